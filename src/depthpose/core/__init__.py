@@ -1,0 +1,1 @@
+"""The floor: geometry, files, config, checkpoints and reports. It knows neither room."""

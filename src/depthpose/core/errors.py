@@ -1,0 +1,33 @@
+"""The one error that bad input raises, and the nearest-name hint it often carries."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used.
+
+    The message names the value, the rule it breaks and the remedy. Nothing else escapes from a
+    reader, whatever bytes it is given; the command line turns it into exit code 2.
+    """
+
+
+class MissingExtraError(ImportError):
+    """An optional dependency is not installed; the message says which extra brings it."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(
+            f"{purpose} needs {package}, which is not installed: pip install 'depthpose[{extra}]'"
+        )
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Say which known name was probably meant, and list them all: the tail of an error message.
+
+    Returns:
+        ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where nothing is near.
+    """
+    names = sorted(known)
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"{hint}Known: {', '.join(map(repr, names)) or 'none'}."

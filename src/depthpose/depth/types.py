@@ -1,0 +1,77 @@
+"""What flows through the depth room: input apart from truth, and the estimate."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StereoInput:
+    """What a depth estimate may look at. There is no truth here, so none can leak.
+
+    Attributes:
+        name: what the files made from this input are called.
+        left: left (reference) image, RGB in [0, 1].
+        right: right image of the rectified pair, the same size, or None for one image alone.
+        camera: intrinsics of the left image; its baseline makes disparity metric.
+    """
+
+    name: str
+    left: Float[Tensor, "3 h w"]
+    right: Float[Tensor, "3 h w"] | None
+    camera: Camera | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StereoTruth:
+    """What is known about the left image of a sample; NaN where nothing is known.
+
+    Attributes:
+        disparity_px: disparity of the left image.
+        depth_m: depth of the left image (camera z unless the dataset's protocol says otherwise).
+    """
+
+    disparity_px: Float[Tensor, "h w"] | None = None
+    depth_m: Float[Tensor, "h w"] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StereoSample:
+    """One sample of a dataset."""
+
+    input: StereoInput
+    truth: StereoTruth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Match:
+    """What a stereo matcher answers for one pair.
+
+    Attributes:
+        disparity_px: disparity of the left image, dense or NaN where the matcher has no answer.
+        confidence: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher
+            has no distribution.
+    """
+
+    disparity_px: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthEstimate:
+    """Depth of one left image.
+
+    Attributes:
+        depth_m: metres along the optical axis; NaN where disparity is invalid. None without a rig.
+        disparity_px: disparity that the depth was made from, at the size of the input.
+        confidence: 0..1, or None.
+        right: the synthesised right view, or None where a real one was given.
+    """
+
+    depth_m: Float[Tensor, "h w"] | None
+    disparity_px: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"] | None = None
+    right: Float[Tensor, "3 h w"] | None = None
