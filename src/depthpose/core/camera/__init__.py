@@ -1,0 +1,21 @@
+"""Pinhole camera and rectified stereo rig."""
+
+from depthpose.core.camera.camera_file import (
+    check_image_matches_camera as check_image_matches_camera,
+)
+from depthpose.core.camera.camera_file import read_camera as read_camera
+from depthpose.core.camera.camera_file import read_rig as read_rig
+from depthpose.core.camera.camera_file import write_camera as write_camera
+from depthpose.core.camera.epipolar import epipolar_distance_px as epipolar_distance_px
+from depthpose.core.camera.epipolar import essential_matrix as essential_matrix
+from depthpose.core.camera.epipolar import fundamental_matrix as fundamental_matrix
+from depthpose.core.camera.model import Camera as Camera
+from depthpose.core.camera.model import StereoRig as StereoRig
+from depthpose.core.camera.pinhole import back_project as back_project
+from depthpose.core.camera.pinhole import crop_camera as crop_camera
+from depthpose.core.camera.pinhole import pad_camera as pad_camera
+from depthpose.core.camera.pinhole import pixel_grid as pixel_grid
+from depthpose.core.camera.pinhole import project as project
+from depthpose.core.camera.pinhole import resize_camera as resize_camera
+from depthpose.core.camera.rectified import RectificationReport as RectificationReport
+from depthpose.core.camera.rectified import check_rectified as check_rectified

@@ -1,0 +1,169 @@
+"""Weights with the config that made them: safetensors, loaded strictly; others' files, safely."""
+
+import hashlib
+import json
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import atomic_write
+
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folder of the weights that come with the package."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Checkpoint:
+    """What a weights file holds.
+
+    Attributes:
+        kind: which network the weights belong to, e.g. ``psmnet``.
+        config: the knobs of that network, as :func:`depthpose.core.config.config_to_dict` gives.
+        state: tensors by the names of the network's ``state_dict``.
+        facts: the card in short: ``trained_on``, ``licence`` and the like.
+    """
+
+    kind: str
+    config: Mapping[str, Any]
+    state: Mapping[str, Tensor]
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write weights and config to one ``.safetensors`` file, all or nothing."""
+    if path.suffix != ".safetensors":
+        raise InputError(
+            f"{path}: weights are written as safetensors; end the name in .safetensors."
+        )
+    metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
+    with atomic_write(path) as temporary:
+        save_file(state, temporary, metadata={**checkpoint.facts, **metadata})
+
+
+def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
+    """Read a file that :func:`save_checkpoint` wrote.
+
+    Args:
+        path: a ``.safetensors`` file.
+        kind: the kind that the caller can use; None takes any.
+
+    Raises:
+        InputError: missing, truncated, not safetensors, without our metadata, or of another kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such weights file.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = dict(file.metadata() or {})
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{path}: not a readable safetensors file ({error}). A published checkpoint is brought "
+            "in by 'depthpose weights import'."
+        ) from error
+    return _interpreted(path, metadata, state, kind)
+
+
+def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
+    """Copy the weights into ``network``; every name and shape must agree.
+
+    Raises:
+        InputError: the first names that are missing, unexpected or of another shape.
+    """
+    wanted = network.state_dict()
+    problems = [f"{name} is missing" for name in wanted.keys() - checkpoint.state.keys()]
+    problems += [f"{name} is unexpected" for name in checkpoint.state.keys() - wanted.keys()]
+    problems += [
+        f"{name} is {tuple(checkpoint.state[name].shape)}, not {tuple(tensor.shape)}"
+        for name, tensor in wanted.items()
+        if name in checkpoint.state and checkpoint.state[name].shape != tensor.shape
+    ]
+    if problems:
+        raise InputError(
+            f"{source}: {len(problems)} tensors do not fit the network of its config: "
+            f"{'; '.join(sorted(problems)[:3])}. File and config belong to different versions."
+        )
+    network.load_state_dict(dict(checkpoint.state))
+
+
+def read_torch_file(path: Path) -> Mapping[str, Any]:
+    """Read somebody else's PyTorch checkpoint without running any code in it.
+
+    ``torch.load(weights_only=True)`` refuses every pickled object but tensors and containers.
+
+    Raises:
+        InputError: missing, not a PyTorch file, or holding pickled code.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such checkpoint file.")
+    try:
+        # An open file, not a path: by a path's ending torch would choose another format.
+        with path.open("rb") as file:
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"{path}: refused, as no checkpoint of tensors alone: it is broken, or holds "
+            "pickled objects that could run code on loading. Ask its author for one of tensors."
+        ) from error
+    except Exception as error:  # an unpickler raises whatever broken bytes lead it to
+        raise InputError(f"{path}: not a readable PyTorch checkpoint ({error}).") from error
+    if not isinstance(content, Mapping):
+        raise InputError(
+            f"{path}: holds a {type(content).__name__}, but a checkpoint maps names to tensors."
+        )
+    return content
+
+
+def find_weights(name: str | Path) -> Path:
+    """Find a weights file by its path, or by the name of weights that came with the package.
+
+    Raises:
+        InputError: neither; the nearest name is said.
+    """
+    path = Path(name)
+    shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
+    if path.is_file():
+        return path
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise InputError(
+        f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
+        f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones."
+    )
+
+
+def file_sha256(path: Path) -> str:
+    """Fingerprint a file; it stands beside every number that the file made."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _interpreted(
+    path: Path, metadata: dict[str, str], state: dict[str, Tensor], kind: str | None
+) -> Checkpoint:
+    if "kind" not in metadata or "config" not in metadata:
+        raise InputError(
+            f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A published "
+            "checkpoint is brought in by 'depthpose weights import'."
+        )
+    found = metadata.pop("kind")
+    if kind is not None and found != kind:
+        raise InputError(f"{path}: holds weights of kind {found!r}, but {kind!r} is needed here.")
+    try:
+        config = json.loads(metadata.pop("config"))
+    except ValueError as error:
+        raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: its 'config' is not a mapping.")
+    return Checkpoint(kind=found, config=config, state=state, facts=metadata)

@@ -1,0 +1,96 @@
+"""YAML to frozen dataclass and back. One text: the dataclass is default, check, help and record."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import dacite
+import yaml
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import atomic_write, read_text
+
+ConfigT = TypeVar("ConfigT")
+
+
+def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
+    """Read a YAML file that holds the differences from the defaults of ``kind``.
+
+    Raises:
+        InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
+    """
+    try:
+        content = yaml.safe_load(read_text(path))
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{path}: this is not YAML ({error}). Mend the file.") from error
+    if content is None:
+        content = {}
+    if not isinstance(content, Mapping):
+        raise InputError(
+            f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
+            "values, one 'name: value' a line."
+        )
+    return config_from_dict(content, kind, source=str(path))
+
+
+def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source: str) -> ConfigT:
+    """Build the dataclass ``kind`` from a mapping; ``source`` names the mapping in errors.
+
+    Raises:
+        InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
+    """
+    _refuse_unknown_keys(content, kind, source, prefix="")
+    try:
+        return dacite.from_dict(kind, content, dacite.Config(cast=[tuple, float, Path]))
+    except dacite.WrongTypeError as error:
+        raise InputError(
+            f"{source}: {error.field_path} is {error.value!r}, which is not of type "
+            f"{error.field_type}. Give a value of that type."
+        ) from error
+    except (dacite.DaciteError, ValueError, TypeError) as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def config_to_dict(config: object) -> dict[str, Any]:
+    """Give every knob of a config with its value, nested, ready for YAML and JSON."""
+    plain = dataclasses.asdict(config)  # pyright: ignore[reportArgumentType]
+    return {name: _plain_value(value) for name, value in plain.items()}
+
+
+def write_config(path: Path, config: object) -> None:
+    """Write every knob of ``config``, defaults too, so that the file is a full record."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
+
+
+def _plain_value(value: object) -> object:
+    match value:
+        case dict():
+            return {name: _plain_value(item) for name, item in value.items()}
+        case tuple() | list():
+            return [_plain_value(item) for item in value]
+        case Path():
+            return str(value)
+        case _:
+            return value
+
+
+def _refuse_unknown_keys(content: Mapping[Any, Any], kind: type, source: str, prefix: str) -> None:
+    hints = get_type_hints(kind)
+    known = [field.name for field in dataclasses.fields(kind)]
+    for key, value in content.items():
+        if key not in known:
+            raise InputError(
+                f"{source}: unknown key {prefix + str(key)!r}; {nearest_name(str(key), known)}"
+            )
+        nested = _dataclass_in(hints[key])
+        if nested is not None and isinstance(value, Mapping):
+            _refuse_unknown_keys(value, nested, source, f"{prefix}{key}.")
+
+
+def _dataclass_in(hint: object) -> type | None:
+    candidates = (hint, *get_args(hint))
+    return next(
+        (c for c in candidates if isinstance(c, type) and dataclasses.is_dataclass(c)), None
+    )

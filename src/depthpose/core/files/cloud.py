@@ -1,0 +1,131 @@
+"""Point clouds: PLY, PCD, NPY, text and KITTI's binary scans."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files.disk import AnyPath, read_bytes, refused_suffix, write_bytes
+from depthpose.core.files.maps import read_npy, to_float32
+from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
+from depthpose.core.files.ply import encode_ply, read_ply
+from depthpose.core.files.table import Columns, parse_rows
+from depthpose.core.files.text import read_text
+
+_READ = (".ply", ".pcd", ".npy", ".xyz", ".txt")
+_ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
+_COLOR = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """Points as a file holds them: its unit and frame are known to the caller alone.
+
+    Attributes:
+        points: coordinates.
+        color: RGB in [0, 1], one a point, or None.
+    """
+
+    points: Float32[Tensor, "n 3"]
+    color: Float32[Tensor, "n 3"] | None = None
+
+
+def read_cloud(path: AnyPath) -> Cloud:
+    """Read a point cloud: ``.ply``, ``.pcd``, ``.npy`` or text (``.xyz``, ``.txt``).
+
+    NPY and text hold a point a row; columns after the third are left out. Points with a NaN
+    coordinate, which organised clouds put where the sensor saw nothing, are left out too.
+
+    Raises:
+        InputError: the file is missing, damaged, without x, y and z, or no point is finite; a
+            coordinate is infinite; a colour is out of range.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _READ:
+        raise refused_suffix(path, "point cloud", _READ)
+    if suffix in (".ply", ".pcd"):
+        columns = read_ply(path) if suffix == ".ply" else read_pcd(path)
+        return _from_columns(path, columns)
+    table = read_npy(path) if suffix == ".npy" else _read_rows(path)
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
+    return _finite_cloud(path, to_float32(table[:, :3]), None)
+
+
+def write_cloud(path: AnyPath, cloud: Cloud) -> None:
+    """Write a point cloud as binary ``.ply`` or ``.pcd``, colours in 8 bits.
+
+    Raises:
+        InputError: a coordinate or colour is not finite, the suffix is another, the disk refuses.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _ENCODERS:
+        raise refused_suffix(path, "written point cloud", tuple(_ENCODERS))
+    points = cloud.points.detach().cpu().numpy()
+    color = None if cloud.color is None else cloud.color.detach().cpu().numpy()
+    if not np.isfinite(points).all() or (color is not None and not np.isfinite(color).all()):
+        raise InputError(f"{path}: the cloud holds NaN or infinity; leave those points out")
+    rgb = None if color is None else np.rint(color.clip(0, 1) * 255).astype(np.uint8)
+    write_bytes(path, _ENCODERS[suffix](points, rgb))
+
+
+def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n columns"]:
+    """Read rows of little-endian float32, as KITTI's Velodyne scans (x, y, z, reflectance).
+
+    Raises:
+        InputError: the file is missing, empty, no whole number of rows, or not finite.
+    """
+    data = read_bytes(path)
+    if columns < 1 or not data or len(data) % (4 * columns):
+        raise InputError(
+            f"{path}: {len(data)} bytes are no whole number of rows of {columns} float32; it is "
+            "empty, truncated or of another format"
+        )
+    rows = to_float32(np.frombuffer(data, "<f4").reshape(-1, columns))
+    if not np.isfinite(rows).all():
+        raise InputError(f"{path}: holds NaN or infinity; it is damaged or of another format")
+    return torch.from_numpy(rows)
+
+
+def _read_rows(path: AnyPath) -> np.ndarray:
+    lines = (line.partition("#")[0] for line in read_text(path).splitlines())
+    rows = [line.replace(",", " ").replace(";", " ") for line in lines]
+    return parse_rows(path, [row for row in rows if row.strip()])
+
+
+def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
+    missing = [name for name in "xyz" if name not in columns]
+    if missing and columns:
+        raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
+    points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
+    return _finite_cloud(path, to_float32(points), _color(path, columns))
+
+
+def _color(path: AnyPath, columns: Columns) -> np.ndarray | None:
+    packed = columns.get("rgb", columns.get("rgba"))
+    if packed is not None and packed.dtype.itemsize == 4:
+        return to_float32(unpack_rgb(packed)) / np.float32(255)
+    if not columns.keys() >= set(_COLOR):
+        return None
+    color = np.stack([columns[name] for name in _COLOR], -1)
+    if color.dtype.kind != "f":
+        color = color / np.iinfo(color.dtype).max
+    if not ((color >= 0) & (color <= 1)).all():
+        raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
+    return to_float32(color)
+
+
+def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -> Cloud:
+    if np.isinf(points).any():
+        raise InputError(f"{path}: a coordinate is infinite or beyond float32; leave it out")
+    kept = ~np.isnan(points).any(-1)
+    if not kept.any():
+        raise InputError(f"{path}: {len(points)} points, none with finite coordinates; give some")
+    return Cloud(
+        points=torch.from_numpy(points[kept]),
+        color=None if color is None else torch.from_numpy(color[kept]),
+    )

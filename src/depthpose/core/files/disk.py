@@ -1,0 +1,123 @@
+"""Bytes from and to the disk: guarded reading, atomic writing."""
+
+import os
+import secrets
+import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from depthpose.core.errors import InputError
+
+AnyPath = str | os.PathLike[str]
+"""A path as users give it."""
+
+MAX_FILE_BYTES = 4 * 2**30
+"""Nothing that is read whole is this large; a bigger file is a mistake or an attack."""
+
+
+def read_bytes(path: AnyPath) -> bytes:
+    """Read a regular file whole.
+
+    Raises:
+        InputError: there is no such file, or it is a folder, a device, too large or unreadable.
+    """
+    try:
+        status = Path(path).stat()
+        _refuse_irregular(path, status)
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check the path") from error
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read: {error or 'no memory left'}") from error
+    except InputError:
+        raise
+    except ValueError as error:  # a NUL byte in the name
+        raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
+
+
+def _refuse_irregular(path: AnyPath, status: os.stat_result) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path}: a folder where a file is needed; name a file inside it")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: a device or pipe; save its content to a regular file first")
+    if status.st_size > MAX_FILE_BYTES:
+        raise InputError(
+            f"{path}: {status.st_size} bytes, more than the {MAX_FILE_BYTES} that are read at "
+            "once; split it"
+        )
+
+
+@contextmanager
+def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a decoder raises on bad bytes into an :class:`InputError`.
+
+    Decoders' warnings are silenced on purpose: they speak of metadata that is not read here, and
+    sizes are checked by us.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:  # a decoder fed with random bytes may raise anything
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
+
+
+@contextmanager
+def atomic_write(path: AnyPath) -> Iterator[Path]:
+    """Write a file whole or not at all.
+
+    Yields a temporary path in the same folder, with the same suffix, to be written inside the
+    block. On success it takes the place of ``path``; on any failure or interrupt it is removed
+    and ``path`` stays as it was. Missing folders are made.
+
+    Raises:
+        InputError: the disk is full, or the place cannot be written to.
+    """
+    target = Path(path)
+    part = target.with_name(f".part-{secrets.token_hex(6)}{target.suffix}")
+    try:
+        _refuse_to_replace(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        _sync(part)
+        part.replace(target)
+        _sync(target.parent)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; "
+            "free the space, or choose another place"
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_bytes(path: AnyPath, data: bytes) -> None:
+    """Write bytes whole or not at all; see :func:`atomic_write`."""
+    with atomic_write(path) as part:
+        part.write_bytes(data)
+
+
+def _refuse_to_replace(target: Path) -> None:
+    # Replacing /dev/null by a file would harm the whole machine.
+    if target.exists() and not target.is_file():
+        raise InputError(f"{target}: a folder or device, which no file may replace; add a name")
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def refused_suffix(path: AnyPath, kind: str, known: tuple[str, ...]) -> InputError:
+    """Make the error for a file name whose suffix says nothing to us."""
+    suffix = Path(path).suffix or "no suffix"
+    return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(known)}")

@@ -1,0 +1,131 @@
+"""Float maps in NPY and PFM files."""
+
+import math
+import re
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files.disk import (
+    AnyPath,
+    read_bytes,
+    refused_as,
+    refused_suffix,
+    write_bytes,
+)
+
+_SUFFIXES = (".npy", ".pfm")
+_HEADER_READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+_PFM_HEADER = re.compile(
+    rb"P([fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?[0-9.]{1,32}(?:[eE][-+]?\d{1,3})?)(?:\r\n|\s)"
+)
+
+
+def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
+    """Read a map from ``.npy`` (float16, 32 or 64) or one-channel ``.pfm``; NaN where invalid.
+
+    A PFM file marks invalid pixels by infinity, as Middlebury's do; the magnitude of its scale
+    is not applied. An NPY file marks them by NaN and may not hold infinity.
+
+    Raises:
+        InputError: the file is missing, damaged, of another type or shape, or holds infinity.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".pfm":
+        return _read_pfm(path)
+    if suffix != ".npy":
+        raise refused_suffix(path, "map", _SUFFIXES)
+    array = read_npy(path)
+    if array.ndim != 2 or array.size == 0:
+        raise InputError(f"{path}: a map is (H, W), got {array.shape}; save one channel alone")
+    if np.isinf(array).any():
+        raise InputError(f"{path}: holds infinity; mark invalid pixels by NaN")
+    return torch.from_numpy(array)
+
+
+def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
+    """Write a map as float32 ``.npy`` (NaN: invalid) or ``.pfm`` (infinity: invalid).
+
+    Raises:
+        InputError: the map is empty or holds infinity, the suffix is another, the disk refuses.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise refused_suffix(path, "map", _SUFFIXES)
+    array = map.detach().cpu().float().contiguous().numpy()
+    if array.size == 0 or np.isinf(array).any():
+        raise InputError(f"{path}: the map is empty or holds infinity; mark invalid pixels by NaN")
+    if suffix == ".npy":
+        encoded = BytesIO()
+        np.save(encoded, array, allow_pickle=False)
+        write_bytes(path, encoded.getvalue())
+    else:
+        height, width = array.shape
+        rows = np.where(np.isnan(array), np.inf, array)[::-1].astype("<f4")
+        write_bytes(path, f"Pf\n{width} {height}\n-1.0\n".encode() + rows.tobytes())
+
+
+def read_npy(path: AnyPath) -> np.ndarray:
+    """Read a float array of any shape as float32; never unpickles.
+
+    Raises:
+        InputError: the file is missing, damaged, or of another type than float16, 32 or 64.
+    """
+    stream = BytesIO(read_bytes(path))
+    with refused_as(path, "NPY file", "save it again with numpy.save"):
+        version = np.lib.format.read_magic(stream)
+        if version not in _HEADER_READERS:
+            raise InputError(f"{path}: NPY version {version}; save plain floats with numpy.save")
+        shape, is_fortran, dtype = _HEADER_READERS[version](stream)
+    if dtype.kind != "f" or dtype.itemsize > 8:
+        raise InputError(f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')")
+    body = stream.getbuffer()[stream.tell() :]
+    if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != len(body):
+        raise InputError(
+            f"{path}: declares {dtype} {shape} but {len(body)} bytes follow; it is truncated or "
+            "damaged, save it again"
+        )
+    array = np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
+    return to_float32(array)
+
+
+def to_float32(array: np.ndarray) -> np.ndarray:
+    """Copy to native contiguous float32; what float32 cannot hold becomes infinity."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.array(array, dtype=np.float32, order="C")
+
+
+def _read_pfm(path: AnyPath) -> Float32[Tensor, "h w"]:
+    data = read_bytes(path)
+    header = _PFM_HEADER.match(data)
+    if header is None:
+        raise InputError(f"{path}: no PFM header ('Pf', width, height, scale); is it a PFM file?")
+    if header[1] == b"F":
+        raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
+    width, height = int(header[2]), int(header[3])
+    body = memoryview(data)[header.end() :]
+    if width * height == 0 or width * height * 4 != len(body):
+        raise InputError(
+            f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
+            "truncated or damaged, save it again"
+        )
+    rows = np.frombuffer(body, _pfm_dtype(path, header[4])).reshape(height, width)
+    array = to_float32(rows[::-1])
+    array[~np.isfinite(array)] = np.nan
+    return torch.from_numpy(array)
+
+
+def _pfm_dtype(path: AnyPath, scale: bytes) -> str:
+    with refused_as(path, "PFM scale", "it must be a number other than 0"):
+        value = float(scale)
+    if value == 0 or not math.isfinite(value):
+        raise InputError(f"{path}: PFM scale {value}; its sign gives the byte order, so not 0")
+    return "<f4" if value < 0 else ">f4"

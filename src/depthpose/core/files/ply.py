@@ -1,0 +1,109 @@
+"""PLY point files (Turk 1994): text and binary of both byte orders to columns, and back."""
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from depthpose.core.errors import InputError
+from depthpose.core.files.disk import AnyPath, read_bytes
+from depthpose.core.files.table import Columns, Field, need_bytes, split_records, split_rows
+
+_CODES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MAX_HEADER = 2**16
+_END = re.compile(rb"(?:^|\n)end_header[ \t]*(?:\r\n|\n|\r)")
+
+
+@dataclass(kw_only=True)
+class _Element:
+    name: str
+    count: int
+    fields: list[Field] = field(default_factory=list)
+    has_list: bool = False
+
+    @property
+    def row_bytes(self) -> int:
+        return sum(np.dtype(f.code).itemsize for f in self.fields)
+
+
+def read_ply(path: AnyPath) -> Columns:
+    """Read the columns of the ``vertex`` element; faces and other elements are stepped over.
+
+    Raises:
+        InputError: the file is missing, truncated, damaged, or lays its vertices behind lists.
+    """
+    data = read_bytes(path)
+    end = _END.search(data, 0, _MAX_HEADER)
+    if not data.startswith(b"ply") or end is None:
+        raise InputError(f"{path}: no PLY header ('ply' ... 'end_header'); is it a PLY file?")
+    order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
+    before, vertex = _find_vertex(path, elements)
+    body = memoryview(data)[end.end() :]
+    if order:
+        skipped = _bytes_of(path, before)
+        need_bytes(path, len(body), skipped, "elements before the vertices")
+        return split_records(path, body[skipped:], vertex.fields, vertex.count, order)
+    rows = [r for r in bytes(body).decode("latin-1").splitlines() if r.strip()]
+    first = sum(e.count for e in before)
+    return split_rows(path, rows[first : first + vertex.count], vertex.fields, vertex.count)
+
+
+def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
+    """Encode points, and colours as bytes where there are any, as little-endian PLY."""
+    columns = [(name, "<f4", "float", points[:, i]) for i, name in enumerate("xyz")]
+    if color is not None:
+        names = ("red", "green", "blue")
+        columns += [(name, "u1", "uchar", color[:, i]) for i, name in enumerate(names)]
+    records = np.empty(len(points), [(name, code) for name, code, _, _ in columns])
+    for name, _, _, values in columns:
+        records[name] = values
+    properties = "".join(f"property {kind} {name}\n" for name, _, kind, _ in columns)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}"
+    return f"{header}end_header\n".encode() + records.tobytes()
+
+
+def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]:
+    order: str | None = None
+    elements: list[_Element] = []
+    for line in lines[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", form, "1.0"] if form in _ORDERS:
+                order = _ORDERS[form]
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
+                elements.append(_Element(name=name, count=int(count)))
+            case ["property", "list", size, kind, _] if {size, kind} <= _CODES.keys() and elements:
+                elements[-1].has_list = True
+            case ["property", kind, name] if kind in _CODES and elements:
+                elements[-1].fields.append(Field(name=name, code=_CODES[kind]))
+            case _:
+                raise InputError(
+                    f"{path}: PLY header line {line[:60]!r} is not understood; mend it"
+                )
+    if order is None:
+        raise InputError(f"{path}: the PLY header names no format; use {', '.join(_ORDERS)} 1.0")
+    return order, elements
+
+
+def _find_vertex(path: AnyPath, elements: list[_Element]) -> tuple[list[_Element], _Element]:
+    names = [e.name for e in elements]
+    if names.count("vertex") != 1:
+        raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
+    vertex = elements[names.index("vertex")]
+    properties = [f.name for f in vertex.fields]
+    if vertex.has_list or len(set(properties)) != len(properties):
+        raise InputError(f"{path}: vertex properties {properties}: a list or a repeated name")
+    return elements[: names.index("vertex")], vertex
+
+
+def _bytes_of(path: AnyPath, elements: list[_Element]) -> int:
+    lists = [e.name for e in elements if e.has_list]
+    if lists:
+        raise InputError(f"{path}: binary lists {lists} lie before the vertices; put them behind")
+    return sum(e.count * e.row_bytes for e in elements)

@@ -1,0 +1,107 @@
+"""Rows to Markdown, CSV, JSON and one self-contained HTML page."""
+
+import base64
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from depthpose.core.files import atomic_write, write_json
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture file with a caption."""
+
+    path: Path
+    caption: str
+
+    @property
+    def data_uri(self) -> str:
+        """The file's bytes as a ``data:`` address, so that the page needs no other file."""
+        kind = "jpeg" if self.path.suffix.lower() in (".jpg", ".jpeg") else "png"
+        return f"data:image/{kind};base64," + base64.b64encode(self.path.read_bytes()).decode()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of a page: words, then a table, then pictures."""
+
+    title: str
+    text: str = ""
+    rows: Sequence[Row] = ()
+    pictures: Sequence[Picture] = field(default_factory=tuple)
+
+
+def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
+    """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
+    write_json(folder / f"{name}.json", [dict(row) for row in rows])
+    with atomic_write(folder / f"{name}.csv") as temporary:
+        temporary.write_text(csv_table(rows))
+    with atomic_write(folder / f"{'table' if name == 'rows' else name}.md") as temporary:
+        temporary.write_text(markdown_table(rows))
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """Format rows as a Markdown table, columns in order of their first appearance."""
+    names = column_names(rows)
+    lines = [names, ["---"] * len(names)]
+    lines += [[show_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def csv_table(rows: Sequence[Row]) -> str:
+    """Format rows as CSV with a header, every digit kept."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def column_names(rows: Sequence[Row]) -> list[str]:
+    """Give the union of the rows' names, in order of their first appearance."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def show_value(value: object) -> str:
+    """Show a value to a person: four digits after the point, nothing for None."""
+    match value:
+        case None:
+            return ""
+        case float():
+            return f"{value:.0f}" if value.is_integer() and abs(value) >= 1 else f"{value:.4f}"
+        case _:
+            return str(value)
+
+
+def write_page(
+    path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
+) -> None:
+    """Write one HTML file that shows the sections and needs no network and no other file.
+
+    Args:
+        path: the page.
+        title: its heading.
+        sections: shown in order.
+        environment: what the numbers were measured with (see ``core.run.environment``).
+    """
+    pages = Environment(
+        loader=PackageLoader("depthpose.core", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pages.globals.update(show_value=show_value, column_names=column_names)
+    html = pages.get_template("report.html").render(
+        title=title, sections=sections, environment=environment
+    )
+    with atomic_write(path) as temporary:
+        temporary.write_text(html, encoding="utf-8")

@@ -1,0 +1,78 @@
+"""Rigid transforms: apply, compose, invert, compare, fit."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """``target_from_source``: carries source points to the target frame, ``R @ p + t``.
+
+    Attributes:
+        R: rotation, orthonormal with determinant +1.
+        t_m: translation [m].
+    """
+
+    R: Float[Tensor, "*batch 3 3"]
+    t_m: Float[Tensor, "*batch 3"]
+
+    def apply(self, points_m: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+        """Move points from the source frame to the target frame."""
+        return points_m @ self.R.mT + self.t_m[..., None, :]
+
+    def __matmul__(self, other: "Rigid") -> "Rigid":
+        """Compose: ``a_from_b @ b_from_c`` is ``a_from_c``."""
+        moved_m = (self.R @ other.t_m[..., None]).squeeze(-1)
+        return Rigid(self.R @ other.R, moved_m + self.t_m)
+
+    def inverse(self) -> "Rigid":
+        """Give ``source_from_target``."""
+        return Rigid(self.R.mT, -(self.R.mT @ self.t_m[..., None]).squeeze(-1))
+
+
+def fit_rigid(
+    source_m: Float[Tensor, "*batch n 3"],
+    target_m: Float[Tensor, "*batch n 3"],
+    weight: Float[Tensor, "*batch n"],
+) -> Rigid:
+    """Find the rigid transform that best carries ``source_m`` onto ``target_m``.
+
+    Minimises ``sum_i w_i |R s_i + t - t_i|^2`` in closed form (Kabsch 1976; Umeyama 1991 for the
+    sign). A reflection is excluded: ``det(R) = +1`` for mirrored and planar points too. Where the
+    weighted points lie on a line the rotation about it is arbitrary.
+
+    Raises:
+        InputError: fewer than three points of some batch entry carry weight.
+    """
+    supported = (weight > 0).sum(-1)
+    if bool((supported < 3).any()):
+        raise InputError(
+            f"fit_rigid: {int(supported.min())} points carry weight, but a rotation is fixed by 3 "
+            "or more. Give more points or a positive weight to more of them."
+        )
+    share = (weight / weight.sum(-1, keepdim=True))[..., None]
+    source_mean_m = (share * source_m).sum(-2, keepdim=True)
+    target_mean_m = (share * target_m).sum(-2, keepdim=True)
+    covariance = (target_m - target_mean_m).mT @ (share * (source_m - source_mean_m))
+    u, _, vh = torch.linalg.svd(covariance)
+    sign = torch.ones_like(u[..., 0])
+    sign[..., -1] = torch.where(torch.linalg.det(u @ vh) < 0, -1.0, 1.0)
+    R = (u * sign[..., None, :]) @ vh
+    return Rigid(R, (target_mean_m - source_mean_m @ R.mT).squeeze(-2))
+
+
+def geodesic_rad(
+    first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch"]:
+    """Angle between two rotations [rad].
+
+    By the chord, ``|A - B|_F = 2 sqrt(2) sin(angle / 2)``: accurate near zero, where the usual
+    arc cosine of the trace loses half of the digits, and less so near pi.
+    """
+    chord = torch.linalg.matrix_norm(first - second) / 8**0.5
+    return 2 * torch.asin(chord.clamp(max=1.0))

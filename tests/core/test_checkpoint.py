@@ -1,0 +1,177 @@
+import json
+import pickle
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from torch import nn
+
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    file_sha256,
+    find_weights,
+    load_weights,
+    read_checkpoint,
+    read_torch_file,
+    save_checkpoint,
+)
+from depthpose.core.errors import InputError
+
+
+def saved(folder: Path, kind: str = "toy") -> Path:
+    path = folder / "w.safetensors"
+    state = nn.Linear(3, 2).state_dict()
+    facts = {"licence": "MIT"}
+    save_checkpoint(path, Checkpoint(kind=kind, config={"width": 3}, state=state, facts=facts))
+    return path
+
+
+def test_a_checkpoint_survives_the_file(tmp_path: Path) -> None:
+    network = nn.Linear(3, 2)
+    state = network.state_dict()
+    made = Checkpoint(kind="toy", config={"width": 3}, state=state, facts={"licence": "MIT"})
+    save_checkpoint(tmp_path / "w.safetensors", made)
+    read = read_checkpoint(tmp_path / "w.safetensors", "toy")
+    assert (read.kind, read.config, read.facts) == ("toy", {"width": 3}, {"licence": "MIT"})
+    other = nn.Linear(3, 2)
+    load_weights(other, read, "w")
+    torch.testing.assert_close(other.weight, network.weight, rtol=0, atol=0)
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def _scramble(path: Path) -> None:
+    path.write_bytes(b"\x00" * 64)
+
+
+def _strip(path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, path)
+
+
+def _spoil_config(path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, path, {"kind": "toy", "config": "{"})
+
+
+def _list_config(path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, path, {"kind": "toy", "config": "[]"})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_truncate, "not a readable safetensors file"),
+        (_scramble, "not a readable safetensors file"),
+        (_strip, "no 'kind' and 'config'.*depthpose weights import"),
+        (_spoil_config, "its 'config' is not JSON"),
+        (_list_config, "its 'config' is not a mapping"),
+        (Path.unlink, "there is no such weights file"),
+    ],
+)
+def test_a_bad_weights_file_is_refused(
+    tmp_path: Path, spoil: Callable[[Path], None], message: str
+) -> None:
+    path = saved(tmp_path)
+    spoil(path)
+    with pytest.raises(InputError, match=message):
+        read_checkpoint(path)
+
+
+def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="kind 'toy', but 'psmnet' is needed"):
+        read_checkpoint(saved(tmp_path), "psmnet")
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({"weight": torch.zeros(2, 3)}, "bias is missing"),
+        (
+            {"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "x": torch.zeros(1)},
+            "x is unexpected",
+        ),
+        (
+            {"weight": torch.zeros(2, 4), "bias": torch.zeros(2)},
+            r"weight is \(2, 4\), not \(2, 3\)",
+        ),
+    ],
+)
+def test_loading_is_strict(state: dict[str, torch.Tensor], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_weights(nn.Linear(3, 2), Checkpoint(kind="toy", config={}, state=state), "w")
+
+
+def test_only_safetensors_are_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"end the name in \.safetensors"):
+        save_checkpoint(tmp_path / "w.pt", Checkpoint(kind="toy", config={}, state={}))
+
+
+class Harmful:
+    def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
+        return (pytest.fail, ("code in the checkpoint was run",))
+
+
+def test_pickled_code_is_refused_and_not_run(tmp_path: Path) -> None:
+    torch.save({"state_dict": Harmful()}, tmp_path / "bad.tar")
+    with pytest.raises(InputError, match="could run code on loading"):
+        read_torch_file(tmp_path / "bad.tar")
+    (tmp_path / "bare.pkl").write_bytes(pickle.dumps(Harmful()))
+    with pytest.raises(InputError, match=r"bare\.pkl"):
+        read_torch_file(tmp_path / "bare.pkl")
+
+
+def test_a_checkpoint_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
+    torch.save([torch.zeros(1)], tmp_path / "list.pt")
+    with pytest.raises(InputError, match="holds a list"):
+        read_torch_file(tmp_path / "list.pt")
+
+
+def test_a_mapping_of_tensors_is_read(tmp_path: Path) -> None:
+    torch.save({"state_dict": {"a": torch.arange(3)}}, tmp_path / "w.tar")
+    assert read_torch_file(tmp_path / "w.tar")["state_dict"]["a"].tolist() == [0, 1, 2]
+
+
+def test_an_unknown_name_says_where_weights_come_from() -> None:
+    with pytest.raises(InputError, match="weights 'nope': neither a file nor the name"):
+        find_weights("nope")
+
+
+def test_the_fingerprint_is_sha256(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert file_sha256(tmp_path / "a").startswith("ba7816bf8f01cfea")
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(noise=st.binary(max_size=200), cut=st.integers(0, 400), where=st.integers(0, 300))
+def test_no_bytes_let_another_error_escape(
+    tmp_path: Path, noise: bytes, cut: int, where: int
+) -> None:
+    whole = saved(tmp_path).read_bytes()
+    path = tmp_path / "fuzz.safetensors"
+    torch.save({"a": torch.zeros(4)}, tmp_path / "t.pt")
+    torch_file = (tmp_path / "t.pt").read_bytes()
+    for content in (noise, whole[:cut], whole[:where] + noise + whole[where:]):
+        path.write_bytes(content)
+        _only_input_error(lambda: read_checkpoint(path))
+    for content in (noise, torch_file[:cut], torch_file[:where] + noise + torch_file[where + 9 :]):
+        path.write_bytes(content)
+        _only_input_error(lambda: read_torch_file(path))
+
+
+def _only_input_error(read: Callable[[], object]) -> None:
+    with suppress(InputError):
+        read()
+
+
+def test_metadata_is_text_that_others_can_read(tmp_path: Path) -> None:
+    raw = saved(tmp_path).read_bytes()
+    header = json.loads(raw[8 : 8 + int.from_bytes(raw[:8], "little")])
+    assert header["__metadata__"]["kind"] == "toy"

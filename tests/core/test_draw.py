@@ -1,0 +1,30 @@
+import torch
+
+from depthpose.core.draw import draw_depth, draw_disparity, draw_points, draw_share
+
+
+def test_near_is_brighter_than_far_all_along() -> None:
+    depth_m = torch.linspace(3, 80, 400)[None]
+    weights = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
+    brightness = (draw_depth(depth_m) * weights).sum(0)[0]
+    assert bool((brightness.diff() < 0).all())
+
+
+def test_the_scale_is_fixed() -> None:
+    one, other = draw_depth(torch.tensor([[5.0, 10.0]])), draw_depth(torch.tensor([[10.0, 70.0]]))
+    assert torch.equal(one[:, 0, 1], other[:, 0, 0])
+
+
+def test_invalid_is_grey() -> None:
+    nothing = torch.tensor([[torch.nan]])
+    for picture in (draw_depth(nothing), draw_disparity(nothing), draw_share(nothing)):
+        assert picture.flatten().tolist() == [0.5, 0.5, 0.5]
+
+
+def test_points_are_grown_and_the_nearest_wins() -> None:
+    depth_m = torch.full((5, 7), torch.nan)
+    depth_m[2, 2], depth_m[2, 3] = 10.0, 20.0
+    picture = draw_points(torch.ones(3, 5, 7), depth_m)
+    near = draw_depth(torch.full((1, 1), 10.0))[:, 0, 0]
+    assert torch.equal(picture[:, 1, 3], near)
+    assert torch.equal(picture[:, 0, 0], torch.full((3,), 0.35))

@@ -1,0 +1,49 @@
+import csv
+import io
+import json
+from pathlib import Path
+
+import torch
+
+from depthpose.core.files import write_image
+from depthpose.core.report import (
+    Picture,
+    Section,
+    csv_table,
+    markdown_table,
+    write_page,
+    write_table,
+)
+
+ROWS = [{"name": "a|b", "x": 0.123456, "n": 3}, {"name": "c", "x": 80.0, "more": None}]
+
+
+def test_markdown_has_every_column_in_order() -> None:
+    assert markdown_table(ROWS) == (
+        "| name | x | n | more |\n| --- | --- | --- | --- |\n"
+        "| a\\|b | 0.1235 | 3 |  |\n| c | 80 |  |  |\n"
+    )
+
+
+def test_csv_keeps_every_digit() -> None:
+    read = list(csv.DictReader(io.StringIO(csv_table(ROWS))))
+    assert float(read[0]["x"]) == 0.123456
+
+
+def test_the_table_is_written_three_times(tmp_path: Path) -> None:
+    write_table(tmp_path, ROWS)
+    assert json.loads((tmp_path / "rows.json").read_text()) == ROWS
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.csv", "rows.json", "table.md"]
+
+
+def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
+    write_image(tmp_path / "p.png", torch.zeros(3, 2, 2))
+    picture = Picture(path=tmp_path / "p.png", caption="a <picture>")
+    sections = [Section(title="T & S", text="<script>x</script>", rows=ROWS, pictures=[picture])]
+    write_page(tmp_path / "page.html", "Title", sections, {"torch": "2"})
+    html = (tmp_path / "page.html").read_text()
+    assert "data:image/png;base64," in html
+    assert "&lt;script&gt;x" in html
+    assert "a &lt;picture&gt;" in html
+    assert "http" not in html
+    assert 'src="p.png' not in html

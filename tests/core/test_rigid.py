@@ -1,0 +1,72 @@
+import pytest
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+
+Batch = tuple[int, ...]
+
+
+def random_rigid(batch: Batch) -> Rigid:
+    q, _ = torch.linalg.qr(torch.randn(*batch, 3, 3, dtype=torch.float64))
+    q[..., 0] *= torch.linalg.det(q)[..., None].sign()
+    return Rigid(q, torch.randn(*batch, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_fit_recovers_the_transform_that_made_the_points(batch: Batch) -> None:
+    truth = random_rigid(batch)
+    source = torch.randn(*batch, 9, 3, dtype=torch.float64)
+    found = fit_rigid(source, truth.apply(source), torch.rand(*batch, 9, dtype=torch.float64) + 0.1)
+    torch.testing.assert_close(found.R, truth.R)
+    torch.testing.assert_close(found.t_m, truth.t_m)
+
+
+def test_fit_never_answers_with_a_reflection() -> None:
+    source = torch.randn(50, 6, 3, dtype=torch.float64)
+    mirrored = source * torch.tensor([1.0, 1.0, -1.0])
+    found = fit_rigid(source, mirrored, torch.ones(50, 6, dtype=torch.float64))
+    torch.testing.assert_close(torch.linalg.det(found.R), torch.ones(50, dtype=torch.float64))
+
+
+def test_fit_of_planar_points_is_a_rotation() -> None:
+    truth = random_rigid(())
+    plane = torch.randn(8, 3, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
+    found = fit_rigid(plane, truth.apply(plane), torch.ones(8, dtype=torch.float64))
+    torch.testing.assert_close(found.R, truth.R)
+
+
+def test_fit_ignores_points_without_weight() -> None:
+    truth = random_rigid(())
+    source = torch.randn(7, 3, dtype=torch.float64)
+    target = truth.apply(source)
+    target[0] += 100
+    weight = torch.tensor([0.0, 1, 1, 1, 1, 1, 1], dtype=torch.float64)
+    torch.testing.assert_close(fit_rigid(source, target, weight).R, truth.R)
+
+
+def test_fit_says_how_many_points_it_needs() -> None:
+    with pytest.raises(InputError, match="2 points carry weight, but a rotation is fixed by 3"):
+        fit_rigid(torch.zeros(3, 3), torch.zeros(3, 3), torch.tensor([1.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_composition_is_application_one_after_the_other(batch: Batch) -> None:
+    first, second = random_rigid(batch), random_rigid(batch)
+    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
+    torch.testing.assert_close((second @ first).apply(points), second.apply(first.apply(points)))
+
+
+def test_inverse_undoes() -> None:
+    pose = random_rigid((3,))
+    points = torch.randn(3, 5, 3, dtype=torch.float64)
+    torch.testing.assert_close(pose.inverse().apply(pose.apply(points)), points)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-3, 1.0, 3.0])
+def test_geodesic_measures_the_angle_about_an_axis(angle: float) -> None:
+    a = torch.tensor(angle, dtype=torch.float64)
+    c, s, o, i = a.cos(), a.sin(), torch.zeros_like(a), torch.ones_like(a)
+    turn = torch.stack([c, -s, o, s, c, o, o, o, i]).reshape(3, 3)
+    R = random_rigid(()).R
+    torch.testing.assert_close(geodesic_rad(turn @ R, R), a, rtol=1e-6, atol=1e-12)

@@ -1,0 +1,45 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import depthpose
+from depthpose import core
+
+
+def modules_after(statement: str) -> set[str]:
+    code = f"{statement}; import sys; print(*sys.modules)"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    return set(answer.stdout.split())
+
+
+def test_core_imports_no_room() -> None:
+    names = [
+        path.stem
+        for path in Path(str(core.__file__)).parent.iterdir()
+        if path.suffix in ("", ".py")
+    ]
+    names = [name for name in names if name[0] != "_"]
+    loaded = modules_after("; ".join(f"import depthpose.core.{name}" for name in names))
+    assert not {name for name in loaded if name.startswith(("depthpose.depth", "depthpose.pose"))}
+    assert "cv2" not in loaded
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    assert not {"torch", "numpy", "tyro", "PIL"} & modules_after("import depthpose")
+
+
+def test_the_command_line_loads_nothing_heavy() -> None:
+    assert not {"torch", "numpy", "PIL", "cv2"} & modules_after("import depthpose.cli.depth")
+
+
+def test_an_estimator_is_imported_when_asked_for() -> None:
+    assert depthpose.FakestereoNet.__name__ == "FakestereoNet"
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'Fakestereo'"):
+        getattr(depthpose, "Fakestereo")  # noqa: B009
