@@ -1,0 +1,141 @@
+"""Every knob of the depth room: frozen dataclasses that refuse a value where it is born."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from depthpose.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PSMNetConfig:
+    """Size and conventions of the stereo network (Chang and Chen 2018, stacked hourglass)."""
+
+    max_disparity_px: int = 192
+    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16."""
+
+    width: int = 32
+    """Channels of the first layers; all others are 1, 2 or 4 times it."""
+
+    blocks: tuple[int, int, int, int] = (3, 16, 3, 3)
+    """Residual blocks of the four stages of the feature extractor."""
+
+    pools: tuple[int, ...] = (64, 32, 16, 8)
+    """Windows of the spatial pyramid, in quarter-size pixels, largest first."""
+
+    align_corners: bool = True
+    """How the weights expect maps to be enlarged: True for the published KITTI 2015 weights."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if self.max_disparity_px < 16 or self.max_disparity_px % 16:
+            raise InputError(
+                f"max_disparity_px must be a positive multiple of 16 (the volume is a quarter of "
+                f"it and is halved twice), got {self.max_disparity_px}; take 192"
+            )
+        if self.width < 1:
+            raise InputError(f"width must be 1 or more channels, got {self.width}; take 32")
+        if min(self.blocks) < 1:
+            raise InputError(f"each stage needs 1 block or more, got blocks={self.blocks}")
+        if not self.pools or min(self.pools) < 1:
+            raise InputError(f"pools must hold windows of 1 pixel or more, got {self.pools}")
+
+    @property
+    def min_side_px(self) -> int:
+        """Smallest image side that the network takes [px]: its largest pool sees one window."""
+        return max(16, -(-4 * max(self.pools) // 16) * 16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherConfig:
+    """How a stereo network is run on a pair of images."""
+
+    device: str = "cpu"
+    """Where to compute: cpu, cuda, cuda:1, ..."""
+
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """fp32 is exact; bf16 is faster and halves the memory, at some hundredths of a pixel."""
+
+    max_memory_bytes: int | None = None
+    """Bound on the memory of activations, exact (no tiles); None: no bound."""
+
+    tile_px: tuple[int, int] | None = None
+    """Rows and columns of tiles that are matched one by one and blended: approximate."""
+
+    tile_overlap_px: int = 64
+    """Overlap of neighbouring tiles, beyond the disparity range to the left of each."""
+
+    with_confidence: bool = True
+    """Say for each pixel how sure the match is."""
+
+    with_left_right_check: bool = False
+    """Match the mirrored pair too and lower the confidence where both disagree: twice the time."""
+
+    with_compile: bool = False
+    """Compile the feature extractor: pays after many images of one size."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no run can have."""
+        if self.precision not in ("fp32", "bf16"):
+            raise InputError(f"precision must be 'fp32' or 'bf16', got {self.precision!r}")
+        if self.max_memory_bytes is not None and self.max_memory_bytes < 1:
+            raise InputError(
+                f"max_memory_bytes must be positive, got {self.max_memory_bytes}; None: no bound"
+            )
+        if self.tile_px is not None and min(self.tile_px) < 1:
+            raise InputError(f"tile_px must be two positive sizes, got {self.tile_px}")
+        if self.tile_overlap_px < 0:
+            raise InputError(f"tile_overlap_px must be 0 or more, got {self.tile_overlap_px}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SGBMConfig:
+    """Semi-global block matching of OpenCV (Hirschmueller 2008), with the settings of our tables.
+
+    The names follow OpenCV's documentation of ``StereoSGBM``.
+    """
+
+    num_disparities: int = 192
+    """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16."""
+
+    block_size: int = 3
+    """Side of the matched window [px], odd."""
+
+    p1: int = 8 * 3 * 9
+    """Punishment of a disparity step of 1 between neighbours."""
+
+    p2: int = 32 * 3 * 9
+    """Punishment of a larger step; more than p1."""
+
+    disp12_max_diff: int = 1
+    """Largest difference allowed in the left-right check [px]."""
+
+    pre_filter_cap: int = 63
+    """Bound of the horizontal gradient that is matched."""
+
+    uniqueness_ratio: int = 10
+    """Percent by which the best cost must beat the second."""
+
+    speckle_window_size: int = 100
+    """Islands of at most so many pixels are dropped."""
+
+    speckle_range: int = 2
+    """Disparity step inside an island [px]."""
+
+    mode: Literal["sgbm", "hh", "sgbm_3way", "hh4"] = "sgbm_3way"
+    """Directions of aggregation: 5, 8, 3 or 4."""
+
+    with_filled_holes: bool = False
+    """Fill pixels without an answer as the KITTI devkit does: the smaller neighbour of the row."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that OpenCV would misread."""
+        if self.num_disparities < 16 or self.num_disparities % 16:
+            raise InputError(
+                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
+            )
+        if self.block_size < 1 or self.block_size % 2 == 0:
+            raise InputError(f"block_size must be odd and positive, got {self.block_size}")
+        if not 0 < self.p1 < self.p2:
+            raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
+        if self.mode not in ("sgbm", "hh", "sgbm_3way", "hh4"):
+            raise InputError(f"mode must be 'sgbm', 'hh', 'sgbm_3way' or 'hh4', got {self.mode!r}")

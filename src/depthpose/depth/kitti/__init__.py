@@ -1,0 +1,15 @@
+"""KITTI, Middlebury and plain folders of pairs: disk to samples, splits, the check of a folder."""
+
+from depthpose.depth.kitti.calibration import KittiCalibration as KittiCalibration
+from depthpose.depth.kitti.check import CheckReport as CheckReport
+from depthpose.depth.kitti.check import Problem as Problem
+from depthpose.depth.kitti.check import check_dataset as check_dataset
+from depthpose.depth.kitti.dataset import Dataset as Dataset
+from depthpose.depth.kitti.dataset import open_dataset as open_dataset
+from depthpose.depth.kitti.frames import Frame as Frame
+from depthpose.depth.kitti.frames import kitti_calibration as kitti_calibration
+from depthpose.depth.kitti.frames import lidar_truth as lidar_truth
+from depthpose.depth.kitti.frames import read_disparity as read_disparity
+from depthpose.depth.kitti.lidar import project_lidar as project_lidar
+from depthpose.depth.kitti.splits import Split as Split
+from depthpose.depth.kitti.splits import read_split as read_split

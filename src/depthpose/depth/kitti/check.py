@@ -1,0 +1,207 @@
+"""The check of a folder before hours of work: everything wrong, a line each."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, read_depth_png, read_image, read_points_bin
+from depthpose.depth.kitti.frames import Frame, frame_rig, kitti_calibration, read_disparity
+from depthpose.depth.kitti.layouts import find_frames
+from depthpose.depth.kitti.splits import read_split
+
+_LFS_POINTER = b"version https://git-lfs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """One thing that is wrong, or worth knowing.
+
+    Attributes:
+        path: the file or folder.
+        kind: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``.
+        message: what is wrong.
+    """
+
+    path: Path
+    kind: str
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckReport:
+    """What the check of a folder found.
+
+    Attributes:
+        layout: the layout that was recognised.
+        counts: how many frames, and how many of them have each part.
+        problems: what would stop or spoil work.
+        notices: what only limits it, such as frames without a right view.
+    """
+
+    layout: str
+    counts: dict[str, int]
+    problems: list[Problem]
+    notices: list[Problem]
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        parts = ", ".join(f"{count} {part}" for part, count in self.counts.items())
+        verdict = "nothing is wrong" if self.is_ok else f"{len(self.problems)} problems"
+        return f"{self.layout}: {parts}; {verdict}, {len(self.notices)} notices"
+
+
+def check_dataset(
+    folder: Path,
+    split: str | Path | None = None,
+    *,
+    with_decoding: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> CheckReport:
+    """Look at every file of a dataset.
+
+    Args:
+        folder: the dataset's folder, in any layout that ``open_dataset`` knows.
+        split: look only at these frames, and name those that are missing.
+        with_decoding: decode every image in full; else only headers and sizes are looked at.
+        progress: called with the number of frames done and of all frames.
+
+    Raises:
+        InputError: no such folder, or no layout that is known.
+    """
+    folder = Path(folder)
+    layout, frames = find_frames(folder)
+    found: list[Problem] = []
+    if split is not None:
+        chosen = read_split(split)
+        here = {frame.name: frame for frame in frames}
+        found += [
+            Problem(path=folder, kind="missing", message=f"frame {name} of {chosen.name}")
+            for name in chosen.names
+            if name not in here
+        ]
+        frames = [here[name] for name in chosen.names if name in here]
+    found += _same_names(frames)
+    for done, frame in enumerate(frames, 1):
+        found += _check_frame(frame, with_decoding=with_decoding)
+        if progress is not None:
+            progress(done, len(frames))
+    return CheckReport(
+        layout=layout,
+        counts=_count(frames),
+        problems=[problem for problem in found if problem.kind != "note"],
+        notices=[problem for problem in found if problem.kind == "note"],
+    )
+
+
+def _count(frames: list[Frame]) -> dict[str, int]:
+    parts = {"right views": "right", "calibrations": "calibration", "LiDAR scans": "velodyne",
+             "depth maps": "depth", "disparity maps": "disparity"}  # fmt: skip
+    counts = {"frames": len(frames)}
+    return counts | {
+        what: sum(getattr(frame, part) is not None for frame in frames)
+        for what, part in parts.items()
+    }
+
+
+def _same_names(frames: list[Frame]) -> Iterator[Problem]:
+    seen: dict[str, Path] = {}
+    for frame in frames:
+        if frame.name in seen:
+            message = f"has the same name as {seen[frame.name]}; rename one"
+            yield Problem(path=frame.left, kind="mismatch", message=message)
+        seen[frame.name] = frame.left
+
+
+def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
+    size = None
+    for path in (frame.left, frame.right):
+        if path is None:
+            yield Problem(path=frame.left, kind="note", message="has no right view")
+            continue
+        problem, found = _look_at_image(path, with_decoding=with_decoding)
+        if problem is not None:
+            yield problem
+        elif size is not None and found != size:
+            message = f"is {_show(found)}, but its left image is {_show(size)}"
+            yield Problem(path=path, kind="mismatch", message=message)
+        size = size or found
+    yield from _check_calibration(frame)
+    if frame.velodyne is not None:
+        yield from _check_scan(frame.velodyne)
+    for path in (frame.depth, frame.disparity, frame.disparity_noc):
+        if path is not None and size is not None:
+            yield from _check_truth(path, size, is_depth=path == frame.depth)
+
+
+def _look_at_image(
+    path: Path, *, with_decoding: bool
+) -> tuple[Problem | None, tuple[int, int] | None]:
+    try:
+        if with_decoding:
+            _, height, width = read_image(path).shape
+            return None, (width, height)
+        return None, image_size(path)
+    except InputError as error:
+        return _unreadable(path, error), None
+
+
+def _check_calibration(frame: Frame) -> Iterator[Problem]:
+    if frame.calibration is None:
+        message = "has no calibration: disparity only, no metres"
+        yield Problem(path=frame.left, kind="note", message=message)
+        return
+    try:
+        frame_rig(frame)
+        if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
+            message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
+            yield Problem(path=frame.calibration, kind="missing", message=message)
+    except InputError as error:
+        yield _unreadable(frame.calibration, error)
+
+
+def _check_scan(path: Path) -> Iterator[Problem]:
+    try:
+        points = read_points_bin(path)
+    except InputError as error:
+        yield _unreadable(path, error)
+        return
+    if len(points) == 0:
+        yield Problem(path=path, kind="empty", message="holds no LiDAR point")
+
+
+def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
+    try:
+        truth = read_depth_png(path) if is_depth else read_disparity(path)
+    except InputError as error:
+        yield _unreadable(path, error)
+        return
+    height, width = truth.shape
+    if (width, height) != size:
+        message = f"is {width}x{height}, but its left image is {_show(size)}"
+        yield Problem(path=path, kind="mismatch", message=message)
+    if not bool(torch.isfinite(truth).any()):
+        yield Problem(path=path, kind="empty", message="holds no value")
+
+
+def _unreadable(path: Path, error: InputError) -> Problem:
+    message = str(error).removeprefix(f"{path}: ")
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
+                message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
+    except OSError:
+        pass
+    return Problem(path=path, kind="unreadable", message=message)
+
+
+def _show(size: tuple[int, int] | None) -> str:
+    return "unreadable" if size is None else f"{size[0]}x{size[1]}"

@@ -1,0 +1,132 @@
+"""One stereo frame on disk: where its parts lie, and reading them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import StereoRig, read_rig
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    image_size,
+    read_depth_png,
+    read_disparity_png,
+    read_image,
+    read_map,
+    read_points_bin,
+)
+from depthpose.depth.kitti.calibration import (
+    KittiCalibration,
+    read_middlebury_calibration,
+    read_object_calibration,
+    read_plain_calibration,
+    read_raw_calibration,
+)
+from depthpose.depth.kitti.lidar import LidarDepth, project_lidar
+from depthpose.depth.types import StereoInput, StereoTruth
+
+CalibrationStyle = Literal["raw", "object", "middlebury", "plain", "camera"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """Paths of one frame; None where the dataset has no such file.
+
+    Attributes:
+        name: unique in its dataset and usable as a file name.
+        left: left image (camera 2 of KITTI).
+        right: right image (camera 3).
+        calibration: file, or for ``raw`` the folder of the date.
+        style: how the calibration is written.
+        velodyne: one LiDAR scan, float32 x, y, z, reflectance.
+        depth: 16-bit depth of the left image, metres x 256.
+        disparity: disparity of the left image, 16-bit PNG (x 256) or PFM, hidden pixels too.
+        disparity_noc: that of the pixels alone that both views see.
+    """
+
+    name: str
+    left: Path
+    right: Path | None = None
+    calibration: Path | None = None
+    style: CalibrationStyle = "plain"
+    velodyne: Path | None = None
+    depth: Path | None = None
+    disparity: Path | None = None
+    disparity_noc: Path | None = None
+
+
+def frame_input(frame: Frame) -> StereoInput:
+    """Read images and calibration of a frame."""
+    return StereoInput(
+        name=frame.name,
+        left=read_image(frame.left),
+        right=None if frame.right is None else read_image(frame.right),
+        camera=frame_rig(frame),
+    )
+
+
+def frame_truth(frame: Frame) -> StereoTruth:
+    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`."""
+    depth_m = None if frame.depth is None else read_depth_png(frame.depth)
+    disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
+    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m)
+
+
+def frame_rig(frame: Frame) -> StereoRig | None:
+    """Read the rig of a frame, or None where it has no calibration."""
+    if frame.calibration is None:
+        return None
+    if frame.style in ("raw", "object"):
+        return kitti_calibration(frame).rig
+    if frame.style == "middlebury":
+        return read_middlebury_calibration(frame.calibration)
+    if frame.style == "camera":
+        return read_rig(frame.calibration)
+    width, height = image_size(frame.left)
+    return read_plain_calibration(frame.calibration, frame.left.stem, width, height)
+
+
+def kitti_calibration(frame: Frame) -> KittiCalibration:
+    """Read rig and LiDAR projection of a frame in KITTI's raw or object layout.
+
+    Raises:
+        InputError: the frame has no such calibration.
+    """
+    if frame.calibration is None or frame.style not in ("raw", "object"):
+        raise InputError(
+            f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
+            "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
+        )
+    width, height = image_size(frame.left)
+    read = read_raw_calibration if frame.style == "raw" else read_object_calibration
+    return read(frame.calibration, width, height)
+
+
+def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"] | None:
+    """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
+
+    A plain folder holds no scan but a drawn one (``lidar_depth/``, camera z), which serves
+    ``camera_z`` as it is. None where the frame has neither.
+
+    Raises:
+        InputError: a scan without calibration.
+    """
+    if frame.velodyne is None:
+        is_drawn = frame.style in ("plain", "camera") and depth == "camera_z"
+        return read_depth_png(frame.depth) if is_drawn and frame.depth is not None else None
+    pixels_from_velodyne = kitti_calibration(frame).pixels_from_velodyne
+    if pixels_from_velodyne is None:
+        raise InputError(
+            f"{frame.name}: its calibration says nothing of the LiDAR; calib_velo_to_cam.txt (or "
+            "Tr_velo_to_cam in an object text) is missing."
+        )
+    width, height = image_size(frame.left)
+    points = read_points_bin(frame.velodyne)
+    return project_lidar(points, pixels_from_velodyne, (height, width), depth)
+
+
+def read_disparity(path: Path) -> Float[Tensor, "h w"]:
+    """Read disparity from a 16-bit PNG or a PFM; NaN where there is none."""
+    return read_map(path) if path.suffix.lower() == ".pfm" else read_disparity_png(path)

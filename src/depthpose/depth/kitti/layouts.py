@@ -1,0 +1,141 @@
+"""Folders to frames: which layout this is, and where each frame's parts lie."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from depthpose.core.errors import InputError
+from depthpose.depth.kitti.frames import Frame
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+def find_frames(folder: Path) -> tuple[str, list[Frame]]:
+    """Recognise the layout of a folder and list its frames, sorted by name.
+
+    Raises:
+        InputError: no such folder, no known layout, or no image.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder. Give the folder of a dataset.")
+    for layout, find in LAYOUTS.items():
+        frames = sorted(find(folder), key=lambda frame: frame.name)
+        if frames:
+            return layout, frames
+    found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
+    raise InputError(
+        f"{folder}: no layout that is known here. It holds {found}. Known: "
+        "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
+        "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
+        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json)."
+    )
+
+
+def _raw(folder: Path) -> Iterable[Frame]:
+    """KITTI raw: a root of dates, or one date; annotated depth inside the drives or beside."""
+    for drive in sorted([*folder.glob("*_sync"), *folder.glob("*/*_sync")]):
+        date = drive.parent
+        annotated = _annotated_folder(folder, drive)
+        for left in _images(drive / "image_02/data"):
+            yield Frame(
+                name=f"{drive.name}_{left.stem}",
+                left=left,
+                right=_partner(drive / "image_03/data", left.stem),
+                calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
+                style="raw",
+                velodyne=_existing(drive / "velodyne_points/data" / f"{left.stem}.bin"),
+                depth=_existing(annotated / f"{left.stem}.png"),
+            )
+
+
+def _annotated_folder(folder: Path, drive: Path) -> Path:
+    inside = "proj_depth/groundtruth/image_02"
+    roots = (folder, folder / "data_depth_annotated")
+    homes = [drive, *(root / part / drive.name for root in roots for part in ("train", "val"))]
+    return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
+
+
+def _object_or_2015(folder: Path) -> Iterable[Frame]:
+    home = folder / "training" if (folder / "training/image_2").is_dir() else folder
+    is_stereo = any((home / name).is_dir() for name in ("disp_occ_0", "disp_noc_0"))
+    for left in _images(home / "image_2"):
+        if is_stereo and not left.stem.endswith("_10"):
+            continue
+        number = left.stem.removesuffix("_10")
+        yield Frame(
+            name=left.stem,
+            left=left,
+            right=_partner(home / "image_3", left.stem),
+            calibration=_existing(home / "calib" / f"{left.stem}.txt")
+            or _existing(home / "calib_cam_to_cam" / f"{number}.txt"),
+            style="object",
+            velodyne=_existing(home / "velodyne" / f"{left.stem}.bin"),
+            depth=_existing(home / "gt_depth_map" / f"{left.stem}.png"),
+            disparity=_existing(home / "disp_occ_0" / f"{left.stem}.png"),
+            disparity_noc=_existing(home / "disp_noc_0" / f"{left.stem}.png"),
+        )
+
+
+def _kitti_2012(folder: Path) -> Iterable[Frame]:
+    home = folder / "training" if (folder / "training/colored_0").is_dir() else folder
+    for left in _images(home / "colored_0"):
+        if left.stem.endswith("_10"):
+            yield Frame(
+                name=left.stem,
+                left=left,
+                right=_partner(home / "colored_1", left.stem),
+                calibration=_existing(home / "calib" / f"{left.stem.removesuffix('_10')}.txt"),
+                style="object",
+                disparity=_existing(home / "disp_occ" / f"{left.stem}.png"),
+                disparity_noc=_existing(home / "disp_noc" / f"{left.stem}.png"),
+            )
+
+
+def _middlebury(folder: Path) -> Iterable[Frame]:
+    for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
+        if (scene / "calib.txt").is_file() and (scene / "im0.png").is_file():
+            yield Frame(
+                name=scene.name,
+                left=scene / "im0.png",
+                right=_existing(scene / "im1.png"),
+                calibration=scene / "calib.txt",
+                style="middlebury",
+                disparity=_existing(scene / "disp0GT.pfm") or _existing(scene / "disp0.pfm"),
+            )
+
+
+def _pairs(folder: Path) -> Iterable[Frame]:
+    camera, text = _existing(folder / "camera.json"), _existing(folder / "calib.txt")
+    for left in _images(folder / "left"):
+        yield Frame(
+            name=left.stem,
+            left=left,
+            right=_partner(folder / "right", left.stem),
+            calibration=camera or text,
+            style="camera" if camera else "plain",
+            depth=_existing(folder / "lidar_depth" / f"{left.stem}.png"),
+            disparity=_existing(folder / "disp_occ" / f"{left.stem}.png"),
+        )
+
+
+LAYOUTS: dict[str, Callable[[Path], Iterable[Frame]]] = {
+    "KITTI raw": _raw,
+    "KITTI object or 2015": _object_or_2015,
+    "KITTI 2012": _kitti_2012,
+    "Middlebury": _middlebury,
+    "pairs": _pairs,
+}
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+
+
+def _partner(folder: Path, stem: str) -> Path | None:
+    candidates = (folder / f"{stem}{ending}" for ending in _IMAGES)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.is_file() else None

@@ -1,0 +1,146 @@
+"""How far a depth or disparity map is from the truth.
+
+All arithmetic is float64, so that a mean does not depend on the order of its terms.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """The seven numbers of Eigen et al. (2014), of one image.
+
+    Attributes:
+        abs_rel: mean of |p - t| / t.
+        sq_rel: mean of (p - t)^2 / t [m].
+        rmse: root of the mean of (p - t)^2 [m].
+        rmse_log: the same of natural logarithms.
+        d1: share of pixels with max(p / t, t / p) < 1.25.
+        d2: the same below 1.25^2.
+        d3: the same below 1.25^3.
+    """
+
+    abs_rel: float
+    sq_rel: float
+    rmse: float
+    rmse_log: float
+    d1: float
+    d2: float
+    d3: float
+
+
+@dataclass(frozen=True)
+class DisparityErrors:
+    """KITTI's stereo measures over a set of pixels.
+
+    Attributes:
+        epe_px: mean end-point error, |p - t|.
+        d1_all: share of pixels off by more than 3 px and by more than 5 % of the truth.
+    """
+
+    epe_px: float
+    d1_all: float
+
+
+def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
+    """Measure predicted against true depth, pixel by pixel.
+
+    Args:
+        predicted_m: positive and finite, already clamped as the protocol says.
+        true_m: positive and finite.
+
+    Raises:
+        InputError: no pixel at all, or a value that is not positive and finite.
+    """
+    _refuse_unusable(predicted_m, "predicted")
+    _refuse_unusable(true_m, "true")
+    p, t = predicted_m.double(), true_m.double()
+    ratio = torch.maximum(p / t, t / p)
+    square = (p - t) ** 2
+    within = [float((ratio < 1.25**k).double().mean()) for k in (1, 2, 3)]
+    return DepthErrors(
+        abs_rel=float(((p - t).abs() / t).mean()),
+        sq_rel=float((square / t).mean()),
+        rmse=float(square.mean().sqrt()),
+        rmse_log=float(((p.log() - t.log()) ** 2).mean().sqrt()),
+        d1=within[0],
+        d2=within[1],
+        d3=within[2],
+    )
+
+
+def disparity_errors(
+    predicted_px: Float[Tensor, " n"], true_px: Float[Tensor, " n"]
+) -> DisparityErrors:
+    """Measure predicted against true disparity; D1 by the KITTI 2015 devkit (both strict).
+
+    Raises:
+        InputError: no pixel at all.
+    """
+    if predicted_px.numel() == 0:
+        raise InputError("disparity_errors: there is no pixel to compare; the truth may be empty.")
+    error = (predicted_px.double() - true_px.double()).abs()
+    is_bad = (error > 3) & (error > 0.05 * true_px.double())
+    return DisparityErrors(float(error.mean()), float(is_bad.double().mean()))
+
+
+def sparsification_area(
+    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"], steps: int = 50
+) -> float:
+    """AUSE: how far removing the least confident pixels is from removing the worst ones.
+
+    Both orders remove 0 %, 2 %, ... of the pixels; the area between the two curves of the mean
+    remaining error, divided by the mean error of all pixels (Ilg et al. 2018). 0 is an oracle;
+    a confidence that knows nothing, such as a constant, gives the area under (1 - oracle).
+
+    Raises:
+        InputError: no pixel at all.
+    """
+    if error.numel() == 0:
+        raise InputError("sparsification_area: there is no pixel to compare.")
+    if float(error.double().mean()) == 0:
+        return 0.0
+    by_confidence = _remaining_error(error.double(), confidence.double(), steps)
+    by_oracle = _remaining_error(error.double(), -error.double(), steps)
+    return float(((by_confidence - by_oracle) / error.double().mean()).mean())
+
+
+def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
+    """Mask of Garg et al. (2016), its corners truncated as in the published script."""
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    rows = slice(int(0.40810811 * height), int(0.99189189 * height))
+    columns = slice(int(0.03594771 * width), int(0.96405229 * width))
+    mask[rows, columns] = True
+    return mask
+
+
+def _remaining_error(
+    error: Float[Tensor, " n"], keep_first: Float[Tensor, " n"], steps: int
+) -> Float[Tensor, " steps"]:
+    """Mean error of what is left, the pixels of low ``keep_first`` removed first.
+
+    Ties share their mean error: the answer does not depend on how equal pixels are ordered.
+    """
+    values, group = keep_first.unique(return_inverse=True)
+    count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))
+    mean = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, error) / count
+    descending = torch.argsort(keep_first, descending=True)
+    running = mean[group[descending]].cumsum(0) / torch.arange(1, len(error) + 1)
+    kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
+    return running[kept.ceil().long().clamp(min=1) - 1]
+
+
+def _refuse_unusable(depth_m: Float[Tensor, " n"], role: str) -> None:
+    if depth_m.numel() == 0:
+        raise InputError("depth_errors: there is no pixel to compare; the truth may be empty.")
+    if not bool((torch.isfinite(depth_m) & (depth_m > 0)).all()):
+        raise InputError(
+            f"depth_errors: the {role} depth holds values that are not positive and finite; mask "
+            "or clamp them first, as the protocol says."
+        )

@@ -1,0 +1,134 @@
+"""Estimates as files: what they are called, writing them all or nothing, reading them back."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera, StereoRig, back_project
+from depthpose.core.draw import draw_depth, draw_disparity
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    Cloud,
+    read_map,
+    write_cloud,
+    write_depth_png,
+    write_image,
+    write_map,
+)
+from depthpose.core.run import claim_folder
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+_READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
+
+
+def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> None:
+    """Write the files of one estimate; the disparity comes last and marks the frame as finished.
+
+    ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
+    ``NAME.color.png``, ``NAME.right.png`` (synthesised) and ``NAME.disparity_px.npy``, each where
+    the estimate has it.
+    """
+    base = folder / pair.name
+    if estimate.depth_m is not None:
+        write_map(_file(base, "depth_m.npy"), estimate.depth_m)
+        write_depth_png(_file(base, "depth.png"), estimate.depth_m)
+    if estimate.confidence is not None:
+        write_map(_file(base, "confidence.npy"), estimate.confidence)
+    if estimate.right is not None:
+        write_image(_file(base, "right.png"), estimate.right)
+    picture = (
+        draw_disparity(estimate.disparity_px)
+        if estimate.depth_m is None
+        else draw_depth(estimate.depth_m)
+    )
+    write_image(_file(base, "color.png"), picture)
+    write_map(_file(base, "disparity_px.npy"), estimate.disparity_px)
+
+
+def write_estimate_cloud(
+    folder: Path, pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0
+) -> None:
+    """Write ``NAME.ply``: the coloured points nearer than ``far_m`` in the left camera's frame."""
+    if estimate.depth_m is None or pair.camera is None:
+        raise InputError(f"{pair.name}: a cloud needs metres: give a camera with a baseline.")
+    points_m = back_project(estimate.depth_m, pair.camera.K).reshape(-1, 3)
+    is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
+    color = pair.left.permute(1, 2, 0).reshape(-1, 3)
+    cloud = Cloud(points=points_m[is_kept].float(), color=color[is_kept])
+    write_cloud(_file(folder / pair.name, "ply"), cloud)
+
+
+def is_finished(folder: Path, name: str) -> bool:
+    """Whether an earlier run left the estimate of this frame."""
+    return _file(folder / name, "disparity_px.npy").is_file()
+
+
+def has_prediction(folder: Path, name: str) -> bool:
+    """Whether the folder holds a prediction of this frame, ours or anybody's."""
+    return any(_file(folder / name, ending).is_file() for ending in _READABLE)
+
+
+def read_disparity(folder: Path, name: str, camera: Camera | None) -> Float[Tensor, "h w"]:
+    """Read one predicted disparity [px at its own width], ours or anybody's.
+
+    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; a ``NAME.depth_m.npy`` alone is turned
+    into disparity by the rig.
+
+    Raises:
+        InputError: neither file is there, or depth without a rig.
+    """
+    base = folder / name
+    for ending in _READABLE[:2]:
+        if (path := _file(base, ending)).is_file():
+            return read_map(path)
+    path = _file(base, "depth_m.npy")
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: no prediction for frame {name!r}. Expected {name}.disparity_px.npy (pixels "
+            f"at the map's own width) or {name}.depth_m.npy."
+        )
+    depth_m = read_map(path)
+    if not isinstance(camera, StereoRig):
+        raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
+    # The map may have a size of its own: its disparity is counted in its own pixels.
+    return disparity_from_depth(depth_m, camera) * (depth_m.shape[1] / camera.width)
+
+
+def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
+    """Read the confidence beside a prediction, or None where there is none."""
+    path = _file(folder / name, "confidence.npy")
+    return read_map(path) if path.is_file() else None
+
+
+def predict(
+    net: FakestereoNet,
+    inputs: Iterable[Callable[[], StereoInput]],
+    names: list[str],
+    folder: Path,
+    settings: dict[str, Any],
+) -> Iterable[str]:
+    """Estimate what is not finished yet, one frame at a time, and yield each name.
+
+    Args:
+        net: the estimator.
+        inputs: readers of the inputs, called only for unfinished frames.
+        names: their names, in the same order.
+        folder: where the files go; refused if other settings made what it holds.
+        settings: what decides the results.
+    """
+    claim_folder(folder, settings)
+    for read_input, name in zip(inputs, names, strict=True):
+        if not is_finished(folder, name):
+            pair = read_input()
+            write_estimate(folder, pair, net.estimate_pair(pair))
+        yield name
+
+
+def _file(base: Path, ending: str) -> Path:
+    return base.with_name(f"{base.name}.{ending}")

@@ -1,0 +1,205 @@
+"""PSMNet as it is run: the same function as ``psmnet.PSMNet``, faster and in bounded memory.
+
+- Batch norm is folded; tensors keep their channels last, which convolutions like best.
+- The first volume convolution runs on the two views, and no concatenation volume is ever made.
+- Volumes are computed by slabs of rows. Only one full-size volume, ``cost0``, is held whole.
+- The soft arg-min enlarges the cost a few rows at a time.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.depth.stereo.expectation import Size, expected_disparity
+from depthpose.depth.stereo.first_layer import FirstLayer, LookedPair
+from depthpose.depth.stereo.folding import RowsConv, fold_features, folded_weight
+from depthpose.depth.stereo.psmnet import Head, Hourglass, PSMNet
+from depthpose.depth.stereo.slabs import Slab, convolve, spans, whole
+from depthpose.depth.types import Match
+
+View = Float[Tensor, "3 h w"]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How much is computed at a time.
+
+    Attributes:
+        rows: quarter-size rows of a slab, even.
+        chunk_bytes: size of one piece of the soft arg-min.
+    """
+
+    rows: int = 12
+    chunk_bytes: int = 4 << 20
+
+
+class PSMNetInference:
+    """A trained PSMNet made ready to run; the weights are copied.
+
+    Args:
+        network: the trained network.
+        dtype: what volumes and features are computed in; the soft arg-min is float32 at least.
+        with_compile: compile the feature extractor with torch.compile.
+    """
+
+    def __init__(
+        self, network: PSMNet, dtype: torch.dtype = torch.float32, *, with_compile: bool = False
+    ) -> None:
+        self.config = network.config
+        features = copy.deepcopy(network.features).eval()
+        fold_features(features)
+        features = features.to(dtype).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.features = torch.compile(features) if with_compile else features
+        self._like = torch.empty(0, dtype=dtype, device=next(network.parameters()).device)
+        first, second = network.dres0
+        self.first = FirstLayer(*folded_weight(first), self._like)
+        self.residual = [RowsConv(layer, self._like) for layer in (second, *network.dres1)]
+        self.hourglasses = [_FoldedHourglass(h, self._like) for h in network.hourglasses]
+        self.heads = [_FoldedHead(h, self._like) for h in network.heads]
+
+    @torch.inference_mode()
+    def match(
+        self, left: View, right: View, steps: Steps, *, with_confidence: bool = False
+    ) -> Match:
+        """Match one normalised pair whose sides suit the network."""
+        cost = self.cost(left, right, steps)
+        wide = cost if cost.dtype == torch.float64 else cost.float()
+        size = Size(self.config.max_disparity_px, left.shape[1], left.shape[2])
+        disparity_px, confidence = expected_disparity(
+            wide,
+            size,
+            align_corners=self.config.align_corners,
+            chunk_bytes=steps.chunk_bytes,
+            with_confidence=with_confidence,
+        )
+        return Match(disparity_px=disparity_px, confidence=confidence)
+
+    def cost(self, left: View, right: View, steps: Steps) -> Float[Tensor, "h4 w4 d4"]:
+        """Answer the cost after the last hourglass."""
+        cost0 = whole(self._cost0(self._look(left, right), steps))
+        pass_ = _Pass(self, cost0, steps)
+        for index in range(3):
+            pass_.run(index)
+        return pass_.finish()
+
+    def _look(self, left: View, right: View) -> LookedPair:
+        pair = torch.stack([left, right]).to(self._like)
+        views = self.features(pair.contiguous(memory_format=torch.channels_last))
+        return self.first.look(views[:1], views[1:], self.config.max_disparity_px // 4)
+
+    def _cost0(self, pair: LookedPair, steps: Steps) -> Float[Tensor, "1 c h d w"]:
+        """Run the layers before the hourglasses."""
+        height = pair.height
+        cost0 = empty_volume(self._like, self.config.width, (height, pair.bins, pair.width))
+        for first, stop in spans(height, steps.rows):
+            begin, end = max(first - 3, 0), min(stop + 3, height)
+            x = Slab(pair.rows(begin, end), begin, height)
+            x = relu(convolve(self.residual[0], x, first - 2, stop + 2))
+            y = relu(convolve(self.residual[1], x, first - 1, stop + 1))
+            y = convolve(self.residual[2], y, first, stop).values
+            torch.add(y, x.rows(first, stop), out=cost0[:, :, first:stop])
+        return cost0
+
+
+class _FoldedHourglass:
+    def __init__(self, hourglass: Hourglass, like: Tensor) -> None:
+        self.down1 = RowsConv(hourglass.down1, like)
+        self.same1 = RowsConv(hourglass.same1, like)
+        self.down2 = RowsConv(hourglass.down2, like)
+        self.same2 = RowsConv(hourglass.same2, like)
+        self.up2 = RowsConv(hourglass.up2, like)
+        self.up1 = RowsConv(hourglass.up1, like)
+
+
+class _FoldedHead:
+    def __init__(self, head: Head, like: Tensor) -> None:
+        self.hidden = RowsConv(head.hidden, like)
+        self.cost = RowsConv(head.cost, like)
+
+
+class _Pass:
+    """One walk through the hourglasses, and the half-size volumes that it has to remember."""
+
+    def __init__(self, net: PSMNetInference, cost0: Slab, steps: Steps) -> None:
+        self.net, self.cost0, self.steps = net, cost0, steps
+        _, c, h, d, w = cost0.values.shape
+        self.half = (2 * c, (h // 2, d // 2, w // 2))
+        self.cost = cost0.values.new_zeros(h, d, w)
+        self.first_down: Slab | None = None
+        self.up: Slab | None = None
+
+    def run(self, index: int) -> None:
+        """Walk through hourglass ``index``; what it adds is made where it is next looked at."""
+        hourglass = self.net.hourglasses[index]
+        down = self._same1(hourglass, self._down1(hourglass, index))
+        deep = relu(convolve(hourglass.down2, down, 0, down.height // 2))
+        deep = relu(convolve(hourglass.same2, deep, 0, deep.height))
+        self.first_down = self.first_down or down
+        self.up = self._up2(hourglass, deep, self.first_down)
+
+    def finish(self) -> Float[Tensor, "h4 w4 d4"]:
+        """Score the volume after the last hourglass."""
+        for first, stop in spans(self.cost0.height, self.steps.rows):
+            self._score(2, self._refined(3, first, stop), first, stop)
+        return self.cost.transpose(1, 2).contiguous()
+
+    def _refined(self, index: int, first: int, stop: int) -> Slab:
+        """Input of hourglass ``index``, rows ``first - 2 .. stop + 1``."""
+        if index == 0:
+            return self.cost0
+        assert self.up is not None
+        x = convolve(self.net.hourglasses[index - 1].up1, self.up, first - 2, stop + 2)
+        x.values.add_(self.cost0.rows(x.first, x.first + x.values.shape[2]))
+        return x
+
+    def _down1(self, hourglass: _FoldedHourglass, index: int) -> Slab:
+        half = empty_volume(self.cost0.values, *self.half)
+        for first, stop in spans(self.cost0.height, self.steps.rows):
+            x = self._refined(index, first, stop)
+            if index:
+                self._score(index - 1, x, first, stop)
+            y = convolve(hourglass.down1, x, first // 2, stop // 2)
+            torch.clamp_min(y.values, 0, out=half[:, :, first // 2 : stop // 2])
+        return whole(half)
+
+    def _score(self, index: int, x: Slab, first: int, stop: int) -> None:
+        head = self.net.heads[index]
+        hidden = relu(convolve(head.hidden, x, first - 1, stop + 1))
+        self.cost[first:stop] += convolve(head.cost, hidden, first, stop).values[0, 0]
+
+    def _same1(self, hourglass: _FoldedHourglass, x: Slab) -> Slab:
+        """Second layer on the way down, plus what came up from the hourglass before."""
+        out = torch.empty_like(x.values)
+        for first, stop in spans(x.height, self.steps.rows):
+            y = convolve(hourglass.same1, x, first, stop).values
+            if self.up is not None:
+                y += self.up.rows(first, stop)
+            torch.clamp_min(y, 0, out=out[:, :, first:stop])
+        return whole(out)
+
+    def _up2(self, hourglass: _FoldedHourglass, deep: Slab, first_down: Slab) -> Slab:
+        out = torch.empty_like(first_down.values)
+        for first, stop in spans(first_down.height, self.steps.rows):
+            y = convolve(hourglass.up2, deep, first, stop).values
+            y += first_down.rows(first, stop)
+            torch.clamp_min(y, 0, out=out[:, :, first:stop])
+        return whole(out)
+
+
+def relu(slab: Slab) -> Slab:
+    """Clamp at zero, in place."""
+    slab.values.relu_()
+    return slab
+
+
+def empty_volume(like: Tensor, channels: int, size: tuple[int, int, int]) -> Tensor:
+    """Make a volume ``(1, channels, *size)`` whose channels stand last in memory."""
+    return torch.empty(
+        (1, channels, *size),
+        dtype=like.dtype,
+        device=like.device,
+        memory_format=torch.channels_last_3d,
+    )

@@ -1,0 +1,141 @@
+"""What a stereo matcher is, what it takes, and the tenant that wraps a function of the user's."""
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.depth.types import Match
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """Anything that turns a rectified pair into the disparity of its left image."""
+
+    def match(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair.
+
+        Args:
+            left: left image, ``(3, H, W)`` RGB in [0, 1], float32.
+            right: right image, the same size.
+
+        Raises:
+            InputError: the images are no such pair, or this matcher cannot take them.
+        """
+        ...
+
+
+class CallableMatcher:
+    """A function of the user's as a matcher.
+
+    Example::
+
+        matcher = CallableMatcher(lambda left, right: my_network(left[None], right[None])[0])
+
+    Args:
+        function: takes the two images and answers disparity [px] of the left one, ``(H, W)``,
+            as a tensor or array; NaN where it has no answer.
+        with_numpy_images: give the function ``(H, W, 3)`` arrays instead of tensors.
+    """
+
+    def __init__(
+        self, function: Callable[[Any, Any], Any], *, with_numpy_images: bool = False
+    ) -> None:
+        if not callable(function):
+            raise InputError(f"CallableMatcher needs a function of two images, got {function!r}")
+        self.function = function
+        self.with_numpy_images = with_numpy_images
+
+    def match(self, left: Tensor, right: Tensor) -> Match:
+        """Ask the function, and refuse an answer that is no disparity map.
+
+        Raises:
+            InputError: unusable images, or an answer of another type or size, infinite, negative,
+                or without a single value.
+        """
+        check_pair(left, right)
+        answer = self.function(self._given(left), self._given(right))
+        disparity_px = _as_map(answer)
+        size = tuple(left.shape[-2:])
+        if tuple(disparity_px.shape) != size:
+            raise InputError(
+                f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
+                f"{size}; let it answer one disparity a pixel"
+            )
+        _check_values(disparity_px)
+        return Match(disparity_px=disparity_px)
+
+    def _given(self, image: Tensor) -> Tensor | np.ndarray:
+        return image.permute(1, 2, 0).cpu().numpy() if self.with_numpy_images else image
+
+
+def check_pair(left: Tensor, right: Tensor) -> None:
+    """Refuse what is not a pair of images, with a remedy.
+
+    Raises:
+        InputError: not tensors, not ``(3, H, W)``, not float, empty, of two sizes, not finite or
+            not in [0, 1].
+    """
+    for name, image in (("left", left), ("right", right)):
+        _check_image(name, image)
+    if left.shape != right.shape:
+        raise InputError(
+            f"left image is {_size(left)} and right image {_size(right)}; a rectified pair has one "
+            f"size: crop or resize both alike"
+        )
+
+
+def _check_image(name: str, image: Tensor) -> None:
+    if not isinstance(image, Tensor):
+        raise InputError(
+            f"{name} image must be a tensor, got {type(image).__name__}; read files with "
+            f"core.files.read_image, or use torch.from_numpy"
+        )
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise InputError(
+            f"{name} image must have shape (3, H, W), got {tuple(image.shape)}; move channels "
+            f"first, drop alpha, repeat grey three times, and match pairs one by one"
+        )
+    if not image.is_floating_point():
+        raise InputError(f"{name} image must be float in [0, 1], got {image.dtype}; divide by 255")
+    if not image.numel():
+        raise InputError(f"{name} image is empty: shape {tuple(image.shape)}; give it pixels")
+    if not bool(torch.isfinite(image).all()):
+        raise InputError(f"{name} image holds NaN or infinite values; replace or mask them first")
+    low, high = float(image.min()), float(image.max())
+    if low < -1e-3 or high > 1 + 1e-3:
+        raise InputError(
+            f"{name} image must lie in [0, 1], got {low:.4g} .. {high:.4g}; divide 8-bit values by "
+            f"255 and do not normalise: the matcher does"
+        )
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[-2]}x{image.shape[-1]}"
+
+
+def _as_map(answer: object) -> Tensor:
+    if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
+        answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
+    if not isinstance(answer, Tensor) or answer.is_complex():
+        raise InputError(
+            f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
+            f"array of disparities"
+        )
+    return answer.detach().to(torch.float32)
+
+
+def _check_values(disparity_px: Tensor) -> None:
+    if bool(disparity_px.isinf().any()):
+        raise InputError("the wrapped matcher answered infinite disparity; use NaN for no answer")
+    if bool(disparity_px.isnan().all()):
+        raise InputError("the wrapped matcher answered NaN for every pixel; is the pair rectified?")
+    if bool((disparity_px < 0).any()):
+        raise InputError(
+            f"the wrapped matcher answered negative disparity (least "
+            f"{float(disparity_px.nan_to_num(0).min()):.4g} px); is the pair swapped? NaN says no "
+            f"answer"
+        )

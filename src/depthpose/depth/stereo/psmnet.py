@@ -1,0 +1,176 @@
+"""PSMNet, stacked hourglass: a rectified pair to disparity (Chang and Chen, CVPR 2018).
+
+This is the network as it is trained, said plainly. ``inference`` runs the same weights faster
+and in bounded memory.
+"""
+
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import PSMNetConfig
+from depthpose.depth.stereo.features import ConvNorm, FeatureExtractor
+
+Volume = Float[Tensor, "b c d h w"]
+Maps = Float[Tensor, "b h w"]
+
+
+def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:
+    """Make a 3x3x3 convolution with batch norm."""
+    conv = nn.Conv3d(inputs, outputs, 3, stride, 1, bias=False)
+    return ConvNorm(conv, nn.BatchNorm3d(outputs))
+
+
+def deconv_norm_3d(inputs: int, outputs: int) -> ConvNorm:
+    """Make a transposed 3x3x3 convolution that doubles the size, with batch norm."""
+    conv = nn.ConvTranspose3d(inputs, outputs, 3, 2, 1, output_padding=1, bias=False)
+    return ConvNorm(conv, nn.BatchNorm3d(outputs))
+
+
+class Hourglass(nn.Module):
+    """Down to a quarter of the volume and back, to let far evidence reach each voxel."""
+
+    def __init__(self, c: int) -> None:
+        super().__init__()
+        self.down1 = conv_norm_3d(c, 2 * c, stride=2)
+        self.same1 = conv_norm_3d(2 * c, 2 * c)
+        self.down2 = conv_norm_3d(2 * c, 2 * c, stride=2)
+        self.same2 = conv_norm_3d(2 * c, 2 * c)
+        self.up2 = deconv_norm_3d(2 * c, 2 * c)
+        self.up1 = deconv_norm_3d(2 * c, c)
+
+    def forward(
+        self, x: Volume, first: Volume | None, before: Volume | None
+    ) -> tuple[Volume, Volume, Volume]:
+        """Answer the volume to add, and the half-size volumes going down and coming up.
+
+        Args:
+            x: what the hourglass refines.
+            first: half-size volume of the first hourglass going down; None in the first itself.
+            before: half-size volume of the hourglass before, coming up; None in the first.
+        """
+        down = self.same1(F.relu(self.down1(x)))
+        down = F.relu(down if before is None else down + before)
+        up = self.up2(F.relu(self.same2(F.relu(self.down2(down)))))
+        up = F.relu(up + (down if first is None else first))
+        return self.up1(up), down, up
+
+
+class Head(nn.Module):
+    """Volume of features to one cost a voxel; a larger cost means a likelier match."""
+
+    def __init__(self, c: int) -> None:
+        super().__init__()
+        self.hidden = conv_norm_3d(c, c)
+        self.cost = nn.Conv3d(c, 1, 3, 1, 1, bias=False)
+
+    def forward(self, x: Volume) -> Volume:
+        """Score each voxel."""
+        return self.cost(F.relu(self.hidden(x)))
+
+
+def concatenation_volume(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
+) -> Volume:
+    """Put left features beside the right ones that each disparity would match them with.
+
+    Voxel ``(d, y, x)`` holds ``left[y, x]`` and ``right[y, x - d]``, or zeros where the right
+    pixel falls outside the image.
+    """
+    b, c, h, w = left.shape
+    volume = left.new_zeros(b, 2 * c, bins, h, w)
+    for d in range(min(bins, w)):
+        volume[:, :c, d, :, d:] = left[..., d:]
+        volume[:, c:, d, :, d:] = right[..., : w - d]
+    return volume
+
+
+def soft_argmin(cost: Volume, size: tuple[int, int, int], *, align_corners: bool) -> Maps:
+    """Enlarge the cost to ``size`` (disparities, rows, columns) and take the expected disparity.
+
+    ``sum_d d softmax(cost)_d`` [px], eq. 2.2 of the thesis; costs are likelihoods here, so no
+    sign stands before them.
+    """
+    full = F.interpolate(cost, size=size, mode="trilinear", align_corners=align_corners)[:, 0]
+    disparity_px = torch.arange(size[0], dtype=full.dtype, device=full.device)
+    return (full.softmax(1) * disparity_px[:, None, None]).sum(1)
+
+
+class PSMNet(nn.Module):
+    """Rectified pair to disparity: features, concatenation volume, three hourglasses, three heads.
+
+    Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 16 and
+    at least ``config.min_side_px``. The default size has 5,224,768 parameters.
+    """
+
+    def __init__(self, config: PSMNetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or PSMNetConfig()
+        c = self.config.width
+        self.features = FeatureExtractor(self.config)
+        self.dres0 = nn.ModuleList([conv_norm_3d(2 * c, c), conv_norm_3d(c, c)])
+        self.dres1 = nn.ModuleList([conv_norm_3d(c, c), conv_norm_3d(c, c)])
+        self.hourglasses = nn.ModuleList([Hourglass(c) for _ in range(3)])
+        self.heads = nn.ModuleList([Head(c) for _ in range(3)])
+        self.apply(_initialise)
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Maps, ...]:
+        """Match the pair.
+
+        Returns:
+            Disparity of the left view [px]: after each of the three hourglasses while training,
+            after the last alone in eval mode. The last is always the answer.
+
+        Raises:
+            InputError: the images' size does not suit the network.
+        """
+        self._check_size(left)
+        size = (self.config.max_disparity_px, left.shape[-2], left.shape[-1])
+        costs = self.costs(left, right)
+        align = self.config.align_corners
+        return tuple(
+            soft_argmin(cost, size, align_corners=align)
+            for cost in (costs if self.training else costs[-1:])
+        )
+
+    def costs(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Volume, Volume, Volume]:
+        """Answer the quarter-size cost after each hourglass; each adds to the one before."""
+        bins = self.config.max_disparity_px // 4
+        cost0 = self._aggregate(
+            concatenation_volume(self.features(left), self.features(right), bins)
+        )
+        x, first, before, costs = cost0, None, None, []
+        for hourglass, head in zip(self.hourglasses, self.heads, strict=True):
+            refined, down, before = hourglass(x, first, before)
+            first = down if first is None else first
+            x = refined + cost0
+            costs.append(head(x) + costs[-1] if costs else head(x))
+        return cast("tuple[Volume, Volume, Volume]", tuple(costs))
+
+    def _aggregate(self, volume: Volume) -> Volume:
+        x = F.relu(self.dres0[1](F.relu(self.dres0[0](volume))))
+        return self.dres1[1](F.relu(self.dres1[0](x))) + x
+
+    def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
+        h, w = image.shape[-2:]
+        least = self.config.min_side_px
+        if h % 16 or w % 16 or min(h, w) < least:
+            raise InputError(
+                f"PSMNet takes sides that are multiples of 16 and at least {least} px, got "
+                f"{h}x{w}; pad the pair, as PSMNetMatcher does"
+            )
+
+
+def _initialise(module: nn.Module) -> None:
+    """Draw weights as the authors did: deconvolutions keep PyTorch's default."""
+    if isinstance(module, nn.Conv2d | nn.Conv3d):
+        taps = module.weight[0, 0].numel()
+        nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)

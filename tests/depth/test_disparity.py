@@ -1,0 +1,77 @@
+import pytest
+import torch
+from torch import Tensor
+
+from depthpose.core.camera import StereoRig
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    disparity_from_depth,
+    left_right_difference_px,
+    resize_disparity,
+    warp_right_to_left,
+)
+
+
+def rig(offset_px: float = 0.0, f: float = 100.0) -> StereoRig:
+    K = torch.tensor([[f, 0, 20], [0, f, 10], [0, 0, 1]], dtype=torch.float64)
+    return StereoRig(width=40, height=20, K=K, baseline_m=0.5, cx_right_minus_left_px=offset_px)
+
+
+def test_depth_of_a_worked_example() -> None:
+    disparity_px = torch.tensor([[5.0, 50.0]])
+    assert depth_from_disparity(disparity_px, rig()).tolist() == [[10.0, 1.0]]
+    assert depth_from_disparity(disparity_px, rig(offset_px=5.0))[0, 0].item() == 5.0
+
+
+@pytest.mark.parametrize("offset_px", [0.0, 7.5])
+def test_disparity_and_depth_undo_each_other(offset_px: float) -> None:
+    disparity_px = torch.rand(6, 7) * 90 + 1
+    there = depth_from_disparity(disparity_px, rig(offset_px))
+    torch.testing.assert_close(disparity_from_depth(there, rig(offset_px)), disparity_px)
+
+
+@pytest.mark.parametrize("value", [0.0, -3.0, torch.nan])
+def test_no_depth_without_positive_disparity(value: float) -> None:
+    assert bool(torch.isnan(depth_from_disparity(torch.tensor([[value]]), rig())).all())
+    assert bool(torch.isnan(disparity_from_depth(torch.tensor([[value]]), rig())).all())
+
+
+def test_resizing_keeps_the_depth_of_a_slanted_plane() -> None:
+    plane = torch.linspace(10, 20, 32).expand(16, 32).contiguous()
+    half = resize_disparity(plane, 8, 16)
+    inner = (plane[::2, 0::2] + plane[::2, 1::2]) / 2
+    torch.testing.assert_close(half, inner / 2)
+
+
+def test_resizing_to_its_own_size_changes_nothing() -> None:
+    disparity_px = torch.rand(5, 9)
+    assert torch.equal(resize_disparity(disparity_px, 5, 9), disparity_px)
+
+
+def test_warping_by_zero_is_the_identity() -> None:
+    right = torch.rand(3, 6, 8)
+    torch.testing.assert_close(warp_right_to_left(right, torch.zeros(6, 8)), right)
+
+
+@pytest.mark.parametrize("shift", [1, 3])
+def test_warping_by_whole_pixels_moves_columns(shift: int) -> None:
+    right = torch.rand(3, 6, 8)
+    warped = warp_right_to_left(right, torch.full((6, 8), float(shift)))
+    torch.testing.assert_close(warped[..., shift:], right[..., :-shift])
+    assert bool(torch.isnan(warped[..., :shift]).all())
+
+
+def test_warping_lets_gradient_reach_the_disparity() -> None:
+    disparity_px = torch.full((4, 8), 1.5, requires_grad=True)
+    warped = warp_right_to_left(torch.rand(3, 4, 8), disparity_px)
+    warped.nan_to_num(0.0).sum().backward()
+    assert isinstance(disparity_px.grad, Tensor)
+    assert bool(torch.isfinite(disparity_px.grad).all())
+
+
+def test_both_views_of_one_surface_agree() -> None:
+    left_px, right_px = torch.full((4, 9), 2.0), torch.full((4, 9), 2.0)
+    right_px[:, 5] = 4.0
+    difference = left_right_difference_px(left_px, right_px)
+    assert bool(torch.isnan(difference[:, :2]).all())
+    assert difference[0, 2:].tolist() == [0, 0, 0, 0, 0, 2, 0]

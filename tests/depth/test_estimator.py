@@ -1,0 +1,103 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from depthpose import FakestereoNet
+from depthpose.core.camera import Camera, StereoRig, write_camera
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_image
+from depthpose.demo.scene import make_street
+from depthpose.depth.stereo import CallableMatcher
+from depthpose.depth.types import StereoSample
+
+
+@pytest.fixture(scope="module")
+def street() -> StereoSample:
+    return make_street(0.4)
+
+
+def test_the_street_is_estimated_in_metres(street: StereoSample) -> None:
+    pair, truth_m = street.input, street.truth.depth_m
+    assert pair.right is not None
+    assert truth_m is not None
+    net = FakestereoNet.load(matcher="sgbm")
+    estimate = net.estimate(pair.left, pair.camera, right=pair.right)
+    assert estimate.depth_m is not None
+    error = ((estimate.depth_m - truth_m).abs() / truth_m).nanmedian()
+    assert error < 0.03
+
+
+def test_files_arrays_and_tensors_give_one_answer(street: StereoSample, tmp_path: Path) -> None:
+    pair = street.input
+    assert pair.right is not None
+    assert pair.camera is not None
+    left, right = (
+        (image.permute(1, 2, 0) * 255).round().byte().numpy() for image in (pair.left, pair.right)
+    )
+    write_image(tmp_path / "l.png", pair.left)
+    write_image(tmp_path / "r.png", pair.right)
+    write_camera(tmp_path / "c.json", pair.camera)
+    net = FakestereoNet.load(matcher="sgbm")
+    by_file = net.estimate(str(tmp_path / "l.png"), tmp_path / "c.json", right=tmp_path / "r.png")
+    by_array = net.estimate(left, pair.camera, right=right)
+    assert torch.equal(by_file.disparity_px.nan_to_num(0), by_array.disparity_px.nan_to_num(0))
+
+
+def test_without_a_camera_there_is_disparity_only() -> None:
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) + 5))
+    image = np.zeros((20, 30, 3), np.uint8)
+    estimate = net.estimate(image, None, right=image, with_check=False)
+    assert estimate.depth_m is None
+    assert estimate.disparity_px.shape == (20, 30)
+
+
+def _camera(width: int) -> Camera:
+    return Camera(width=width, height=20, K=_intrinsics())
+
+
+def _intrinsics() -> torch.Tensor:
+    return torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("right", "camera", "message"),
+    [
+        (None, None, "there is no right image.*give right="),
+        (torch.zeros(3, 20, 31), None, "left image is 30x20 and the right one 31x20"),
+        (torch.zeros(3, 20, 30), _camera(30), 'Add "baseline_m"'),
+        (torch.zeros(3, 20, 30), _camera(60), "60"),
+    ],
+)
+def test_an_unusable_pair_is_refused(
+    right: torch.Tensor | None, camera: Camera | None, message: str
+) -> None:
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)))
+    with pytest.raises(InputError, match=message):
+        net.estimate(torch.zeros(3, 20, 30), camera, right=right)
+
+
+def test_a_swapped_pair_is_recognised(street: StereoSample) -> None:
+    pair = street.input
+    net = FakestereoNet.load(matcher="sgbm")
+    assert pair.right is not None
+    with pytest.raises(InputError, match=r"street: .*swap"):
+        net.estimate(pair.right, pair.camera, right=pair.left, name="street")
+
+
+@pytest.mark.parametrize(
+    ("weights", "matcher"), [(None, None), (None, "psmnet"), ("w.safetensors", "sgbm")]
+)
+def test_a_matcher_and_its_weights_belong_together(weights: str, matcher: str) -> None:
+    with pytest.raises(InputError, match=r"'psmnet' needs a weights file and 'sgbm' takes none"):
+        FakestereoNet.load(weights, matcher=matcher)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_rig_decides_the_metres() -> None:
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3))
+    image = torch.zeros(3, 20, 30)
+    rig = StereoRig(width=30, height=20, K=_intrinsics(), baseline_m=0.2)
+    estimate = net.estimate(image, rig, right=image, with_check=False)
+    assert estimate.depth_m is not None
+    assert estimate.depth_m[0, 0].item() == pytest.approx(2.0)

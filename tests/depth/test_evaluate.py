@@ -1,0 +1,193 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
+from depthpose.depth.disparity import depth_from_disparity
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.evaluate import clamped_depth, evaluate
+from depthpose.depth.kitti import Dataset, open_dataset
+from depthpose.depth.predictions import (
+    is_finished,
+    predict,
+    read_disparity,
+    write_estimate,
+    write_estimate_cloud,
+)
+from depthpose.depth.stereo import CallableMatcher
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+W, H = 64, 32
+
+
+def rig() -> StereoRig:
+    K = torch.tensor([[80.0, 0, 31], [0, 80, 15], [0, 0, 1]], dtype=torch.float64)
+    return StereoRig(width=W, height=H, K=K, baseline_m=0.5)
+
+
+def truth_px(k: int) -> torch.Tensor:
+    return 2 + k + torch.arange(H * W).reshape(H, W) % 7 / 4
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Dataset:
+    """Two pairs with exact disparity and depth, and one without truth."""
+    home = tmp_path / "data"
+    for k, name in enumerate("abc"):
+        write_image(home / "left" / f"{name}.png", torch.rand(3, H, W))
+        write_image(home / "right" / f"{name}.png", torch.rand(3, H, W))
+        if name != "c":
+            write_disparity_png(home / "disp_occ" / f"{name}.png", truth_px(k))
+            depth_m = depth_from_disparity(truth_px(k), rig())
+            write_depth_png(home / "lidar_depth" / f"{name}.png", depth_m)
+    write_camera(home / "camera.json", rig())
+    return open_dataset(home)
+
+
+def write_predictions(folder: Path, change: Callable[[torch.Tensor], torch.Tensor]) -> Path:
+    for k, name in enumerate("abc"):
+        write_map(folder / f"{name}.disparity_px.npy", change(truth_px(k)))
+    return folder
+
+
+def test_perfect_disparity_has_no_error(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: d)
+    result = evaluate(pairs, folder, "kitti-2015")
+    assert result.rows[0]["epe_px"] == 0
+    assert result.rows[0]["d1_all"] == 0
+    assert result.rows[0]["frames"] == 2
+    assert result.skipped == {"c": "no truth of the kind disparity"}
+
+
+def test_perfect_disparity_has_perfect_depth(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: d)
+    for row in evaluate(pairs, folder, "eigen-improved").rows:
+        assert row["abs_rel"] < 1e-3  # the truth is stored in steps of 1/256 m
+        assert row["d1"] == 1.0
+        assert row["coverage"] == 1.0
+
+
+def test_a_prediction_of_half_the_size_is_scaled(pairs: Dataset, tmp_path: Path) -> None:
+    for name in "abc":
+        write_map(tmp_path / "p" / f"{name}.disparity_px.npy", torch.full((H // 2, W // 2), 3.0))
+    whole = write_predictions(tmp_path / "w", lambda d: torch.full_like(d, 6.0))
+    half = evaluate(pairs, tmp_path / "p", "kitti-2015").rows
+    assert half == evaluate(pairs, whole, "kitti-2015").rows
+
+
+def test_depth_files_of_others_count_as_disparity(pairs: Dataset, tmp_path: Path) -> None:
+    for k, name in enumerate("abc"):
+        depth_m = depth_from_disparity(truth_px(k), rig())
+        write_map(tmp_path / "p" / f"{name}.depth_m.npy", depth_m)
+    assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0]["epe_px"] < 1e-5
+
+
+def test_pixels_without_prediction_lower_the_coverage(pairs: Dataset, tmp_path: Path) -> None:
+    def leave_out(d: torch.Tensor) -> torch.Tensor:
+        return torch.where(torch.arange(W) < W // 4, torch.nan, d)
+
+    row = evaluate(pairs, write_predictions(tmp_path / "p", leave_out), "kitti-2015").rows[0]
+    assert row["coverage"] == 0.75
+    assert row["epe_px"] == 0
+
+
+def test_a_frame_without_any_usable_pixel_is_said(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: torch.full_like(d, torch.nan))
+    with pytest.raises(InputError, match="no pixel to compare"):
+        evaluate(pairs, folder, "kitti-2015")
+
+
+def test_caps_have_a_row_each_and_clamp(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: torch.full_like(d, 1e-3))
+    rows = evaluate(pairs, folder, "eigen-raw-camera", caps_m=(80.0, 50.0, 15.0)).rows
+    assert [row["cap_m"] for row in rows] == [80.0, 50.0, 15.0]
+    assert rows[0]["rmse"] > rows[1]["rmse"] > rows[2]["rmse"]
+    assert rows[2]["pixels"] < rows[0]["pixels"]
+
+
+def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
+    def spoil(d: torch.Tensor) -> torch.Tensor:
+        return d + torch.arange(W) / W
+
+    folder = write_predictions(tmp_path / "p", spoil)
+    for name in "abc":
+        write_map(folder / f"{name}.confidence.npy", 1 - torch.arange(W).expand(H, W) / W)
+    good = evaluate(pairs, folder, "kitti-2015").rows[0]["ause"]
+    for name in "abc":
+        write_map(folder / f"{name}.confidence.npy", torch.arange(W).expand(H, W) / W)
+    assert good < 0.01 < evaluate(pairs, folder, "kitti-2015").rows[0]["ause"]
+
+
+def test_the_clamp_follows_the_published_script() -> None:
+    disparity_px = torch.tensor([[0.0, -1.0, 1e-9, 400.0, 1e9, torch.nan]])
+    clamped_m = clamped_depth(disparity_px, rig(), 80.0)[0]
+    assert clamped_m[:5].tolist() == pytest.approx([1e-3, 1e-3, 80.0, 0.1, 1e-3])
+    assert bool(torch.isnan(clamped_m[5]))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "message"),
+    [
+        ("eigen-rw", "did you mean 'eigen-raw'"),
+        ("eigen-raw", "none of its 3 frames has the truth"),
+    ],
+)
+def test_an_unusable_protocol_is_refused(
+    pairs: Dataset, tmp_path: Path, protocol: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        evaluate(pairs, tmp_path, protocol)
+
+
+def test_a_missing_prediction_is_named(pairs: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no prediction for frame 'a'. Expected a\.disparity_px"):
+        evaluate(pairs, tmp_path, "kitti-2015")
+
+
+def test_depth_without_a_rig_cannot_be_compared(tmp_path: Path) -> None:
+    write_map(tmp_path / "a.depth_m.npy", torch.ones(3, 3))
+    with pytest.raises(InputError, match="depth becomes disparity by a rig"):
+        read_disparity(tmp_path, "a", None)
+
+
+def test_a_frame_without_right_view_and_prediction_is_skipped(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    frames = [replace(frame, right=None) for frame in pairs.frames[:1]] + pairs.frames[1:2]
+    write_map(tmp_path / "b.disparity_px.npy", truth_px(1))
+    result = evaluate(replace(pairs, frames=frames), tmp_path, "kitti-2015")
+    assert result.skipped == {"a": "no right view to match, and no prediction"}
+
+
+def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def answer(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        return torch.full(tuple(left.shape[-2:]), 3.0)
+
+    net = FakestereoNet(CallableMatcher(answer))
+    names = [frame.name for frame in pairs.frames]
+    readers = [lambda i=i: pairs.read_input(i) for i in range(3)]
+    first = iter(predict(net, readers, names, tmp_path / "p", {"method": "constant"}))
+    assert next(first) == "a"
+    assert len(list(predict(net, readers, names, tmp_path / "p", {"method": "constant"}))) == 3
+    assert len(calls) == 3
+    with pytest.raises(InputError, match="Two settings never share a folder"):
+        list(predict(net, readers, names, tmp_path / "p", {"method": "another"}))
+
+
+def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
+    pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
+    estimate = DepthEstimate(depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W))
+    write_estimate(tmp_path, pair, estimate)
+    written = sorted(path.name for path in tmp_path.iterdir())
+    assert written == ["x.color.png", "x.disparity_px.npy", "x.right.png"]
+    assert is_finished(tmp_path, "x")
+    with pytest.raises(InputError, match="a cloud needs metres"):
+        write_estimate_cloud(tmp_path, pair, estimate)
