@@ -1,0 +1,112 @@
+"""The command line: parse words, call one room, write what it returns.
+
+Only this room prints. A command's function is imported when it is named and imports what is heavy
+when it runs, so that every ``--help`` answers at once.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from inspect import cleandoc
+
+from depthpose import __version__
+from depthpose.core.errors import InputError, MissingExtraError, nearest_name
+
+COMMANDS = {
+    "demo": (
+        "demo:demo",
+        "run everything on a made street and open the books: out/demo/report.html",
+    ),
+    "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
+    "weights list": ("weights:list_weights", "name the weights at hand"),
+    "weights show": ("weights:show_weights", "say what a weights file holds"),
+    "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
+    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
+    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+}
+_EXIT_CODES = """exit codes:
+  0    done
+  1    done, but something in the input failed (it is named)
+  2    wrong usage or unreadable input
+  130  interrupted"""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        words: what follows ``depthpose``; the process's own arguments by default.
+
+    Returns:
+        The exit code: 0 done, 1 something in the input failed, 2 unusable, 130 interrupted.
+    """
+    given = list(sys.argv[1:] if words is None else words)
+    if given in (["--version"], ["-V"]):
+        print(f"depthpose {__version__}")
+        return 0
+    name, rest = _split_command(given)
+    if name is None:
+        return _explain(given)
+    try:
+        return _run(name, rest)
+    except (InputError, MissingExtraError) as error:
+        print(f"depthpose: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("depthpose: interrupted; what was finished is kept", file=sys.stderr)
+        return 130
+
+
+def _split_command(given: list[str]) -> tuple[str | None, list[str]]:
+    for length in (2, 1):
+        name = " ".join(given[:length])
+        if name in COMMANDS:
+            return name, given[length:]
+    return None, given
+
+
+def _run(name: str, rest: list[str]) -> int:
+    import tyro
+
+    home, _, function = COMMANDS[name][0].partition(":")
+    command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
+    text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
+    try:
+        return tyro.cli(
+            command,
+            prog=f"depthpose {name}",
+            description=text,
+            args=rest,
+            config=(tyro.conf.PositionalMetavarFromFieldName,),
+        )
+    except SystemExit as stop:  # tyro has printed help (0) or the wrong words (2)
+        return int(stop.code or 0)
+
+
+def _explain(given: list[str]) -> int:
+    """Print the commands of the group that was named, or refuse what is no command."""
+    asked_help = {"-h", "--help"} & set(given)
+    group = given[0] if given and not given[0].startswith("-") else ""
+    known = {name.partition(" ")[0] for name in COMMANDS}
+    if group and group not in known:
+        print(
+            f"depthpose: error: no command {group!r}; {nearest_name(group, known)}", file=sys.stderr
+        )
+        return 2
+    inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
+    verb = next((word for word in given[1:] if not word.startswith("-")), "")
+    if group and verb:
+        verbs = [name.partition(" ")[2] for name in inside]
+        print(f"depthpose {group}: error: no command {verb!r}; {nearest_name(verb, verbs)}",
+              file=sys.stderr)  # fmt: skip
+        return 2
+    print(_overview(inside, group), file=sys.stdout if asked_help else sys.stderr)
+    return 0 if asked_help else 2
+
+
+def _overview(commands: dict[str, str], group: str) -> str:
+    width = max(map(len, commands)) + 2
+    lines = [f"  {name:<{width}}{what}" for name, what in commands.items()]
+    usage = f"usage: depthpose {group or 'COMMAND'} ... [--help]"
+    what = "Metric depth from one camera, and the 6-DoF pose of a known object from a depth sensor."
+    return "\n".join([usage, "", what, "", "commands:", *lines, "", _EXIT_CODES])

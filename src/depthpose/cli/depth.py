@@ -1,0 +1,133 @@
+"""``depthpose depth ...``."""
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+
+MatcherName = Literal["psmnet", "sgbm"]
+Precision = Literal["fp32", "bf16"]
+
+
+def match(
+    left: tyro.conf.Positional[str],
+    right: tyro.conf.Positional[str],
+    camera: Path,
+    out: Path,
+    weights: str | None = None,
+    matcher: MatcherName | None = None,
+    device: str = "cpu",
+    precision: Precision = "fp32",
+    max_memory: str | None = None,
+    tile: tuple[int, int] | None = None,
+    left_right_check: bool = False,
+    cloud: bool = False,
+    check: bool = True,
+) -> int:
+    """Match real stereo pairs to metric depth.
+
+    For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
+    (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
+    NAME.ply with --cloud. A rerun skips what is finished; other settings need another --out.
+
+        depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out out
+
+    Args:
+        left: left image, a folder of them, or a quoted pattern such as 'left/*.png'.
+        right: right image, folder or pattern; images are paired in sorted order.
+        camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}.
+        out: folder for the results.
+        weights: PSMNet weights, a .safetensors file.
+        matcher: psmnet (the default with --weights) or sgbm, OpenCV's, which needs no weights.
+        device: cpu, cuda, cuda:1, ...
+        precision: fp32, or bf16: faster, at some hundredths of a pixel.
+        max_memory: bound on the memory of activations, such as 1GB or 800MB; exact.
+        tile: match tiles of so many rows and columns: less memory and approximate. The first
+            pair is matched whole as well, and the change of its disparity is said.
+        left_right_check: match the mirrored pair too, which makes the confidence better.
+        cloud: write a coloured point cloud, NAME.ply.
+        check: look at the first pair for swapped or unrectified images before any work.
+    """
+    from depthpose.cli import matching, methods
+
+    if (weights is None) == (matcher != "sgbm"):
+        raise InputError("match with --weights FILE (PSMNet), or with --matcher sgbm.")
+    pairs = matching.Pairs.find(left, right, camera)
+    if check:
+        matching.refuse_unusable_first(pairs)
+    config = MatcherConfig(
+        device=device,
+        precision=precision,
+        max_memory_bytes=methods.parse_bytes(max_memory),
+        tile_px=tile,
+        with_left_right_check=left_right_check,
+    )
+    if weights is None:
+        method = methods.sgbm_method(with_filled_holes=False)
+    else:
+        method = methods.psmnet_method(weights, config)
+    if tile is not None:
+        matching.say_tile_change(pairs, method)
+    return matching.match_all(pairs, method, out, with_cloud=cloud)
+
+
+def evaluate(
+    data: Path,
+    out: Path,
+    weights: str | None = None,
+    matcher: MatcherName | None = None,
+    predictions: Path | None = None,
+    protocol: str = "eigen-raw",
+    cap: tuple[float, ...] = (80.0, 50.0),
+    split: str | None = None,
+    holes: Literal["fill", "leave"] = "fill",
+    device: str = "cpu",
+    precision: Precision = "fp32",
+    max_memory: str | None = None,
+) -> int:
+    """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
+
+    Predictions are made once, as files in OUT/predictions/METHOD, and measured from there; a second
+    run measures without predicting anew. --predictions measures the files of any other method.
+    Several methods may be named at once: their rows share the table.
+
+    Protocols: eigen-raw (one LiDAR scan, depth = LiDAR x, Garg crop: the published one),
+    eigen-raw-camera (depth = camera z), eigen-improved (annotated maps, no crop),
+    eigen-improved-garg (with the crop), kitti-2015 (disparity: EPE and D1).
+
+    Args:
+        data: KITTI raw, object, 2012/2015, Middlebury, or a plain folder of pairs.
+        out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
+        weights: PSMNet weights, a .safetensors file.
+        matcher: sgbm measures OpenCV's StereoSGBM.
+        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy.
+        protocol: how prediction and truth are compared.
+        cap: metres beyond which truth does not count; a row each.
+        split: eigen-test, eigen-val, eigen-train, eigen-benchmark, or a file of frames.
+        holes: sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out
+            (then the column 'coverage' says what share was measured).
+        device: cpu, cuda, cuda:1, ...
+        precision: fp32 or bf16.
+        max_memory: bound on the memory of activations, such as 1GB.
+    """
+    from depthpose.cli import evaluating, methods
+
+    if weights is None and matcher is None and predictions is None:
+        raise InputError("measure --weights FILE, --matcher sgbm or --predictions DIR, or several.")
+    dataset = evaluating.open_frames(data, split)
+    chosen: list[methods.Method] = []
+    if matcher == "sgbm":
+        chosen.append(methods.sgbm_method(with_filled_holes=holes == "fill"))
+    if weights is not None:
+        config = MatcherConfig(
+            device=device,
+            precision=precision,
+            max_memory_bytes=methods.parse_bytes(max_memory),
+        )
+        chosen.append(methods.psmnet_method(weights, config))
+    folders = [evaluating.predict_all(dataset, method, out / "predictions") for method in chosen]
+    folders += [] if predictions is None else [predictions]
+    return evaluating.measure(dataset, folders, protocol, cap, out)

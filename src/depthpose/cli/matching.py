@@ -1,0 +1,96 @@
+"""The work behind ``depthpose depth match``."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from depthpose.cli.methods import Method
+from depthpose.core.camera import StereoRig, read_rig
+from depthpose.core.errors import InputError
+from depthpose.core.files import list_images, read_image
+from depthpose.core.run import claim_folder
+from depthpose.depth.estimator import refuse_unrectified
+from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
+from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.types import StereoInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Files of stereo pairs that share one rig."""
+
+    left: list[Path]
+    right: list[Path]
+    rig: StereoRig
+
+    @classmethod
+    def find(cls, left: str, right: str, camera: Path) -> "Pairs":
+        """List both sides, and refuse sides that cannot be paired."""
+        rig = read_rig(camera)
+        lefts, rights = list_images(left), list_images(right)
+        if len(lefts) != len(rights):
+            raise InputError(
+                f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
+                "needs one right image. Remove the ones without a partner."
+            )
+        stems = [path.stem for path in lefts]
+        if len(set(stems)) != len(stems):
+            twice = next(stem for stem in stems if stems.count(stem) > 1)
+            raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
+        return cls(left=lefts, right=rights, rig=rig)
+
+    def read(self, index: int) -> StereoInput:
+        """Read one pair."""
+        return StereoInput(
+            name=self.left[index].stem,
+            left=read_image(self.left[index]),
+            right=read_image(self.right[index]),
+            camera=self.rig,
+        )
+
+
+def refuse_unusable_first(pairs: Pairs) -> None:
+    """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    try:
+        refuse_unrectified(pairs.read(0))
+    except InputError as error:
+        raise InputError(f"{error} (--no-check matches them all the same.)") from error
+
+
+def say_tile_change(pairs: Pairs, method: Method) -> None:
+    """Print how far tiles move the disparity of the first pair from that of the whole image."""
+    if not isinstance(method.net.matcher, PSMNetMatcher):
+        raise InputError("--tile is for psmnet; sgbm needs little memory as it is.")
+    pair = pairs.read(0)
+    assert pair.right is not None
+    change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
+    print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
+
+
+def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
+    """Match what is not finished; a pair that fails is named at the end and stops no other."""
+    rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
+    claim_folder(out, {**method.settings, "camera": rig})
+    failures: list[str] = []
+    for index in tqdm(range(len(pairs.left)), unit=" pairs", disable=None):
+        name = pairs.left[index].stem
+        if is_finished(out, name) and (not with_cloud or (out / f"{name}.ply").is_file()):
+            continue
+        try:
+            pair = pairs.read(index)
+            estimate = method.net.estimate_pair(pair)
+        except InputError as error:
+            if len(pairs.left) == 1:
+                raise
+            failures.append(str(error))
+            continue
+        if with_cloud:
+            write_estimate_cloud(out, pair, estimate)
+        write_estimate(out, pair, estimate)
+    for failure in failures:
+        print(f"depthpose: failed: {failure}", file=sys.stderr)
+    done = len(pairs.left) - len(failures)
+    print(f"{done} of {len(pairs.left)} pairs are in {out}")
+    return 1 if failures else 0

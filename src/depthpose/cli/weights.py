@@ -1,0 +1,73 @@
+"""``depthpose weights ...``."""
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+def list_weights(folder: Path | None = None) -> int:
+    """Name the weights that came with depthpose, or those in a folder.
+
+    Args:
+        folder: look here instead.
+    """
+    from depthpose.core.checkpoint import SHIPPED, read_checkpoint
+    from depthpose.core.report import markdown_table
+
+    home = folder or SHIPPED
+    found = sorted(home.glob("*.safetensors"))
+    if not found:
+        print(f"No weights in {home}. 'depthpose weights import' brings in a published checkpoint.")
+        return 0
+    rows = [
+        {"name": path.stem, "kind": (read := read_checkpoint(path)).kind, **read.facts}
+        for path in found
+    ]
+    print(markdown_table(rows), end="")
+    return 0
+
+
+def show_weights(weights: tyro.conf.Positional[str]) -> int:
+    """Say what a weights file holds: kind, knobs, parameters, origin, licence, fingerprint.
+
+    Args:
+        weights: a .safetensors file, or the name of weights that came with depthpose.
+    """
+    from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
+
+    path = find_weights(weights)
+    checkpoint = read_checkpoint(path)
+    statistics = ("running_mean", "running_var", "num_batches_tracked")
+    learnt = [t for name, t in checkpoint.state.items() if not name.endswith(statistics)]
+    facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
+             "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
+    for name, value in {**facts, **checkpoint.facts, **checkpoint.config}.items():
+        print(f"{name}: {value}")
+    return 0
+
+
+def import_weights(
+    kind: tyro.conf.Positional[Literal["psmnet"]],
+    file: tyro.conf.Positional[Path],
+    out: Path,
+    align_corners: Literal["true", "false"],
+) -> int:
+    """Turn a published checkpoint into a weights file of depthpose.
+
+    The checkpoint is read without running any code in it; one that holds pickled objects other
+    than tensors is refused.
+
+    Args:
+        kind: the network: psmnet, the stacked hourglass.
+        file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
+        out: the .safetensors file to write.
+        align_corners: how the checkpoint was trained to upsample, which no file records: true for
+            the authors' first weights (2018, PyTorch 0.4), false for those of 2021 (PyTorch 1.8.1).
+            A wrong choice costs about 1 px of disparity.
+    """
+    from depthpose.depth.stereo import import_psmnet
+
+    assert kind == "psmnet"
+    import_psmnet(file, out, align_corners=align_corners == "true")
+    return show_weights(str(out))

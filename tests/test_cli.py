@@ -1,0 +1,202 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from depthpose.cli import COMMANDS, main
+from depthpose.core.files import read_depth_png, read_map, write_image, write_json
+from depthpose.demo.scene import make_street
+from depthpose.depth.types import StereoInput
+
+NAMES = [name.split() for name in COMMANDS]
+
+
+@pytest.fixture(scope="module")
+def pair_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two pairs of the made street, 621 x 188, with their rig."""
+    folder = tmp_path_factory.mktemp("pairs")
+    pair = make_street(0.5).input
+    assert pair.right is not None
+    for name in ("a", "b"):
+        write_image(folder / "left" / f"{name}.png", pair.left)
+        write_image(folder / "right" / f"{name}.png", pair.right)
+    write_json(folder / "cam.json", _camera_file(pair))
+    return folder
+
+
+def _camera_file(pair: StereoInput) -> dict[str, object]:
+    assert pair.camera is not None
+    K = pair.camera.K.tolist()
+    return {"width": pair.camera.width, "height": pair.camera.height, "K": K, "baseline_m": 0.54}
+
+
+def match(folder: Path, out: Path, *more: str) -> int:
+    return match_sides(folder / "left", folder / "right", folder / "cam.json", out, *more)
+
+
+def match_sides(left: Path, right: Path, camera: Path, out: Path, *more: str) -> int:
+    words = ["depth", "match", str(left), str(right), "--camera", str(camera), "--out", str(out)]
+    return main([*words, *(more or ("--matcher", "sgbm"))])
+
+
+@pytest.mark.parametrize("words", NAMES, ids=" ".join)
+def test_help_reads_like_documentation(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"usage: depthpose {' '.join(words)}" in text
+    assert len(text) > 300
+    assert "Args:" not in text
+
+
+@pytest.mark.parametrize("words", [[], *NAMES], ids=" ".join)
+def test_help_loads_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys; from depthpose.cli import main; main(sys.argv[1:]); "
+        "assert not {'torch', 'numpy', 'PIL', 'cv2'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, *words, "--help"], check=True, capture_output=True)
+
+
+def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in COMMANDS)
+    assert "130  interrupted" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["dept"], "no command 'dept'; did you mean 'depth'"),
+        (["depth", "mach"], "no command 'mach'; did you mean 'match'"),
+        (["weights", "show", "nope"], "neither a file nor the name of weights"),
+        (["weights", "import", "psmnet", "none.tar", "--out", "w.safetensors",
+          "--align-corners", "true"], "none.tar: there is no such checkpoint file"),
+        (["data", "check", "nowhere"], "nowhere"),
+        (["depth", "evaluate", "--data", ".", "--out", "o"], "measure --weights FILE"),
+        (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o"], "match with --weights"),
+        (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
+         "c.json"),
+    ],
+)  # fmt: skip
+def test_wrong_words_are_refused(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--outt", "x"]) == 2
+    assert "--outt" in capsys.readouterr().err
+
+
+def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("depthpose 0.")
+
+
+def test_matching_writes_every_file(pair_folder: Path, tmp_path: Path) -> None:
+    assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--cloud") == 0
+    kinds = ("depth_m.npy", "disparity_px.npy", "depth.png", "color.png", "ply")
+    assert all((tmp_path / "o" / f"{name}.{kind}").is_file() for name in "ab" for kind in kinds)
+    depth_m = read_map(tmp_path / "o/a.depth_m.npy")
+    png_m = read_depth_png(tmp_path / "o/a.depth.png")
+    both = torch.isfinite(depth_m) & torch.isfinite(png_m)
+    assert (depth_m - png_m)[both].abs().max() <= 0.5 / 256
+    assert np.load(tmp_path / "o/a.depth_m.npy").dtype == np.float32
+
+
+def test_a_rerun_keeps_what_is_finished_and_refuses_other_settings(
+    pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert match(pair_folder, tmp_path) == 0
+    written = (tmp_path / "a.disparity_px.npy").stat().st_mtime_ns
+    (tmp_path / "b.disparity_px.npy").unlink()
+    assert match(pair_folder, tmp_path) == 0
+    assert (tmp_path / "a.disparity_px.npy").stat().st_mtime_ns == written
+    assert (tmp_path / "b.disparity_px.npy").is_file()
+    record = json.loads((tmp_path / "run.json").read_text())
+    record["settings"]["camera"]["baseline_m"] = 0.1
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert match(pair_folder, tmp_path) == 2
+    assert "Two settings never share a folder" in capsys.readouterr().err
+
+
+def test_one_broken_pair_does_not_stop_the_others(
+    pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for side in ("left", "right"):
+        (tmp_path / "in" / side).mkdir(parents=True)
+        for name in ("a", "b"):
+            content = (pair_folder / side / f"{name}.png").read_bytes()
+            (tmp_path / "in" / side / f"{name}.png").write_bytes(content)
+    (tmp_path / "in/cam.json").write_bytes((pair_folder / "cam.json").read_bytes())
+    broken = tmp_path / "in/left/b.png"
+    broken.write_bytes(broken.read_bytes()[:5000])
+    assert match(tmp_path / "in", tmp_path / "out") == 1
+    assert "b.png" in capsys.readouterr().err
+    assert (tmp_path / "out/a.depth_m.npy").is_file()
+    assert not (tmp_path / "out/b.disparity_px.npy").exists()
+
+
+def test_swapped_sides_are_refused(
+    pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right, left = pair_folder / "right", pair_folder / "left"
+    assert match_sides(right, left, pair_folder / "cam.json", tmp_path) == 2
+    assert "swap" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"baseline_m": None}, "baseline"),
+        ({"width": 1242}, "1242"),
+        ({"baseline_m": 540.0}, "540"),
+        ({"baselin": 1}, "did you mean 'baseline_m'"),
+    ],
+)
+def test_a_wrong_camera_is_refused(
+    pair_folder: Path,
+    tmp_path: Path,
+    change: dict[str, object],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    camera = json.loads((pair_folder / "cam.json").read_text()) | change
+    camera = {name: value for name, value in camera.items() if value is not None}
+    write_json(tmp_path / "cam.json", camera)
+    left, right = pair_folder / "left", pair_folder / "right"
+    assert match_sides(left, right, tmp_path / "cam.json", tmp_path / "o") == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_side_with_more_images_is_refused(
+    pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left, right = pair_folder / "left", pair_folder / "right/a.png"
+    assert match_sides(left, right, pair_folder / "cam.json", tmp_path) == 2
+    assert "holds 2 images" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", ["1 parsec", "-1GB", "GB", ""])
+def test_a_size_that_is_none_is_refused(
+    size: str, pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "w.safetensors").touch()
+    more = (f"--max-memory={size}", "--weights", str(tmp_path / "w.safetensors"))
+    assert match(pair_folder, tmp_path / "o", *more) == 2
+    assert "not a size" in capsys.readouterr().err

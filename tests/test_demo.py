@@ -1,0 +1,51 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core.camera import StereoRig, read_camera
+from depthpose.core.files import read_image, read_map
+from depthpose.demo import make_demo
+from depthpose.demo.scene import make_street
+from depthpose.depth.disparity import warp_right_to_left
+
+
+def test_the_disparity_carries_one_view_to_the_other() -> None:
+    sample = make_street(0.25)
+    assert sample.input.right is not None
+    assert sample.truth.disparity_px is not None
+    warped = warp_right_to_left(sample.input.right, sample.truth.disparity_px)
+    error = (warped - sample.input.left).abs().mean(0)
+    shifted = (sample.input.right - sample.input.left).abs().mean(0)
+    seen = torch.isfinite(error)
+    assert error[seen].median() < 0.3 * shifted[seen].median()
+
+
+def test_the_road_is_where_geometry_says() -> None:
+    sample = make_street(0.25)
+    rig = sample.input.camera
+    assert isinstance(rig, StereoRig)
+    assert sample.truth.depth_m is not None
+    v = rig.height - 1
+    expected_m = 1.65 * float(rig.K[1, 1]) / (v - float(rig.K[1, 2]))
+    assert sample.truth.depth_m[v, rig.width // 2].item() == pytest.approx(expected_m, rel=1e-6)
+
+
+def test_the_street_is_the_same_every_time() -> None:
+    assert torch.equal(make_street(0.1).input.left, make_street(0.1).input.left)
+
+
+def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> None:
+    result = make_demo(tmp_path, scale=0.5)
+    html = result.page.read_text()
+    assert html.count("data:image/png;base64,") == 7
+    assert "http" not in html
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["method"] for row in rows] == ["SGBM, holes filled", "SGBM, matched pixels"]
+    assert all(0 < row["abs_rel"] < 0.15 for row in rows)
+    assert rows[0]["coverage"] == 1.0
+    camera = read_camera(tmp_path / "street/camera.json")
+    assert read_image(tmp_path / "street/left.png").shape == (3, camera.height, camera.width)
+    depth_m = read_map(tmp_path / "sgbm-matched-pixels/street.depth_m.npy")
+    assert depth_m.shape == (camera.height, camera.width)

@@ -1,0 +1,70 @@
+"""What the README tells a newcomer to type, typed."""
+
+import os
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from depthpose.cli import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+PUBLISHED = "pretrained_model_KITTI2015.tar"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands() -> list[str]:
+    lines = "\n".join(blocks("bash")).splitlines()
+    return [line for line in lines if line.startswith("depthpose ")]
+
+
+def run(line: str) -> int:
+    return main(shlex.split(line)[1:])
+
+
+@pytest.fixture
+def demo_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    assert run("depthpose demo") == 0
+    return tmp_path
+
+
+def test_the_commands_that_need_no_data_run(demo_folder: Path) -> None:
+    lines = [line for line in commands() if "sgbm" in line and "KITTI" not in line]
+    assert lines
+    assert [run(line) for line in lines] == [0] * len(lines)
+    assert (demo_folder / "out/match/left.ply").is_file()
+
+
+def test_the_python_lines_run_and_end_in_metres(demo_folder: Path) -> None:
+    names: dict[str, object] = {}
+    for block in blocks("python"):
+        exec(block, names)  # the README is ours
+    assert names["depth_m"].shape == (375, 1242)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_the_commands_that_need_data_run(demo_folder: Path) -> None:
+    data = Path(os.environ.get("DEPTHPOSE_DATA") or pytest.skip("DEPTHPOSE_DATA names no data"))
+    (demo_folder / PUBLISHED).symlink_to(data / "reference/psmnet/published_kitti2015.tar")
+    (demo_folder / "KITTI").symlink_to(data / "depth/kitti_object")
+    lines = [line for line in commands() if "psmnet" in line or "KITTI" in line]
+    assert len(lines) >= 5
+    for line in lines:
+        assert run(line) in ((0, 1) if " check " in line else (0,)), line
+
+
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"^make (\w+)", README, re.MULTILINE))))
+def test_the_make_targets_exist(target: str) -> None:
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_the_links_lead_somewhere() -> None:
+    for link in re.findall(r"\]\(([^)#]+)\)", README):
+        assert link.startswith("http") or (ROOT / link).is_file(), link
