@@ -1,0 +1,42 @@
+# Every target sets itself up: `make demo` is all a fresh machine with Python 3.11 and make needs.
+PYTHON ?= python3
+OUT ?= out
+BIN := .venv/bin
+READY := .venv/.ready
+# Real samples for the tests that need them; those tests skip, and say so, where there are none.
+export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
+
+.PHONY: all setup demo test test-slow check bench clean
+all: check test
+
+setup: $(READY)
+
+# torch first and exactly, so that nothing else chooses a build of several gigabytes.
+$(READY): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -q -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: $(READY)
+	$(BIN)/depthpose demo --out $(OUT)/demo
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+check: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+
+bench: $(READY)
+	$(BIN)/python bench/startup.py
+	$(BIN)/python bench/stereo_speed.py
+	$(BIN)/python bench/stereo_memory.py
+
+clean:
+	rm -rf .venv $(OUT) .pytest_cache .ruff_cache .hypothesis .import_linter_cache

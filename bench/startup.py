@@ -1,0 +1,34 @@
+"""How long ``--help`` of each command takes, beside an empty Python and ``import torch``.
+
+python bench/startup.py
+"""
+
+import subprocess
+import sys
+import time
+
+from depthpose.cli import COMMANDS
+
+
+def seconds(*words: str) -> float:
+    """Best of three runs of ``python WORDS``: the machine's noise only ever adds."""
+    runs = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        runs.append(time.perf_counter() - start)
+    return min(runs)
+
+
+def main() -> None:
+    """Print a Markdown table."""
+    rows = {"python -c pass": ("-c", "pass"), "python -c 'import torch'": ("-c", "import torch")}
+    for name in ("", *COMMANDS):
+        rows[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
+    print("| command | seconds |\n| --- | --- |")
+    for name, words in rows.items():
+        print(f"| {name} | {seconds(*words):.2f} |")
+
+
+if __name__ == "__main__":
+    main()
