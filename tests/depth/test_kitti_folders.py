@@ -147,8 +147,6 @@ def test_raw_and_object_calibration_draw_the_same_scan(tmp_path: Path) -> None:
         lidar_truth(open_dataset(tmp_path / name).frames[0], "camera_z")
         for name in ("raw", "object")
     ]
-    assert drawn[0] is not None
-    assert drawn[1] is not None
     assert torch.equal(drawn[0].nan_to_num(0.0), drawn[1].nan_to_num(0.0))
     assert int(torch.isfinite(drawn[0]).sum()) == 2
 
@@ -156,10 +154,9 @@ def test_raw_and_object_calibration_draw_the_same_scan(tmp_path: Path) -> None:
 def test_a_drawn_scan_serves_camera_z_only(tmp_path: Path) -> None:
     make_pairs(tmp_path)
     frame = open_dataset(tmp_path).frames[0]
-    drawn = lidar_truth(frame, "camera_z")
-    assert drawn is not None
-    assert drawn[0, 0].item() == 9.0
-    assert lidar_truth(frame, "velodyne_x") is None
+    assert lidar_truth(frame, "camera_z")[0, 0].item() == 9.0
+    with pytest.raises(InputError, match="a: has no LiDAR scan of the kind velodyne_x"):
+        lidar_truth(frame, "velodyne_x")
 
 
 def test_annotated_depth_is_found_beside_the_drives(tmp_path: Path) -> None:

@@ -114,9 +114,11 @@ def evaluate(
         max_memory: bound on the memory of activations, such as 1GB.
     """
     from depthpose.cli import evaluating, methods
+    from depthpose.depth.evaluate import find_protocol
 
     if weights is None and matcher is None and predictions is None:
         raise InputError("measure --weights FILE, --matcher sgbm or --predictions DIR, or several.")
+    rule = find_protocol(protocol)
     dataset = evaluating.open_frames(data, split)
     chosen: list[methods.Method] = []
     if matcher == "sgbm":
@@ -128,6 +130,7 @@ def evaluate(
             max_memory_bytes=methods.parse_bytes(max_memory),
         )
         chosen.append(methods.psmnet_method(weights, config))
-    folders = [evaluating.predict_all(dataset, method, out / "predictions") for method in chosen]
+    home = out / "predictions"
+    folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
     folders += [] if predictions is None else [predictions]
     return evaluating.measure(dataset, folders, protocol, cap, out)

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from depthpose.cli.methods import Method
 from depthpose.core.report import Section, markdown_table, write_page, write_table
 from depthpose.core.run import environment, read_settings
-from depthpose.depth.evaluate import PROTOCOLS, evaluate
+from depthpose.depth.evaluate import PROTOCOLS, Protocol, evaluate, has_truth
 from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.predictions import predict
 
@@ -23,9 +23,10 @@ def open_frames(data: Path, split: str | None) -> Dataset:
     return dataset
 
 
-def predict_all(dataset: Dataset, method: Method, folder: Path) -> Path:
-    """Write a prediction for every frame that has a right view; give the folder."""
-    usable = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
+def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
+    """Predict every frame that has a right view and truth to compare with; give the folder."""
+    frames = list(enumerate(dataset.frames))
+    usable = [i for i, frame in frames if frame.right is not None and has_truth(frame, rule)]
     names = [dataset.frames[i].name for i in usable]
     readers = [partial(dataset.read_input, i) for i in usable]
     home = folder / method.name

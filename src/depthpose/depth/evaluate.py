@@ -16,7 +16,7 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.depth.disparity import depth_from_disparity, resize_disparity
-from depthpose.depth.kitti import Dataset, Frame, lidar_truth
+from depthpose.depth.kitti import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.kitti import read_disparity as read_truth_disparity
 from depthpose.depth.metrics import (
     depth_errors,
@@ -117,9 +117,7 @@ def evaluate(
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
-    if protocol not in PROTOCOLS:
-        raise InputError(f"protocol {protocol!r}: {nearest_name(protocol, PROTOCOLS)}")
-    rule = PROTOCOLS[protocol]
+    rule = find_protocol(protocol)
     per_frame: list[dict[str, Any]] = []
     skipped: dict[str, str] = {}
     for index in progress(range(len(dataset))):
@@ -141,14 +139,36 @@ def evaluate(
     )
 
 
+def find_protocol(name: str) -> Protocol:
+    """Give a protocol by name.
+
+    Raises:
+        InputError: there is none; the nearest name is said.
+    """
+    if name not in PROTOCOLS:
+        raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+def has_truth(frame: Frame, rule: Protocol) -> bool:
+    """Whether a frame has the truth that a protocol needs, told by its files alone."""
+    match rule.truth:
+        case "disparity":
+            return frame.disparity is not None
+        case "depth":
+            return frame.depth is not None
+        case _:
+            return has_lidar(frame, rule.truth)
+
+
 def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
     """Read truth and prediction of a frame, or say why it does not count."""
     frame = dataset.frames[index]
-    truth = _truth(dataset, index, rule)
-    if truth is None:
+    if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not has_prediction(predictions, frame.name):
         return "no right view to match, and no prediction"
+    truth = _truth(dataset, index, rule)
     camera = dataset.read_rig(index)
     if rule.truth != "disparity" and not isinstance(camera, StereoRig):
         raise InputError(f"{frame.name}: no calibration, so its disparity cannot become metres.")
@@ -166,12 +186,13 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     )
 
 
-def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"] | None:
-    frame = dataset.frames[index]
+def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]:
     if rule.truth in ("velodyne_x", "camera_z"):
-        return lidar_truth(frame, rule.truth)
-    truth = dataset.read_truth(index)
-    return truth.disparity_px if rule.truth == "disparity" else truth.depth_m
+        return lidar_truth(dataset.frames[index], rule.truth)
+    shipped = dataset.read_truth(index)
+    truth = shipped.disparity_px if rule.truth == "disparity" else shipped.depth_m
+    assert truth is not None  # has_truth said so
+    return truth
 
 
 def _measure(prepared: _Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[dict[str, Any]]:

@@ -15,13 +15,14 @@ class StereoInput:
     Attributes:
         name: what the files made from this input are called.
         left: left (reference) image, RGB in [0, 1].
-        right: right image of the rectified pair, the same size, or None for one image alone.
+        right: right image of the rectified pair, or None for one image alone. That its size is
+            the left one's is for the estimator to check: it is the user's to get wrong.
         camera: intrinsics of the left image; its baseline makes disparity metric.
     """
 
     name: str
     left: Float[Tensor, "3 h w"]
-    right: Float[Tensor, "3 h w"] | None
+    right: Float[Tensor, "3 right_h right_w"] | None
     camera: Camera | None
 
 

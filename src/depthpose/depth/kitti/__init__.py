@@ -7,6 +7,7 @@ from depthpose.depth.kitti.check import check_dataset as check_dataset
 from depthpose.depth.kitti.dataset import Dataset as Dataset
 from depthpose.depth.kitti.dataset import open_dataset as open_dataset
 from depthpose.depth.kitti.frames import Frame as Frame
+from depthpose.depth.kitti.frames import has_lidar as has_lidar
 from depthpose.depth.kitti.frames import kitti_calibration as kitti_calibration
 from depthpose.depth.kitti.frames import lidar_truth as lidar_truth
 from depthpose.depth.kitti.frames import read_disparity as read_disparity

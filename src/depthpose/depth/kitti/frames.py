@@ -104,18 +104,24 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return read(frame.calibration, width, height)
 
 
-def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"] | None:
+def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
+    """Whether :func:`lidar_truth` has something to draw."""
+    return frame.velodyne is not None or (depth == "camera_z" and _has_drawn_scan(frame))
+
+
+def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
 
     A plain folder holds no scan but a drawn one (``lidar_depth/``, camera z), which serves
-    ``camera_z`` as it is. None where the frame has neither.
+    ``camera_z`` as it is.
 
     Raises:
-        InputError: a scan without calibration.
+        InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
+    if frame.velodyne is None and frame.depth is not None and has_lidar(frame, depth):
+        return read_depth_png(frame.depth)
     if frame.velodyne is None:
-        is_drawn = frame.style in ("plain", "camera") and depth == "camera_z"
-        return read_depth_png(frame.depth) if is_drawn and frame.depth is not None else None
+        raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
     pixels_from_velodyne = kitti_calibration(frame).pixels_from_velodyne
     if pixels_from_velodyne is None:
         raise InputError(
@@ -125,6 +131,10 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"] | None:
     width, height = image_size(frame.left)
     points = read_points_bin(frame.velodyne)
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
+
+
+def _has_drawn_scan(frame: Frame) -> bool:
+    return frame.style in ("plain", "camera") and frame.depth is not None
 
 
 def read_disparity(path: Path) -> Float[Tensor, "h w"]:
