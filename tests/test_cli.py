@@ -152,6 +152,14 @@ def test_one_broken_pair_does_not_stop_the_others(
     assert not (tmp_path / "out/b.disparity_px.npy").exists()
 
 
+def test_options_of_psmnet_are_refused_with_sgbm(
+    pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--tile", "64", "64") == 2
+    assert "are for psmnet; sgbm takes none" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
 def test_swapped_sides_are_refused(
     pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

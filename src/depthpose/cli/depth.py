@@ -55,9 +55,6 @@ def match(
 
     if (weights is None) == (matcher != "sgbm"):
         raise InputError("match with --weights FILE (PSMNet), or with --matcher sgbm.")
-    pairs = matching.Pairs.find(left, right, camera)
-    if check:
-        matching.refuse_unusable_first(pairs)
     config = MatcherConfig(
         device=device,
         precision=precision,
@@ -65,6 +62,14 @@ def match(
         tile_px=tile,
         with_left_right_check=left_right_check,
     )
+    if weights is None and config != MatcherConfig():
+        raise InputError(
+            "--device, --precision, --max-memory, --tile and --left-right-check are for psmnet; "
+            "sgbm takes none of them."
+        )
+    pairs = matching.Pairs.find(left, right, camera)
+    if check:
+        matching.refuse_unusable_first(pairs)
     if weights is None:
         method = methods.sgbm_method(with_filled_holes=False)
     else:

@@ -13,7 +13,7 @@ from depthpose.core.files import list_images, read_image
 from depthpose.core.run import claim_folder
 from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
-from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
 from depthpose.depth.types import StereoInput
 
 
@@ -61,10 +61,9 @@ def refuse_unusable_first(pairs: Pairs) -> None:
 
 def say_tile_change(pairs: Pairs, method: Method) -> None:
     """Print how far tiles move the disparity of the first pair from that of the whole image."""
-    if not isinstance(method.net.matcher, PSMNetMatcher):
-        raise InputError("--tile is for psmnet; sgbm needs little memory as it is.")
     pair = pairs.read(0)
     assert pair.right is not None
+    assert isinstance(method.net.matcher, PSMNetMatcher)
     change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
     print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
 

@@ -86,7 +86,7 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
         f"the aspect agrees: resize the image to {camera.width}x{camera.height}, or the camera "
         f"with resize_camera(camera, {width}, {height})"
         if is_scaled
-        else "the aspect differs too: was the image cropped (crop_camera), or is the camera another?"
+        else "the aspect differs too: follow a crop with crop_camera, or give that image's camera"
     )
     raise InputError(
         f"{name} is {width}x{height} but its camera is {camera.width}x{camera.height}; {remedy}"
@@ -151,8 +151,9 @@ def _matrix(value: object) -> Float[Tensor, "3 3"]:
 
 def _is_number(value: object) -> bool:
     # A whole number beyond 1e300 has no float.
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) < 1e300
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300
 
 
 def _check_pixels(camera: Camera) -> None:

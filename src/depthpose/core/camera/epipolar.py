@@ -20,12 +20,11 @@ def essential_matrix(rig: StereoRig) -> Float[Tensor, "3 3"]:
 def fundamental_matrix(rig: StereoRig) -> Float[Tensor, "3 3"]:
     """Make F with ``x_right^T F x_left = 0`` for pixels ``x = (u, v, 1)``; its scale is arbitrary.
 
-    ``F = K_right^-T E K_left^-1`` (Hartley and Zisserman, 9.12); the two K differ by the
-    principal point's offset.
+    ``F = K_right^-T E K_left^-1`` (Hartley and Zisserman, 9.12). The two K differ by a shift along
+    the rows, where the epipole lies, so F is the same with either of them.
     """
-    right_K = rig.K.clone()
-    right_K[0, 2] += rig.cx_right_minus_left_px
-    return right_K.inverse().mT @ essential_matrix(rig) @ rig.K.inverse()
+    inverse = rig.K.inverse()
+    return inverse.mT @ essential_matrix(rig) @ inverse
 
 
 def epipolar_distance_px(
@@ -39,13 +38,12 @@ def epipolar_distance_px(
     """
     left, right = _homogeneous(points_left.to(F)), _homogeneous(points_right.to(F))
     lines_right, lines_left = left @ F.mT, right @ F
-    residual = (right * lines_right).sum(-1).abs()
+    residual = (right * lines_right).sum(-1)
     floor = torch.finfo(F.dtype).eps * torch.linalg.matrix_norm(F)
-    inverse = sum(
-        line[:, :2].norm(dim=-1).clamp_min(floor).square().reciprocal()
-        for line in (lines_right, lines_left)
-    )
-    return (residual * (inverse / 2).sqrt()).to(points_left.dtype)
+    near, far = (line[:, :2].norm(dim=-1).clamp_min(floor) for line in (lines_left, lines_right))
+    # The root is of the lines alone: at residual 0 its gradient would be infinite.
+    distance_px = residual.abs() * ((near**-2 + far**-2) / 2).sqrt()
+    return distance_px.to(points_left.dtype)
 
 
 def _homogeneous(points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:

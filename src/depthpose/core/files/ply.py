@@ -97,8 +97,11 @@ def _find_vertex(path: AnyPath, elements: list[_Element]) -> tuple[list[_Element
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
     vertex = elements[names.index("vertex")]
     properties = [f.name for f in vertex.fields]
-    if vertex.has_list or len(set(properties)) != len(properties):
-        raise InputError(f"{path}: vertex properties {properties}: a list or a repeated name")
+    if vertex.has_list or not properties or len(set(properties)) != len(properties):
+        raise InputError(
+            f"{path}: vertex properties {properties} are none, a list or repeat a name; give each "
+            "vertex x, y and z"
+        )
     return elements[: names.index("vertex")], vertex
 
 

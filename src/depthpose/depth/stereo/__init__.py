@@ -1,18 +1,28 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
+from depthpose.depth.stereo.inference import PSMNetInference
 from depthpose.depth.stereo.matcher import CallableMatcher, Matcher, check_pair
+from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher, load_psmnet, normalise
+from depthpose.depth.stereo.psmnet_matcher import (
+    PSMNetMatcher,
+    load_psmnet,
+    normalise,
+    tile_change_px,
+)
 from depthpose.depth.stereo.published import psmnet_from_published
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
 from depthpose.depth.stereo.weights import import_psmnet, read_psmnet
 
 __all__ = [
     "CallableMatcher",
+    "Footprint",
     "Matcher",
     "PSMNet",
+    "PSMNetInference",
     "PSMNetMatcher",
     "SGBMMatcher",
+    "Steps",
     "check_pair",
     "fill_holes",
     "import_psmnet",
@@ -20,4 +30,5 @@ __all__ = [
     "normalise",
     "psmnet_from_published",
     "read_psmnet",
+    "tile_change_px",
 ]

@@ -80,11 +80,6 @@ def expected_disparity(
     return disparity_px, confidence
 
 
-def rows_bytes(size: Size, element_bytes: int) -> int:
-    """Bytes of one row of the full-size volume: the least that ``chunk_bytes`` can mean."""
-    return size.columns * size.bins * element_bytes
-
-
 def _mix(x: Tensor, taps: Taps, axis: int) -> Tensor:
     shape = [1] * x.ndim
     shape[axis] = -1

@@ -1,14 +1,17 @@
 """Batch norm folded into the convolution before it: the same function, one pass less."""
 
+from itertools import product
 from typing import cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.depth.stereo.features import ConvNorm, FeatureExtractor
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d
+Rows = Float[Tensor, "1 _ _ _ _"]
 
 
 def folded_weight(layer: ConvNorm) -> tuple[Tensor, Tensor]:
@@ -27,16 +30,25 @@ def folded_weight(layer: ConvNorm) -> tuple[Tensor, Tensor]:
     return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
 
 
-def fold_features(features: FeatureExtractor) -> None:
-    """Fold every batch norm of a feature extractor, in place."""
+def fold_features(features: FeatureExtractor, like: Tensor) -> FeatureExtractor:
+    """Fold every batch norm of a feature extractor, in place, and bring it to ``like``'s type."""
     for layer in list(features.modules()):
-        if not isinstance(layer, ConvNorm) or isinstance(layer.norm, nn.Identity):
+        if not isinstance(layer, ConvNorm):
             continue
         weight, bias = folded_weight(layer)
         conv = cast("nn.Conv2d", layer.conv)
-        conv.weight.data = weight.to(conv.weight.dtype)
-        conv.bias = nn.Parameter(bias.to(conv.weight.dtype), requires_grad=False)
+        conv.weight.data = weight
+        conv.bias = nn.Parameter(bias)
         layer.norm = nn.Identity()
+    for parameter in features.parameters():
+        cast_ = parameter.data.to(like)
+        parameter.data = cast_.contiguous(memory_format=_memory_format(cast_))
+        parameter.requires_grad_(False)
+    return features
+
+
+def _memory_format(x: Tensor) -> torch.memory_format:
+    return torch.channels_last if x.ndim == 4 else torch.contiguous_format
 
 
 class RowsConv:
@@ -46,22 +58,58 @@ class RowsConv:
     memory, so some rows of a volume are one piece of memory and no copy is needed to take them.
     """
 
-    def __init__(self, layer: ConvNorm | nn.Conv3d, like: Tensor) -> None:
-        conv = layer.conv if isinstance(layer, ConvNorm) else layer
-        self.is_transposed = isinstance(conv, nn.ConvTranspose3d)
-        self.stride = cast("Conv", conv).stride[0]
-        if isinstance(layer, ConvNorm):
-            weight, bias = folded_weight(layer)
-            self.bias = bias.to(like)
-        else:
-            weight, self.bias = layer.weight.detach(), None
+    def __init__(self, layer: ConvNorm, like: Tensor) -> None:
+        self.is_transposed = isinstance(layer.conv, nn.ConvTranspose3d)
+        self.stride = cast("Conv", layer.conv).stride[0]
+        weight, bias = folded_weight(layer)
         turned = weight.transpose(2, 3).to(like)
         self.weight = turned.contiguous(memory_format=torch.channels_last_3d)
+        self.bias = bias.to(like)
 
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Convolve rows that carry their own halo: the result has none."""
+    def __call__(self, rows: Rows) -> Rows:
+        """Convolve rows that carry their own halo; the answer has none."""
         if self.is_transposed:
             # Row 2i+1 looks at rows i and i+1, so the last pair of rows lacks its halo.
-            full = nn.functional.conv_transpose3d(rows, self.weight, self.bias, 2, 1, 1)
-            return full[:, :, :-2]
+            return self._transposed(rows)[:, :, :-2]
+        if _has_onednn(rows):
+            strides = (self.stride,) * 3
+            args = (rows, self.weight, self.bias, (0, 1, 1), strides, (1, 1, 1), 1)
+            return torch.mkldnn_convolution(*args)
         return nn.functional.conv3d(rows, self.weight, self.bias, self.stride, (0, 1, 1))
+
+    def _transposed(self, rows: Rows) -> Rows:
+        if _has_onednn(rows):
+            sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
+            args = (rows, self.weight, self.bias, *sizes, "none", [], "")
+            return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
+        return nn.functional.conv_transpose3d(rows, self.weight, self.bias, 2, 1, 1)
+
+
+class CostConv:
+    """The 3x3x3 convolution to one channel, always in float32 at least.
+
+    One product makes the 27 taps of each voxel, which are then added where they belong: a
+    convolution to a single channel leaves most of a processor idle.
+    """
+
+    def __init__(self, conv: nn.Conv3d, like: Tensor) -> None:
+        self.dtype = torch.promote_types(like.dtype, torch.float32)
+        turned = conv.weight.detach()[0].permute(2, 1, 3, 0)
+        self.weight = turned.reshape(27, -1).to(like.device, self.dtype)
+
+    def __call__(self, rows: Rows) -> Float[Tensor, "m d w"]:
+        """Convolve rows that carry their own halo; the answer has none."""
+        c, n, bins, width = rows.shape[1:]
+        voxels = rows[0].permute(1, 2, 3, 0).reshape(-1, c).to(self.dtype)
+        taps = (self.weight @ voxels.T).view(3, 3, 3, n, bins, width)
+        out = taps.new_zeros(n - 2, bins + 2, width + 2)
+        for y, d, x in product(range(3), repeat=3):
+            target = out[:, 2 - d : bins + 2 - d, 2 - x : width + 2 - x]
+            target += taps[y, d, x, y : y + n - 2]
+        return out[:, 1:-1, 1:-1]
+
+
+def _has_onednn(x: Tensor) -> bool:
+    """Whether to call oneDNN by name: PyTorch's own choice takes a slow path for few rows."""
+    is_usable = x.device.type == "cpu" and x.dtype in (torch.float32, torch.bfloat16)
+    return is_usable and torch.backends.mkldnn.is_available()

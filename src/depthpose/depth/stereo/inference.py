@@ -7,33 +7,22 @@
 """
 
 import copy
-from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.depth.stereo.expectation import Size, expected_disparity
+from depthpose.depth.stereo.features import ConvNorm
 from depthpose.depth.stereo.first_layer import FirstLayer, LookedPair
-from depthpose.depth.stereo.folding import RowsConv, fold_features, folded_weight
+from depthpose.depth.stereo.folding import CostConv, RowsConv, fold_features, folded_weight
+from depthpose.depth.stereo.plan import Steps
 from depthpose.depth.stereo.psmnet import Head, Hourglass, PSMNet
 from depthpose.depth.stereo.slabs import Slab, convolve, spans, whole
 from depthpose.depth.types import Match
 
 View = Float[Tensor, "3 h w"]
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How much is computed at a time.
-
-    Attributes:
-        rows: quarter-size rows of a slab, even.
-        chunk_bytes: size of one piece of the soft arg-min.
-    """
-
-    rows: int = 12
-    chunk_bytes: int = 4 << 20
 
 
 class PSMNetInference:
@@ -42,34 +31,39 @@ class PSMNetInference:
     Args:
         network: the trained network.
         dtype: what volumes and features are computed in; the soft arg-min is float32 at least.
+        device: where to compute.
         with_compile: compile the feature extractor with torch.compile.
     """
 
     def __init__(
-        self, network: PSMNet, dtype: torch.dtype = torch.float32, *, with_compile: bool = False
+        self,
+        network: PSMNet,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | None = None,
+        *,
+        with_compile: bool = False,
     ) -> None:
         self.config = network.config
-        features = copy.deepcopy(network.features).eval()
-        fold_features(features)
-        features = features.to(dtype).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self._like = torch.empty(0, dtype=dtype, device=device)
+        features = fold_features(copy.deepcopy(network.features).eval(), self._like)
         self.features = torch.compile(features) if with_compile else features
-        self._like = torch.empty(0, dtype=dtype, device=next(network.parameters()).device)
-        first, second = network.dres0
+        first, *rest = (cast("ConvNorm", layer) for layer in (*network.dres0, *network.dres1))
         self.first = FirstLayer(*folded_weight(first), self._like)
-        self.residual = [RowsConv(layer, self._like) for layer in (second, *network.dres1)]
-        self.hourglasses = [_FoldedHourglass(h, self._like) for h in network.hourglasses]
-        self.heads = [_FoldedHead(h, self._like) for h in network.heads]
+        self.residual = [RowsConv(layer, self._like) for layer in rest]
+        self.hourglasses = [
+            _FoldedHourglass(cast("Hourglass", hourglass), self._like)
+            for hourglass in network.hourglasses
+        ]
+        self.heads = [_FoldedHead(cast("Head", head), self._like) for head in network.heads]
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def match(
         self, left: View, right: View, steps: Steps, *, with_confidence: bool = False
     ) -> Match:
         """Match one normalised pair whose sides suit the network."""
-        cost = self.cost(left, right, steps)
-        wide = cost if cost.dtype == torch.float64 else cost.float()
         size = Size(self.config.max_disparity_px, left.shape[1], left.shape[2])
         disparity_px, confidence = expected_disparity(
-            wide,
+            self.cost(left, right, steps),
             size,
             align_corners=self.config.align_corners,
             chunk_bytes=steps.chunk_bytes,
@@ -86,9 +80,12 @@ class PSMNetInference:
         return pass_.finish()
 
     def _look(self, left: View, right: View) -> LookedPair:
-        pair = torch.stack([left, right]).to(self._like)
-        views = self.features(pair.contiguous(memory_format=torch.channels_last))
-        return self.first.look(views[:1], views[1:], self.config.max_disparity_px // 4)
+        bins = self.config.max_disparity_px // 4
+        return self.first.look(self._describe(left), self._describe(right), bins)
+
+    def _describe(self, view: View) -> Float[Tensor, "1 c h4 w4"]:
+        batch = view[None].to(self._like)
+        return self.features(batch.contiguous(memory_format=torch.channels_last))
 
     def _cost0(self, pair: LookedPair, steps: Steps) -> Float[Tensor, "1 c h d w"]:
         """Run the layers before the hourglasses."""
@@ -117,7 +114,7 @@ class _FoldedHourglass:
 class _FoldedHead:
     def __init__(self, head: Head, like: Tensor) -> None:
         self.hidden = RowsConv(head.hidden, like)
-        self.cost = RowsConv(head.cost, like)
+        self.cost = CostConv(head.cost, like)
 
 
 class _Pass:
@@ -127,7 +124,7 @@ class _Pass:
         self.net, self.cost0, self.steps = net, cost0, steps
         _, c, h, d, w = cost0.values.shape
         self.half = (2 * c, (h // 2, d // 2, w // 2))
-        self.cost = cost0.values.new_zeros(h, d, w)
+        self.cost = torch.zeros(h, d, w, dtype=net.heads[0].cost.dtype, device=cost0.values.device)
         self.first_down: Slab | None = None
         self.up: Slab | None = None
 
@@ -138,6 +135,8 @@ class _Pass:
         deep = relu(convolve(hourglass.down2, down, 0, down.height // 2))
         deep = relu(convolve(hourglass.same2, deep, 0, deep.height))
         self.first_down = self.first_down or down
+        # Nobody looks at these again; the plan of memory counts on it.
+        self.up = down = None
         self.up = self._up2(hourglass, deep, self.first_down)
 
     def finish(self) -> Float[Tensor, "h4 w4 d4"]:
@@ -168,15 +167,16 @@ class _Pass:
     def _score(self, index: int, x: Slab, first: int, stop: int) -> None:
         head = self.net.heads[index]
         hidden = relu(convolve(head.hidden, x, first - 1, stop + 1))
-        self.cost[first:stop] += convolve(head.cost, hidden, first, stop).values[0, 0]
+        self.cost[first:stop] += head.cost(hidden.rows(first - 1, stop + 1))
 
     def _same1(self, hourglass: _FoldedHourglass, x: Slab) -> Slab:
         """Second layer on the way down, plus what came up from the hourglass before."""
-        out = torch.empty_like(x.values)
+        # What came up is looked at row by row, so the answer may take its place.
+        out = torch.empty_like(x.values) if self.up is None else self.up.values
         for first, stop in spans(x.height, self.steps.rows):
             y = convolve(hourglass.same1, x, first, stop).values
             if self.up is not None:
-                y += self.up.rows(first, stop)
+                y += out[:, :, first:stop]
             torch.clamp_min(y, 0, out=out[:, :, first:stop])
         return whole(out)
 

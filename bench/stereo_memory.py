@@ -1,0 +1,105 @@
+"""Peak memory of stereo matching, bounded and unbounded, each run in a process of its own.
+
+python bench/stereo_memory.py [--size 375x1242] [--bound-mb 1000 least] [--weights F.tar]
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.stereo import Footprint, PSMNetMatcher, Steps
+from stereo_speed import network_for, out_folder, random_pair, size_of
+
+
+def resident_bytes(field: str) -> int:
+    """Read a line of this process's memory, VmRSS or VmHWM [bytes]."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(next(line for line in status.splitlines() if field in line).split()[1])
+
+
+def run_once(size: tuple[int, int], weights: Path | None, bound: int | None, out: Path) -> None:
+    """Match once and write disparity and the rise of peak memory after loading."""
+    network = network_for(weights)
+    left, right = random_pair(size, torch.Generator().manual_seed(0))
+    matcher = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=bound))
+    before = resident_bytes("VmRSS")
+    # Loading may have peaked higher: 5 resets the high-water mark (Linux, proc_pid_clear_refs).
+    Path("/proc/self/clear_refs").write_text("5")
+    match = matcher.match(left, right)
+    peak = max(resident_bytes("VmHWM"), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 0)
+    np.savez(out, disparity_px=match.disparity_px.numpy(), activations=peak - before)
+
+
+def measure(
+    size: tuple[int, int], weights: Path | None, bound: int | None
+) -> tuple[np.ndarray, int]:
+    """Run in a fresh process: memory that one run leaves behind would hide the next one's."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run.npz"
+        command = [sys.executable, __file__, "--size", f"{size[0]}x{size[1]}", "--child", str(out)]
+        command += ["--weights", str(weights)] if weights else []
+        command += ["--bound-mb", str(bound / 1e6)] if bound else []
+        subprocess.run(command, check=True)
+        with np.load(out) as run:
+            return run["disparity_px"], int(run["activations"])
+
+
+def least_bytes(size: tuple[int, int], weights: Path | None) -> int:
+    """The least bound that the planner accepts."""
+    config = network_for(weights).config
+    h, w = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
+    footprint = Footprint(config=config, height=h, width=w, dtype=torch.float32)
+    return footprint.estimate_bytes(Steps(rows=2))
+
+
+def main() -> None:
+    """Print a table and write out/bench/stereo_memory.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", nargs="+", default=["375x1242"])
+    parser.add_argument("--bound-mb", type=float, default=1000)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.child:
+        has_bound = "--bound-mb" in sys.argv
+        bound = round(args.bound_mb * 1e6) if has_bound else None
+        run_once(size_of(args.size[0]), args.weights, bound, args.child)
+        return
+    rows = [row for size in args.size for row in rows_of(size_of(size), args)]
+    print(
+        "| size | bound MB | peak activations MB | max difference px |\n| --- | --- | --- | --- |"
+    )
+    for row in rows:
+        print(f"| {row['size']} | {row['bound_mb']} | {row['peak_mb']} | {row['max_px']:.2g} |")
+    (out_folder() / "stereo_memory.json").write_text(json.dumps(rows, indent=1))
+
+
+def rows_of(size: tuple[int, int], args: argparse.Namespace) -> list[dict[str, object]]:
+    """Measure one size without bound, with the bound asked for, and with the least one."""
+    reference, peak = measure(size, args.weights, None)
+    rows = [
+        {"size": f"{size[0]}x{size[1]}", "bound_mb": None, "peak_mb": peak // 10**6, "max_px": 0}
+    ]
+    for bound in (round(args.bound_mb * 1e6), least_bytes(size, args.weights)):
+        try:
+            disparity_px, peak = measure(size, args.weights, bound)
+        except InputError as error:
+            print(error)
+            continue
+        difference = float(np.abs(disparity_px - reference).max())
+        rows.append({**rows[0], "bound_mb": -(-bound // 10**6), "peak_mb": peak // 10**6})
+        rows[-1]["max_px"] = difference
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""Time of PSMNet as it is run here, beside the plain network: same weights, threads and process.
+
+python bench/stereo_speed.py [--size 256x512 375x1242] [--weights published_kitti2015.tar]
+
+Without weights they are random, and differences say less. With a left and right image
+(--pair LEFT RIGHT) their bottom is matched instead of noise.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from depthpose.core.checkpoint import read_torch_file
+from depthpose.core.files import read_image
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.stereo import (
+    PSMNet,
+    PSMNetMatcher,
+    normalise,
+    psmnet_from_published,
+    read_psmnet,
+)
+
+Pair = tuple[Tensor, Tensor]
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Read ``256x512`` as rows and columns."""
+    rows, columns = text.split("x")
+    return int(rows), int(columns)
+
+
+def out_folder() -> Path:
+    """Where benchmarks write."""
+    folder = Path("out/bench")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def network_for(weights: Path | None) -> PSMNet:
+    """Read the authors' file or one of ours; random weights where there is none."""
+    if weights is None:
+        torch.manual_seed(0)
+        return PSMNet().eval()
+    if weights.suffix == ".safetensors":
+        return read_psmnet(weights)
+    return psmnet_from_published(read_torch_file(weights)["state_dict"], align_corners=True)
+
+
+def random_pair(size: tuple[int, int], generator: torch.Generator) -> Pair:
+    """Smooth noise, seen from two places 20 px apart."""
+    rows, columns = size
+    coarse = torch.rand(1, 3, rows // 4 + 1, columns // 4 + 8, generator=generator)
+    wide = F.interpolate(coarse, (rows, columns + 20), mode="bicubic")[0].clamp(0, 1)
+    return wide[..., :columns].contiguous(), wide[..., 20:].contiguous()
+
+
+def pair_for(size: tuple[int, int], files: list[Path] | None) -> Pair:
+    """Cut the pair from the middle bottom of two files, or make one."""
+    if not files:
+        return random_pair(size, torch.Generator().manual_seed(0))
+    images = [read_image(file) for file in files]
+    first = max(0, (images[0].shape[-1] - size[1]) // 2)
+    left, right = (i[:, -size[0] :, first : first + size[1]].contiguous() for i in images)
+    return left, right
+
+
+def plain_match(network: PSMNet, pair: Pair) -> Tensor:
+    """Run the network module by module on contiguous tensors, padded as the matcher pads."""
+    h, w = pair[0].shape[-2:]
+    rows, columns = (max(256, -(-side // 16) * 16) for side in (h, w))
+    dtype = next(network.parameters()).dtype
+    left, right = (
+        F.pad(normalise(i.to(dtype)), (0, columns - w, rows - h, 0))[None].contiguous()
+        for i in pair
+    )
+    with torch.inference_mode():
+        return network(left, right)[-1][0, -h:, :w]
+
+
+def best_seconds(run: Callable[[], object], repeats: int) -> float:
+    """Least wall time of some runs after a first one."""
+    run()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def peak_flops(dtype: torch.dtype) -> float:
+    """Most operations a second [FLOP/s] that a matrix product reached, by two libraries.
+
+    The second is a 1x1 convolution, which is the same product through oneDNN.
+    """
+    a, b = torch.randn(2, 4096, 1024).to(dtype)
+    by_matmul = best_seconds(lambda: a @ b.T, 5)
+    x = torch.randn(1, 512, 64, 128).to(dtype).contiguous(memory_format=torch.channels_last)
+    w = torch.randn(512, 512, 1, 1).to(dtype).contiguous(memory_format=torch.channels_last)
+    by_convolution = best_seconds(lambda: F.conv2d(x, w), 5)
+    return max(2 * 4096 * 4096 * 1024 / by_matmul, 2 * 512 * 512 * 64 * 128 / by_convolution)
+
+
+def matmul_flops(run: Callable[[], object]) -> int:
+    """Count the operations of convolutions and products in one run."""
+    with FlopCounterMode(display=False) as counter:
+        run()
+    return counter.get_total_flops()
+
+
+def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> list[dict]:
+    """Time every variant on one pair."""
+    with torch.device("meta"):
+        double = PSMNet(network.config)
+    double = double.to_empty(device="cpu").double().eval()
+    double.load_state_dict(network.state_dict())
+    exact = plain_match(double, pair) if args.exact else plain_match(network, pair).double()
+    variants = {
+        "plain eager": None,
+        "ours fp32": MatcherConfig(with_confidence=False),
+        "ours fp32 + confidence": MatcherConfig(),
+        "ours bf16": MatcherConfig(with_confidence=False, precision="bf16"),
+    }
+    if args.compile:
+        variants["ours fp32, compiled"] = MatcherConfig(with_confidence=False, with_compile=True)
+    flops = matmul_flops(lambda: plain_match(network, pair))
+    rows: list[dict] = []
+    for name, config in variants.items():
+        rows.append(
+            {"size": size, "what": name, **timed(network, pair, config, args.repeats, exact)}
+        )
+        rows[-1]["ratio"] = rows[0]["seconds"] / rows[-1]["seconds"]
+        peak = peak_flops(torch.bfloat16 if "bf16" in name else torch.float32)
+        rows[-1]["plain_gflop"] = flops / 1e9
+        rows[-1]["share_of_peak"] = flops / rows[-1]["seconds"] / peak
+        rows[-1]["peak_gflops"] = peak / 1e9
+    return rows
+
+
+def timed(
+    network: PSMNet, pair: Pair, config: MatcherConfig | None, repeats: int, exact: Tensor
+) -> dict[str, float]:
+    """Time one variant, its first run apart, and compare it with the exact disparity."""
+    begin = time.perf_counter()
+    if config is None:
+        answer, run = plain_match(network, pair), lambda: plain_match(network, pair)
+    else:
+        matcher = PSMNetMatcher(network, config)
+        answer, run = matcher.match(*pair).disparity_px, lambda: matcher.match(*pair)
+    first = time.perf_counter() - begin
+    difference = (answer.double() - exact).abs()
+    seconds = best_seconds(run, repeats)
+    return {
+        "seconds": seconds,
+        "first_seconds": first,
+        "max_px": float(difference.max()),
+        "mean_px": float(difference.mean()),
+    }
+
+
+def main() -> None:
+    """Print a table and write out/bench/stereo_speed.json."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", nargs="+", default=["256x512", "375x1242"])
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--pair", nargs=2, type=Path)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--exact", action="store_true", help="compare with float64: a minute more")
+    args = parser.parse_args()
+    network = network_for(args.weights)
+    rows = [
+        row for s in args.size for row in bench(network, s, pair_for(size_of(s), args.pair), args)
+    ]
+    (out_folder() / "stereo_speed.json").write_text(json.dumps(rows, indent=1))
+    print(
+        f"{torch.get_num_threads()} threads, torch {torch.__version__}; differences from ", end=""
+    )
+    print("float64" if args.exact else "the plain network")
+    print("| size | what | s | first run s | times faster | max px | mean px | of peak |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for r in rows:
+        print(
+            f"| {r['size']} | {r['what']} | {r['seconds']:.2f} | {r['first_seconds']:.2f} | "
+            f"{r['ratio']:.2f} | {r['max_px']:.1e} | {r['mean_px']:.1e} | {r['share_of_peak']:.2f} |"
+        )
+    print(f"{rows[0]['plain_gflop']:.0f} GFLOP plain; 'of peak': those, against the best product")
+
+
+if __name__ == "__main__":
+    main()

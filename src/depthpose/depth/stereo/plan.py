@@ -1,0 +1,116 @@
+"""How much memory a match takes, and how large its slabs may be under a bound."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import PSMNetConfig
+
+MARGIN = 1.1
+"""Allocators keep gaps: measured peaks stay below the sum of the tensors times this ..."""
+
+OVERHEAD_BYTES = 96 << 20
+"""... plus this, which the first convolutions take for themselves whatever the size."""
+
+CHUNK_BYTES = 2 << 20
+"""Size of one piece of the soft arg-min; it fits a core's cache."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How much is computed at a time.
+
+    Attributes:
+        rows: quarter-size rows of a slab, even.
+        chunk_bytes: size of one piece of the soft arg-min.
+    """
+
+    rows: int = 12
+    chunk_bytes: int = CHUNK_BYTES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footprint:
+    """A network at a size of images, as far as memory is concerned.
+
+    Attributes:
+        config: the network.
+        height: rows of the padded image [px].
+        width: columns of the padded image [px].
+        dtype: what volumes are computed in.
+    """
+
+    config: PSMNetConfig
+    height: int
+    width: int
+    dtype: torch.dtype
+
+    def estimate_bytes(self, steps: Steps) -> int:
+        """Peak memory of activations [bytes]: the largest stage, with margin for the allocator."""
+        stages = (
+            self._features_bytes(),
+            self._first_layers_bytes(steps),
+            self._hourglass_bytes(steps),
+            self._expectation_bytes(steps),
+        )
+        return int(MARGIN * max(stages)) + OVERHEAD_BYTES
+
+    def plan(self, max_memory_bytes: int | None) -> Steps:
+        """Choose the largest slabs that stay below the bound.
+
+        Raises:
+            InputError: even the smallest slabs need more; the message says how much.
+        """
+        steps = Steps()
+        if max_memory_bytes is None:
+            return steps
+        while self.estimate_bytes(steps) > max_memory_bytes and steps.rows > 2:
+            steps = replace(steps, rows=steps.rows - 2)
+        least = self.estimate_bytes(steps)
+        if least > max_memory_bytes:
+            raise InputError(
+                f"max_memory_bytes={max_memory_bytes} is too small for images of "
+                f"{self.height}x{self.width} (padded): the least that works is {least}; allow "
+                f"that, take precision='bf16', or match tiles (tile_px)"
+            )
+        return steps
+
+    @property
+    def _row_bytes(self) -> int:
+        """One row of a volume at quarter size."""
+        return self._map_bytes * (self.config.max_disparity_px // 4) // (self.height // 4)
+
+    @property
+    def _map_bytes(self) -> int:
+        """One quarter-size map of features."""
+        return self.config.width * (self.height // 4) * (self.width // 4) * self.dtype.itemsize
+
+    @property
+    def _volume_bytes(self) -> int:
+        return self._row_bytes * (self.height // 4)
+
+    def _features_bytes(self) -> int:
+        """Five half-size maps in the first stage; joined levels, twice, in the last."""
+        levels = 6 + len(self.config.pools)
+        return self._map_bytes * max(5 * 4, 2 * levels + 12)
+
+    def _first_layers_bytes(self, steps: Steps) -> int:
+        """``cost0``, both views looked at in 21 ways, and three layers of a slab."""
+        return self._volume_bytes + 21 * self._map_bytes + (3 * steps.rows + 16) * self._row_bytes
+
+    def _hourglass_bytes(self, steps: Steps) -> int:
+        """``cost0``, three half-size volumes (a quarter of it each) and a slab in the head."""
+        tap_rows = 27 * 4 / (self.config.width * self.dtype.itemsize)
+        slab_rows = (2 + tap_rows) * (steps.rows + 2) + 2 * (steps.rows + 6)
+        cost_bytes = self._volume_bytes * 4 // (self.config.width * self.dtype.itemsize)
+        held = self._volume_bytes + 3 * self._volume_bytes // 4 + 2 * cost_bytes
+        return held + int(slab_rows * self._row_bytes)
+
+    def _expectation_bytes(self, steps: Steps) -> int:
+        """Quarter-size cost, full-size maps, and the pieces in between."""
+        cost_bytes = 4 * self._volume_bytes // (self.config.width * self.dtype.itemsize)
+        row_bytes = 4 * self.width * self.config.max_disparity_px
+        return (
+            2 * cost_bytes + 16 * self.height * self.width + 5 * max(steps.chunk_bytes, row_bytes)
+        )

@@ -1,0 +1,160 @@
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from depthpose.core.files import Cloud, read_cloud, read_points_bin, write_cloud
+from depthpose.core.files.pcd import decompress_lzf
+
+POINTS = torch.tensor([[0.0, 1.5, -2.0], [3.25, 4.0, 5.0]])
+COLOR = torch.tensor([[255.0, 0, 7], [1, 2, 3]]) / 255
+PLY_PROPERTIES = (
+    "property double x\nproperty float y\nproperty float z\nproperty float nx\n"
+    "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+)
+PCD_HEADER = (
+    "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U U\n"
+    "COUNT 1 1 1 3 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA "
+)
+
+
+def same(found: Cloud, points: torch.Tensor = POINTS, color: torch.Tensor | None = COLOR) -> bool:
+    if color is None or found.color is None:
+        return torch.equal(found.points, points) and found.color is color
+    return torch.equal(found.points, points) and torch.allclose(found.color, color)
+
+
+def ply_rows(order: str) -> bytes:
+    rows = zip(POINTS.tolist(), (COLOR * 255).round().int().tolist(), strict=True)
+    return b"".join(struct.pack(f"{order}dfffBBB", *p, 9.0, *c) for p, c in rows)
+
+
+def pack_lzf(data: bytes) -> bytes:
+    """Compress with literals and, wherever 3 bytes or more came before, a reference."""
+    out, at = bytearray(), 0
+    while at < len(data):
+        length, start = 0, 0
+        for candidate in range(max(0, at - 8191), at):
+            n = 0
+            while n < 264 and at + n < len(data) and data[candidate + n] == data[at + n]:
+                n += 1
+            if n > length:
+                length, start = n, candidate
+        if length < 3:
+            out += bytes([0, data[at]])
+            at += 1
+            continue
+        back = at - start - 1
+        short = min(length - 2, 7)
+        out.append(short << 5 | back >> 8)
+        if short == 7:
+            out.append(length - 9)
+        out.append(back & 255)
+        at += length
+    return bytes(out)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+@pytest.mark.parametrize("with_color", [True, False])
+@given(
+    points=hnp.arrays(
+        np.float32,
+        st.tuples(st.integers(1, 9), st.just(3)),
+        elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+    )
+)
+def test_written_clouds_come_back(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, with_color: bool, points: np.ndarray
+) -> None:
+    path = tmp_path_factory.mktemp("cloud") / f"x{suffix}"
+    color = torch.randint(0, 256, points.shape) / 255 if with_color else None
+    write_cloud(path, Cloud(points=torch.from_numpy(points), color=color))
+    assert same(read_cloud(path), torch.from_numpy(points), color)
+
+
+@pytest.mark.parametrize(
+    ("name", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")]
+)
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_binary_ply_with_more_than_points(
+    tmp_path: Path, name: str, order: str, newline: str
+) -> None:
+    header = (
+        f"ply\nformat {name} 1.0\ncomment made here\nelement camera 1\nproperty short id\n"
+        f"element vertex 2\n{PLY_PROPERTIES}element face 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    ).replace("\n", newline)
+    face = b"\x03" + bytes(12)
+    (tmp_path / "x.ply").write_bytes(header.encode() + b"\x01\x02" + ply_rows(order) + face)
+    assert same(read_cloud(tmp_path / "x.ply"))
+
+
+def test_text_ply_with_faces(tmp_path: Path) -> None:
+    header = f"ply\nformat ascii 1.0\nelement vertex 2\n{PLY_PROPERTIES}element face 1\n"
+    rows = "0 1.5 -2 9 255 0 7\n3.25 4 5 9 1 2 3\n3 0 1 1\n"
+    text = f"{header}property list uchar int vertex_indices\nend_header\n{rows}"
+    (tmp_path / "x.ply").write_text(text)
+    assert same(read_cloud(tmp_path / "x.ply"))
+
+
+def pcd_columns() -> list[np.ndarray]:
+    rgb = (COLOR * 255).round().int().numpy()
+    packed = (rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]).astype("<u4")
+    return [*POINTS.numpy().astype("<f4").T, np.zeros((2, 3), "u1"), packed]
+
+
+def test_binary_pcd_with_padding(tmp_path: Path) -> None:
+    x, y, z, gap, rgb = pcd_columns()
+    rows = b"".join(b"".join(c[i].tobytes() for c in (x, y, z, gap, rgb)) for i in range(2))
+    (tmp_path / "x.pcd").write_bytes(f"{PCD_HEADER}binary\n".encode() + rows)
+    assert same(read_cloud(tmp_path / "x.pcd"))
+
+
+def test_compressed_pcd(tmp_path: Path) -> None:
+    body = b"".join(np.ascontiguousarray(c).tobytes() for c in pcd_columns())
+    packed = pack_lzf(body)
+    data = f"{PCD_HEADER}binary_compressed\n".encode()
+    data += struct.pack("<II", len(packed), len(body)) + packed
+    (tmp_path / "x.pcd").write_bytes(data)
+    assert same(read_cloud(tmp_path / "x.pcd"))
+
+
+def test_text_pcd_of_an_organised_cloud_leaves_out_what_was_not_seen(tmp_path: Path) -> None:
+    text = (
+        "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 2\nDATA ascii\n"
+        "0 1.5 -2\nnan nan nan\n3.25 4 5\nnan nan nan\n"
+    )
+    (tmp_path / "x.pcd").write_text(text)
+    assert same(read_cloud(tmp_path / "x.pcd"), color=None)
+
+
+@given(
+    st.binary(max_size=300)
+    | st.builds(lambda b, n: b * n, st.binary(max_size=9), st.integers(1, 90))
+)
+def test_lzf_undoes_its_compression(data: bytes) -> None:
+    assert decompress_lzf(memoryview(pack_lzf(data)), len(data)) == data
+
+
+@pytest.mark.parametrize("text", ["0 1.5 -2\n3.25 4 5\n", "# x, y, z\n0,1.5,-2, 9\n\n3.25;4;5;9\n"])
+@pytest.mark.parametrize("suffix", [".xyz", ".txt"])
+def test_text_rows(tmp_path: Path, suffix: str, text: str) -> None:
+    (tmp_path / f"x{suffix}").write_text(text)
+    assert same(read_cloud(tmp_path / f"x{suffix}"), color=None)
+
+
+def test_npy_rows_of_more_columns(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", np.column_stack([POINTS.double().numpy(), np.ones(2)]))
+    assert same(read_cloud(tmp_path / "x.npy"), color=None)
+
+
+def test_velodyne_rows(tmp_path: Path) -> None:
+    rows = torch.arange(12.0).reshape(3, 4)
+    (tmp_path / "x.bin").write_bytes(rows.numpy().astype("<f4").tobytes())
+    assert torch.equal(read_points_bin(tmp_path / "x.bin"), rows)
+    assert torch.equal(read_points_bin(tmp_path / "x.bin", columns=3), rows.reshape(4, 3))

@@ -1,0 +1,117 @@
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import atomic_write, read_bytes, write_json
+
+
+def test_a_finished_write_is_whole_and_makes_its_folders(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "b" / "x.bin"
+    with atomic_write(target) as part:
+        assert part.parent == target.parent
+        assert part.suffix == target.suffix
+        part.write_bytes(b"new")
+        assert not target.exists()
+    assert target.read_bytes() == b"new"
+    assert list(target.parent.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError, SystemExit])
+def test_a_broken_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, failure: type[BaseException]
+) -> None:
+    target = tmp_path / "x.bin"
+    target.write_bytes(b"old")
+
+    def half() -> None:
+        with atomic_write(target) as part:
+            part.write_bytes(b"half")
+            raise failure
+
+    with pytest.raises(failure):
+        half()
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_new_file_takes_the_place_of_the_old_one_and_does_not_write_into_it(
+    tmp_path: Path,
+) -> None:
+    target, other = tmp_path / "x.json", tmp_path / "link.json"
+    write_json(target, "old")
+    other.hardlink_to(target)
+    write_json(target, "new")
+    assert other.read_text() == '"old"\n'
+
+
+def test_a_full_disk_is_named(tmp_path: Path) -> None:
+    target = tmp_path / "x.bin"
+
+    def fill() -> None:
+        with atomic_write(target) as part:
+            part.write_bytes(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(InputError, match=r"x\.bin: cannot be written: No space left on device"):
+        fill()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError, match="cannot be written: No such file"),
+        atomic_write(tmp_path / "x.bin"),
+    ):
+        pass
+
+
+def test_a_folder_and_a_device_are_not_replaced(tmp_path: Path) -> None:
+    for place in (tmp_path, Path("/dev/null")):
+        with pytest.raises(InputError, match="a folder or device, which no file may replace"):
+            write_json(place, {})
+    assert not Path("/dev/null").is_file()
+
+
+def test_a_file_in_the_way_of_a_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"x\.json: cannot be written"):
+        write_json(tmp_path / "file" / "x.json", {})
+
+
+def test_a_written_file_has_the_rights_of_any_new_file(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_text("")
+    write_json(tmp_path / "x.json", {})
+    assert (tmp_path / "x.json").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_file_too_large_is_refused_unread(tmp_path: Path) -> None:
+    with (tmp_path / "huge.npy").open("wb") as file:
+        file.truncate(5 * 2**30)
+    with pytest.raises(InputError, match=r"huge\.npy: 5368709120 bytes, more than the 4294967296"):
+        read_bytes(tmp_path / "huge.npy")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay_s", [0.0, 0.01, 0.05, 0.2])
+def test_a_killed_writer_never_leaves_half_a_file(tmp_path: Path, delay_s: float) -> None:
+    target = tmp_path / "x.bin"
+    target.write_bytes(b"a" * 10_000_000)
+    code = (
+        "import sys\nfrom depthpose.core.files.disk import write_bytes\nprint('go', flush=True)\n"
+        "while True:\n    for c in b'bc': write_bytes(sys.argv[1], bytes([c]) * 10_000_000)"
+    )
+    writer = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE)
+    with writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        with pytest.raises(subprocess.TimeoutExpired):
+            writer.wait(delay_s)
+        writer.kill()
+    content = target.read_bytes()
+    assert len(content) == 10_000_000
+    assert len(set(content)) == 1

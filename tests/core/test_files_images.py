@@ -1,0 +1,146 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    image_size,
+    list_images,
+    read_depth_png,
+    read_disparity_png,
+    read_image,
+    write_depth_png,
+    write_disparity_png,
+    write_image,
+)
+
+
+def bytes_image(height: int = 5, width: int = 7) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@given(seed=st.integers(0, 2**32 - 1), height=st.integers(1, 9), width=st.integers(1, 9))
+def test_png_gives_back_every_byte(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, height: int, width: int
+) -> None:
+    path = tmp_path_factory.mktemp("png") / "x.png"
+    torch.manual_seed(seed)
+    image = torch.randint(0, 256, (3, height, width)) / 255
+    write_image(path, image)
+    assert torch.equal(read_image(path), image)
+    assert image_size(path) == (width, height)
+
+
+def test_writing_rounds_to_the_nearest_level_and_clips_overshoot(tmp_path: Path) -> None:
+    image = torch.tensor([0.4, 0.6, 254.6, 260.0, -3.0])[None, None].expand(3, 1, -1) / 255
+    write_image(tmp_path / "x.png", image)
+    assert (read_image(tmp_path / "x.png")[0, 0] * 255).tolist() == [0, 1, 255, 255, 0]
+
+
+def test_jpeg_comes_back_close(tmp_path: Path) -> None:
+    ramp = torch.linspace(0, 1, 64).expand(3, 32, 64).contiguous()
+    write_image(tmp_path / "x.jpg", ramp)
+    assert float((read_image(tmp_path / "x.jpg") - ramp).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "CMYK", "I;16"])
+def test_every_mode_becomes_three_channels(tmp_path: Path, mode: str) -> None:
+    grey = Image.fromarray(bytes_image()[:, :, 0])
+    picture = (
+        Image.fromarray(bytes_image()[:, :, 0].astype(np.uint16) * 257)
+        if mode == "I;16"
+        else grey.convert("RGB").convert(mode)
+    )
+    path = tmp_path / ("x.tif" if mode == "CMYK" else "x.png")
+    picture.save(path)
+    image = read_image(path)
+    assert image.shape == (3, 5, 7)
+    assert torch.equal(image[0], image[2])
+    if mode not in ("1", "P"):
+        expected = torch.from_numpy(bytes_image()[:, :, 0] / 255).float()
+        torch.testing.assert_close(image[0], expected)
+
+
+def test_a_transparent_palette_keeps_its_colours(tmp_path: Path) -> None:
+    picture = Image.new("P", (2, 1))
+    picture.putpalette([255, 0, 0, 0, 0, 255])
+    picture.putdata([0, 1])
+    picture.save(tmp_path / "x.png", transparency=bytes([0, 128]))
+    assert read_image(tmp_path / "x.png")[:, 0].T.tolist() == [[1, 0, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+def test_exif_orientation_is_applied_to_pixels_and_size(
+    tmp_path: Path, orientation: int, suffix: str
+) -> None:
+    pixels = np.zeros((16, 32, 3), np.uint8)
+    pixels[:8, :16] = 255  # the first corner of what the file stores
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"x{suffix}"
+    Image.fromarray(pixels).save(path, exif=exif.tobytes())
+    image = read_image(path)
+    assert image_size(path) == (image.shape[2], image.shape[1])
+    assert (image.shape[1] > image.shape[2]) == (orientation >= 5)
+    # EXIF 2.32, tag 274: where the stored first row and first column belong.
+    row, column = {
+        **{1: (0, 0), 2: (0, -1), 3: (-1, -1), 4: (-1, 0)},
+        **{5: (0, 0), 6: (0, -1), 7: (-1, -1), 8: (-1, 0)},
+    }[orientation]
+    corners = {(r, c): float(image[0, r, c]) for r in (0, -1) for c in (0, -1)}
+    assert max(corners, key=lambda at: corners[at]) == (row, column)
+
+
+def test_depth_png_follows_kitti_to_the_digit(tmp_path: Path) -> None:
+    Image.fromarray(np.array([[0, 1, 256, 65535]], np.uint16)).save(tmp_path / "d.png")
+    depth_m = read_depth_png(tmp_path / "d.png")
+    assert torch.isnan(depth_m[0, 0])
+    assert depth_m[0, 1:].tolist() == [1 / 256, 1.0, 65535 / 256]
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1 / 256, 0.001, 0.0001]))
+def test_depth_png_round_trips_every_unit(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, unit_m: float
+) -> None:
+    path = tmp_path_factory.mktemp("depth") / "d.png"
+    torch.manual_seed(seed)
+    units = torch.randint(0, 65536, (4, 5))
+    depth_m = torch.where(units > 0, units.double() * unit_m, torch.nan).float()
+    write_depth_png(path, depth_m, unit_m)
+    torch.testing.assert_close(read_depth_png(path, unit_m), depth_m, equal_nan=True)
+    again = torch.from_numpy(np.asarray(Image.open(path)).astype(np.int64))
+    assert torch.equal(again, units)
+
+
+def test_what_16_bits_cannot_hold_becomes_zero(tmp_path: Path) -> None:
+    bad = torch.tensor([[torch.nan, -1, 0, 256, torch.inf, 255.999, 0.001]])
+    write_disparity_png(tmp_path / "d.png", bad)
+    assert torch.isnan(read_disparity_png(tmp_path / "d.png")).all()
+
+
+def test_listing_a_file_a_folder_and_a_pattern(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("b.png", "a.JPG", "c.jpeg", "note.txt", ".hidden.png", "sub/d.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    names = [p.name for p in list_images(tmp_path)]
+    assert names == ["a.JPG", "b.png", "c.jpeg"]
+    assert list_images(tmp_path / "b.png") == [tmp_path / "b.png"]
+    assert [p.name for p in list_images(f"{tmp_path}/*.png")] == ["b.png"]
+    assert [p.name for p in list_images(tmp_path / "**" / "*.png")] == ["b.png", "d.png"]
+    monkeypatch.chdir(tmp_path)
+    assert list_images("sub/*") == [Path("sub/d.png")]
+
+
+@pytest.mark.parametrize("wanted", ["", "nothing", "*.bmp", "empty"])
+def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no \.png, \.jpg, \.jpeg file there; give a picture"):
+        list_images(tmp_path / wanted)

@@ -1,0 +1,58 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from depthpose.core.files import read_json, read_key_values, read_text, write_json
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(exclude_categories=["Cs"])),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text("abcé"), inner),
+    max_leaves=12,
+)
+
+
+@given(JSON)
+def test_json_comes_back(tmp_path_factory: pytest.TempPathFactory, content: object) -> None:
+    path = tmp_path_factory.mktemp("json") / "x.json"
+    write_json(path, content)
+    assert read_json(path) == content
+
+
+def test_json_keeps_the_order_it_was_given(tmp_path: Path) -> None:
+    write_json(tmp_path / "x.json", {"z": 1, "a": {"c": [1.5], "b": None}})
+    text = (tmp_path / "x.json").read_text()
+    assert list(json.loads(text)) == ["z", "a"]
+    assert text.startswith('{\n  "z": 1,\n')
+    assert text.endswith("}\n")
+
+
+def test_text_loses_its_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "x.txt").write_bytes(b"\xef\xbb\xbfK\xc3\xb6ln")
+    assert read_text(tmp_path / "x.txt") == "Köln"
+
+
+def test_key_values_of_kitti_and_middlebury(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text(
+        "# sensors\ncalib_time: 09-Jan-2012 13:57:47\n\nP2: 7.2e+02 0 -1\nP_rect_02: 1 2\r\n"
+        "cam0=[3997.684 0 1176.728; 0 3997.684 1011.728; 0 0 1]\ndoffs=131.111\nR0_rect:\n"
+    )
+    assert read_key_values(tmp_path / "calib.txt") == {
+        "P2": [720.0, 0.0, -1.0],
+        "P_rect_02": [1.0, 2.0],
+        "cam0": [3997.684, 0, 1176.728, 0, 3997.684, 1011.728, 0, 0, 1],
+        "doffs": [131.111],
+    }
+
+
+def test_numbers_survive_json_exactly(tmp_path: Path) -> None:
+    values = [math.pi, 1e-308, 0.1, 1 / 3]
+    write_json(tmp_path / "x.json", values)
+    assert read_json(tmp_path / "x.json") == values
