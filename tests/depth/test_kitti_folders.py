@@ -269,9 +269,10 @@ def test_the_check_counts_and_notes_what_is_not_there(tmp_path: Path) -> None:
     assert report.is_ok
     assert report.counts["frames"] == 2
     assert report.counts["right views"] == 1
-    assert [note.message for note in report.notices] == ["has no right view"]
+    notes = [note.message for note in report.notices]
+    assert notes == ["mixes PNG and JPEG images", "has no right view"]
     assert seen == [(1, 2), (2, 2)]
-    assert "nothing is wrong, 1 notices" in report.summary
+    assert "nothing is wrong, 2 notices" in report.summary
 
 
 def test_two_images_of_one_name_are_a_mismatch(tmp_path: Path) -> None:

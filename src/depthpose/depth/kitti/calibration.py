@@ -38,6 +38,7 @@ def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibrat
     cameras = folder / "calib_cam_to_cam.txt"
     keys = read_key_values(cameras)
     left = _matrix(cameras, keys, "P_rect_02", (3, 4))
+    _check_size(cameras, keys, width, height)
     rig = _rig(cameras, left, _matrix(cameras, keys, "P_rect_03", (3, 4)), width, height)
     lidar = folder / "calib_velo_to_cam.txt"
     if not lidar.is_file():
@@ -45,8 +46,8 @@ def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibrat
     rectify = _square(_matrix(cameras, keys, "R_rect_00", (3, 3)))
     of_lidar = read_key_values(lidar)
     R, t = _matrix(lidar, of_lidar, "R", (3, 3)), _matrix(lidar, of_lidar, "T", (3, 1))
-    camera_from_velodyne = _square(np.hstack([R, t]))
-    return KittiCalibration(rig=rig, pixels_from_velodyne=left @ rectify @ camera_from_velodyne)
+    composed = _compose(lidar, left, rectify, _square(np.hstack([R, t])))
+    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
 def read_object_calibration(path: Path, width: int, height: int) -> KittiCalibration:
@@ -60,12 +61,14 @@ def read_object_calibration(path: Path, width: int, height: int) -> KittiCalibra
     keys = read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
     left, right = (_matrix(path, keys, name, (3, 4)) for name in names)
+    _check_size(path, keys, width, height)
     rig = _rig(path, left, right, width, height)
     if "Tr_velo_to_cam" not in keys:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = _square(_matrix(path, keys, "R0_rect", (3, 3)))
     camera_from_velodyne = _square(_matrix(path, keys, "Tr_velo_to_cam", (3, 4)))
-    return KittiCalibration(rig=rig, pixels_from_velodyne=left @ rectify @ camera_from_velodyne)
+    composed = _compose(path, left, rectify, camera_from_velodyne)
+    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
 def read_middlebury_calibration(path: Path) -> StereoRig:
@@ -112,6 +115,8 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
                 for key, side in (("width", width), ("height", height))]  # fmt: skip
         return _simple_rig(path, size, values)
     own = [words for line in text.splitlines() if (words := line.split()) and words[0] == name]
+    if len(own) > 1:
+        raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
     if not own or len(own[0]) < 7:
         raise InputError(
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
@@ -134,9 +139,34 @@ def _rig(path: Path, left: Matrix, right: Matrix, width: int, height: int) -> St
     """Derive the rig from two projections: f = P2[0,0], B = b3 - b2 with b = -P[0,3] / P[0,0]."""
     if not (left[0, 0] > 0 and right[0, 0] > 0):
         raise InputError(f"{path}: the focal lengths of cameras 2 and 3 are not positive.")
-    baseline_m = -right[0, 3] / right[0, 0] + left[0, 3] / left[0, 0]
+    with np.errstate(all="ignore"):  # what overflows is refused as a baseline
+        baseline_m = -right[0, 3] / right[0, 0] + left[0, 3] / left[0, 0]
+        difference_px = right[0, 2] - left[0, 2]
     K = torch.from_numpy(left[:, :3].copy())
-    return _built(path, width, height, K, float(baseline_m), float(right[0, 2] - left[0, 2]))
+    return _built(path, width, height, K, float(baseline_m), float(difference_px))
+
+
+def _compose(
+    path: Path,
+    left: Matrix,
+    rectify: Float64[np.ndarray, "4 4"],
+    camera_from_velodyne: Float64[np.ndarray, "4 4"],
+) -> Float64[np.ndarray, "3 4"]:
+    with np.errstate(all="ignore"):
+        composed = left @ rectify @ camera_from_velodyne
+    if not np.isfinite(composed).all():
+        raise InputError(f"{path}: its matrices multiply to infinity. Copy the file anew.")
+    return composed
+
+
+def _check_size(path: Path, keys: Mapping[str, list[float]], width: int, height: int) -> None:
+    size = keys.get("S_rect_02", [width, height])
+    if size != [width, height]:
+        said = "x".join(f"{number:g}" for number in size)
+        raise InputError(
+            f"{path}: S_rect_02 says {said}, but the image is {width}x{height}. It was cropped or "
+            "scaled: give its own calibration, in a folder of pairs."
+        )
 
 
 def _built(

@@ -12,6 +12,9 @@ from depthpose.depth.kitti.frames import Frame, frame_rig, kitti_calibration, re
 from depthpose.depth.kitti.layouts import find_frames
 from depthpose.depth.kitti.splits import read_split
 
+_MAX_BASELINE_M = 10
+_MAX_DEPTH_M = 200
+"""KITTI's LiDAR sees 120 m."""
 _LFS_POINTER = b"version https://git-lfs"
 
 
@@ -89,7 +92,7 @@ def check_dataset(
             if name not in here
         ]
         frames = [here[name] for name in chosen.names if name in here]
-    found += _same_names(frames)
+    found += [*_same_names(frames), *_mixed_formats(folder, frames), *_lone_right_views(frames)]
     for done, frame in enumerate(frames, 1):
         found += _check_frame(frame, with_decoding=with_decoding)
         if progress is not None:
@@ -119,6 +122,25 @@ def _same_names(frames: list[Frame]) -> Iterator[Problem]:
             message = f"has the same name as {seen[frame.name]}; rename one"
             yield Problem(path=frame.left, kind="mismatch", message=message)
         seen[frame.name] = frame.left
+
+
+def _mixed_formats(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
+    """Compression changes what networks predict, so a mixture is worth knowing."""
+    views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
+    kinds = {"JPEG" if path.suffix.lower() in (".jpg", ".jpeg") else "PNG" for path in views}
+    if len(kinds) > 1:
+        yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
+
+
+def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
+    # The folders are listed, not the frames: a split leaves many pairs out on purpose.
+    folders = {(f.left.parent, f.right.parent) for f in frames if f.right is not None}
+    for left, right in sorted(folders):
+        stems = {path.stem for path in left.iterdir()}
+        for path in sorted(right.iterdir()):
+            is_view = path.suffix.lower() in (".png", ".jpg", ".jpeg") and path.name[0] != "."
+            if is_view and left != right and path.stem not in stems:
+                yield Problem(path=path, kind="missing", message="has no left view")
 
 
 def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
@@ -155,12 +177,19 @@ def _look_at_image(
 
 
 def _check_calibration(frame: Frame) -> Iterator[Problem]:
+    if frame.calibration is None and frame.velodyne is not None:
+        message = "has no calibration, so its scan cannot be projected"
+        yield Problem(path=frame.left, kind="missing", message=message)
+        return
     if frame.calibration is None:
         message = "has no calibration: disparity only, no metres"
         yield Problem(path=frame.left, kind="note", message=message)
         return
     try:
-        frame_rig(frame)
+        rig = frame_rig(frame)
+        if rig is not None and rig.baseline_m >= _MAX_BASELINE_M:
+            message = f"gives a baseline of {rig.baseline_m:g} m; is it in metres?"
+            yield Problem(path=frame.calibration, kind="mismatch", message=message)
         if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
             message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
             yield Problem(path=frame.calibration, kind="missing", message=message)
@@ -190,6 +219,11 @@ def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterat
         yield Problem(path=path, kind="mismatch", message=message)
     if not bool(torch.isfinite(truth).any()):
         yield Problem(path=path, kind="empty", message="holds no value")
+    largest = float(truth.nan_to_num(0.0).max())
+    limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (width, "px")
+    if largest > limit:
+        message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
+        yield Problem(path=path, kind="mismatch", message=message)
 
 
 def _unreadable(path: Path, error: InputError) -> Problem:

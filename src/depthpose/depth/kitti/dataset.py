@@ -1,6 +1,7 @@
 """A folder of stereo frames, opened."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from depthpose.core.camera import StereoRig
@@ -53,10 +54,14 @@ def open_dataset(folder: Path, split: str | Path | None = None) -> Dataset:
         split: name or file of a split: only its frames, which must all be there.
 
     Raises:
-        InputError: no such folder or layout, or frames of the split are missing.
+        InputError: no such folder or layout, two images of one name, or frames of the split are
+            missing.
     """
     folder = Path(folder)
     layout, frames = find_frames(folder)
+    for frame, after in pairwise(frames):
+        if frame.name == after.name:
+            raise InputError(f"{after.left}: has the same name as {frame.left}; remove one.")
     name = folder.resolve().name
     if split is None:
         return Dataset(name=name, layout=layout, frames=frames)

@@ -7,7 +7,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import StereoRig, read_rig
+from depthpose.core.camera import StereoRig, check_image_matches_camera, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     image_size,
@@ -58,34 +58,54 @@ class Frame:
 
 
 def frame_input(frame: Frame) -> StereoInput:
-    """Read images and calibration of a frame."""
-    return StereoInput(
-        name=frame.name,
-        left=read_image(frame.left),
-        right=None if frame.right is None else read_image(frame.right),
-        camera=frame_rig(frame),
-    )
+    """Read images and calibration of a frame.
+
+    Raises:
+        InputError: a file is missing or damaged, or the two views differ in size.
+    """
+    left = read_image(frame.left)
+    right = None if frame.right is None else read_image(frame.right)
+    if frame.right is not None and right is not None:
+        _check_size(frame.right, right, (left.shape[2], left.shape[1]))
+    return StereoInput(name=frame.name, left=left, right=right, camera=frame_rig(frame))
 
 
 def frame_truth(frame: Frame) -> StereoTruth:
-    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`."""
+    """Read the truth that the dataset ships as maps; a LiDAR scan is for :func:`lidar_truth`.
+
+    Raises:
+        InputError: a map is damaged, or of another size than the left image.
+    """
     depth_m = None if frame.depth is None else read_depth_png(frame.depth)
     disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
+    for path, values in ((frame.depth, depth_m), (frame.disparity, disparity_px)):
+        if path is not None and values is not None:
+            _check_size(path, values, image_size(frame.left))
     return StereoTruth(disparity_px=disparity_px, depth_m=depth_m)
 
 
 def frame_rig(frame: Frame) -> StereoRig | None:
-    """Read the rig of a frame, or None where it has no calibration."""
+    """Read the rig of a frame, or None where it has no calibration.
+
+    Raises:
+        InputError: the calibration is damaged, or that of images of another size.
+    """
     if frame.calibration is None:
         return None
+    rig = _read_rig(frame, frame.calibration)
+    check_image_matches_camera(rig, *image_size(frame.left), str(frame.left))
+    return rig
+
+
+def _read_rig(frame: Frame, path: Path) -> StereoRig:
     if frame.style in ("raw", "object"):
         return kitti_calibration(frame).rig
     if frame.style == "middlebury":
-        return read_middlebury_calibration(frame.calibration)
+        return read_middlebury_calibration(path)
     if frame.style == "camera":
-        return read_rig(frame.calibration)
+        return read_rig(path)
     width, height = image_size(frame.left)
-    return read_plain_calibration(frame.calibration, frame.left.stem, width, height)
+    return read_plain_calibration(path, frame.left.stem, width, height)
 
 
 def kitti_calibration(frame: Frame) -> KittiCalibration:
@@ -135,6 +155,15 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
 
 def _has_drawn_scan(frame: Frame) -> bool:
     return frame.style in ("plain", "camera") and frame.depth is not None
+
+
+def _check_size(path: Path, values: Float[Tensor, "*any h w"], size: tuple[int, int]) -> None:
+    height, width = values.shape[-2:]
+    if (width, height) != size:
+        raise InputError(
+            f"{path}: is {width}x{height}, but its left image is {size[0]}x{size[1]}; "
+            "do the two belong together?"
+        )
 
 
 def read_disparity(path: Path) -> Float[Tensor, "h w"]:

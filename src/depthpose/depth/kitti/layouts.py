@@ -17,24 +17,36 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Give the folder of a dataset.")
-    for layout, find in LAYOUTS.items():
-        frames = sorted(find(folder), key=lambda frame: frame.name)
-        if frames:
-            return layout, frames
-    found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
+    known = _recognise(folder)
+    if known is not None:
+        return known
+    children = sorted(folder.iterdir())
+    found = ", ".join(path.name for path in children[:8]) or "nothing"
+    inside = [path.name for path in children[:50] if path.is_dir() and _recognise(path)]
+    hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
     raise InputError(
         f"{folder}: no layout that is known here. It holds {found}. Known: "
         "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
         "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
         "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json)."
+        f"{hint}"
     )
 
 
+def _recognise(folder: Path) -> tuple[str, list[Frame]] | None:
+    for layout, find in LAYOUTS.items():
+        frames = sorted(find(folder), key=lambda frame: frame.name)
+        if frames:
+            return layout, frames
+    return None
+
+
 def _raw(folder: Path) -> Iterable[Frame]:
-    """KITTI raw: a root of dates, or one date; annotated depth inside the drives or beside."""
-    for drive in sorted([*folder.glob("*_sync"), *folder.glob("*/*_sync")]):
+    """KITTI raw: a root of dates, a date or a drive; annotated depth inside or beside."""
+    itself = [folder] if folder.name.endswith("_sync") else []
+    for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date = drive.parent
-        annotated = _annotated_folder(folder, drive)
+        annotated = _annotated_folder(drive)
         for left in _images(drive / "image_02/data"):
             yield Frame(
                 name=f"{drive.name}_{left.stem}",
@@ -47,17 +59,20 @@ def _raw(folder: Path) -> Iterable[Frame]:
             )
 
 
-def _annotated_folder(folder: Path, drive: Path) -> Path:
+def _annotated_folder(drive: Path) -> Path:
+    """Find the maps of a drive, wherever in the tree the dataset was opened."""
     inside = "proj_depth/groundtruth/image_02"
-    roots = (folder, folder / "data_depth_annotated")
+    homes = (drive.parent, drive.parent.parent)
+    roots = [root for home in homes for root in (home, home / "data_depth_annotated")]
     homes = [drive, *(root / part / drive.name for root in roots for part in ("train", "val"))]
     return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
 
 
 def _object_or_2015(folder: Path) -> Iterable[Frame]:
     home = folder / "training" if (folder / "training/image_2").is_dir() else folder
-    is_stereo = any((home / name).is_dir() for name in ("disp_occ_0", "disp_noc_0"))
-    for left in _images(home / "image_2"):
+    lefts = _images(home / "image_2")
+    is_stereo = any(left.stem.endswith("_10") for left in lefts)  # its testing folder too
+    for left in lefts:
         if is_stereo and not left.stem.endswith("_10"):
             continue
         number = left.stem.removesuffix("_10")
@@ -94,7 +109,7 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
     for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
         if (scene / "calib.txt").is_file() and (scene / "im0.png").is_file():
             yield Frame(
-                name=scene.name,
+                name="_".join(scene.relative_to(folder).parts) or scene.name,
                 left=scene / "im0.png",
                 right=_existing(scene / "im1.png"),
                 calibration=scene / "calib.txt",
@@ -129,7 +144,8 @@ LAYOUTS: dict[str, Callable[[Path], Iterable[Frame]]] = {
 def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+    found = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in found if path.suffix.lower() in _IMAGES)
 
 
 def _partner(folder: Path, stem: str) -> Path | None:

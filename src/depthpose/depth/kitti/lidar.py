@@ -34,15 +34,16 @@ def project_lidar(
     homogeneous = points.numpy().astype(np.float32).copy()
     homogeneous[:, 3] = 1.0
     homogeneous = homogeneous[homogeneous[:, 0] >= 0]
-    projected = (pixels_from_velodyne @ homogeneous.T.astype(np.float64)).T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):  # points on the plane of the camera divide by zero
+        projected = (pixels_from_velodyne @ homogeneous.T.astype(np.float64)).T
         pixel = np.round(projected[:, :2] / projected[:, 2:3]) - 1
     value_m = homogeneous[:, 0].astype(np.float64) if depth == "velodyne_x" else projected[:, 2]
     is_inside = ((pixel >= 0) & (pixel < (width, height))).all(1)
     u, v = pixel[is_inside].astype(np.int64).T
     written = _write_in_order(u, v, value_m[is_inside], (height, width))
     written[written < 0] = 0
-    as_float32 = torch.from_numpy(written.astype(np.float32))
+    with np.errstate(over="ignore"):
+        as_float32 = torch.from_numpy(written.astype(np.float32))
     return torch.where(as_float32 > 0, as_float32, torch.nan)
 
 

@@ -55,7 +55,11 @@ def read_split(name: str | Path) -> Split:
     if str(name) in _SHIPPED:
         return _shipped(str(name))
     path = Path(name)
-    if not path.is_file():
+    try:
+        is_there = path.is_file()
+    except OSError:  # a name too long for the disk
+        is_there = False
+    if not is_there:
         raise InputError(f"split {str(name)!r}: no such file; {nearest_name(str(name), _SHIPPED)}")
     text = read_text(path)
     known = _MONODEPTH_SHA256.get(hashlib.sha256(text.encode()).hexdigest())
@@ -74,19 +78,18 @@ def read_split(name: str | Path) -> Split:
 
 def _parse_line(path: Path, number: int, line: str) -> tuple[str, int] | None:
     """Read one line; None for a frame of the right camera."""
-    drive = re.search(r"(\d{4}_\d\d_\d\d_drive_\d{4}_sync)", line)
-    as_image = re.search(r"image_0[23]/data/(\d{1,10})\.\w+", line)
-    as_words = re.fullmatch(r"\S+\s+(\d{1,10})\s+([lr])", line)
-    if drive is None or (as_image is None and as_words is None):
+    drives = set(re.findall(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync", line, re.ASCII))
+    images = {int(n) for n in re.findall(r"image_0[23]/(?:data/)?(\d{1,10})\.\w", line, re.ASCII)}
+    as_words = re.fullmatch(r"\S+\s+(\d{1,10})\s+([lr])", line, re.ASCII)
+    numbers = {int(as_words[1])} if as_words is not None else images
+    if len(drives) != 1 or len(numbers) != 1:
         raise InputError(
             f"{path}: line {number} is {line[:60]!r}, but a frame is 'DATE/DRIVE FRAME l' "
-            "(monodepth2) or two image paths (monodepth)."
+            "(monodepth2) or two image paths of one frame (monodepth)."
         )
     if as_words is not None and as_words[2] == "r":
         return None
-    found = as_words or as_image
-    assert found is not None
-    return drive[1], int(found[1])
+    return drives.pop(), numbers.pop()
 
 
 @cache
