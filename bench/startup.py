@@ -22,7 +22,10 @@ def seconds(*words: str) -> float:
 
 def main() -> None:
     """Print a Markdown table."""
-    rows = {"python -c pass": ("-c", "pass"), "python -c 'import torch'": ("-c", "import torch")}
+    rows: dict[str, tuple[str, ...]] = {
+        "python -c pass": ("-c", "pass"),
+        "python -c 'import torch'": ("-c", "import torch"),
+    }
     for name in ("", *COMMANDS):
         rows[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
     print("| command | seconds |\n| --- | --- |")

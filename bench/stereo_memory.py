@@ -5,7 +5,6 @@ python bench/stereo_memory.py [--size 375x1242] [--bound-mb 1000 least] [--weigh
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -13,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from stereo_speed import network_for, out_folder, random_pair, size_of
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import Footprint, PSMNetMatcher, Steps
-from stereo_speed import network_for, out_folder, random_pair, size_of
 
 
 def resident_bytes(field: str) -> int:
@@ -35,8 +34,8 @@ def run_once(size: tuple[int, int], weights: Path | None, bound: int | None, out
     # Loading may have peaked higher: 5 resets the high-water mark (Linux, proc_pid_clear_refs).
     Path("/proc/self/clear_refs").write_text("5")
     match = matcher.match(left, right)
-    peak = max(resident_bytes("VmHWM"), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 0)
-    np.savez(out, disparity_px=match.disparity_px.numpy(), activations=peak - before)
+    activations = resident_bytes("VmHWM") - before
+    np.savez(out, disparity_px=match.disparity_px.numpy(), activations=activations)
 
 
 def measure(

@@ -86,8 +86,7 @@ def plain_match(network: PSMNet, pair: Pair) -> Tensor:
 
 
 def best_seconds(run: Callable[[], object], repeats: int) -> float:
-    """Least wall time of some runs after a first one."""
-    run()
+    """Least wall time of some runs; the caller has warmed up."""
     times = []
     for _ in range(repeats):
         begin = time.perf_counter()
@@ -109,20 +108,25 @@ def peak_flops(dtype: torch.dtype) -> float:
     return max(2 * 4096 * 4096 * 1024 / by_matmul, 2 * 512 * 512 * 64 * 128 / by_convolution)
 
 
-def matmul_flops(run: Callable[[], object]) -> int:
-    """Count the operations of convolutions and products in one run."""
+def plain_flops(network: PSMNet, pair: Pair) -> int:
+    """Count the operations of the plain network, without computing anything."""
+    with torch.device("meta"):
+        shadow = PSMNet(network.config).eval()
     with FlopCounterMode(display=False) as counter:
-        run()
+        plain_match(shadow, (pair[0].to("meta"), pair[1].to("meta")))
     return counter.get_total_flops()
+
+
+def exact_match(network: PSMNet, pair: Pair) -> Tensor:
+    """Run the plain network in float64."""
+    double = PSMNet(network.config).double().eval()
+    double.load_state_dict(network.state_dict())
+    return plain_match(double, pair)
 
 
 def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> list[dict]:
     """Time every variant on one pair."""
-    with torch.device("meta"):
-        double = PSMNet(network.config)
-    double = double.to_empty(device="cpu").double().eval()
-    double.load_state_dict(network.state_dict())
-    exact = plain_match(double, pair) if args.exact else plain_match(network, pair).double()
+    exact = exact_match(network, pair) if args.exact else plain_match(network, pair).double()
     variants = {
         "plain eager": None,
         "ours fp32": MatcherConfig(with_confidence=False),
@@ -131,18 +135,26 @@ def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> l
     }
     if args.compile:
         variants["ours fp32, compiled"] = MatcherConfig(with_confidence=False, with_compile=True)
-    flops = matmul_flops(lambda: plain_match(network, pair))
+    flops = plain_flops(network, pair)
     rows: list[dict] = []
     for name, config in variants.items():
-        rows.append(
-            {"size": size, "what": name, **timed(network, pair, config, args.repeats, exact)}
-        )
-        rows[-1]["ratio"] = rows[0]["seconds"] / rows[-1]["seconds"]
+        row = {"size": size, "what": name, **timed(network, pair, config, args.repeats, exact)}
+        rows.append(row)
         peak = peak_flops(torch.bfloat16 if "bf16" in name else torch.float32)
-        rows[-1]["plain_gflop"] = flops / 1e9
-        rows[-1]["share_of_peak"] = flops / rows[-1]["seconds"] / peak
-        rows[-1]["peak_gflops"] = peak / 1e9
+        row["ratio"] = rows[0]["seconds"] / row["seconds"]
+        row["plain_gflop"], row["peak_gflops"] = flops / 1e9, peak / 1e9
+        row["share_of_peak"] = flops / row["seconds"] / peak
+        print(as_line(row), flush=True)
     return rows
+
+
+def as_line(row: dict) -> str:
+    """Write a row in Markdown."""
+    return (
+        f"| {row['size']} | {row['what']} | {row['seconds']:.2f} | {row['first_seconds']:.2f} "
+        f"| {row['ratio']:.2f} | {row['max_px']:.1e} | {row['mean_px']:.1e} "
+        f"| {row['plain_gflop']:.0f} | {row['share_of_peak']:.2f} |"
+    )
 
 
 def timed(
@@ -172,27 +184,22 @@ def main() -> None:
     parser.add_argument("--size", nargs="+", default=["256x512", "375x1242"])
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--pair", nargs=2, type=Path)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--compile", action="store_true")
     parser.add_argument("--exact", action="store_true", help="compare with float64: a minute more")
     args = parser.parse_args()
     network = network_for(args.weights)
+    print(
+        f"{torch.get_num_threads()} threads, torch {torch.__version__}; differences from ", end=""
+    )
+    print("float64" if args.exact else "the plain network", end="")
+    print("; 'of peak': the plain network's operations a second against the best matrix product's")
+    print("| size | what | s | first run s | times faster | max px | mean px | GFLOP | of peak |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     rows = [
         row for s in args.size for row in bench(network, s, pair_for(size_of(s), args.pair), args)
     ]
     (out_folder() / "stereo_speed.json").write_text(json.dumps(rows, indent=1))
-    print(
-        f"{torch.get_num_threads()} threads, torch {torch.__version__}; differences from ", end=""
-    )
-    print("float64" if args.exact else "the plain network")
-    print("| size | what | s | first run s | times faster | max px | mean px | of peak |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for r in rows:
-        print(
-            f"| {r['size']} | {r['what']} | {r['seconds']:.2f} | {r['first_seconds']:.2f} | "
-            f"{r['ratio']:.2f} | {r['max_px']:.1e} | {r['mean_px']:.1e} | {r['share_of_peak']:.2f} |"
-        )
-    print(f"{rows[0]['plain_gflop']:.0f} GFLOP plain; 'of peak': those, against the best product")
 
 
 if __name__ == "__main__":

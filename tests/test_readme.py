@@ -1,6 +1,5 @@
 """What the README tells a newcomer to type, typed."""
 
-import os
 import re
 import shlex
 from pathlib import Path
@@ -50,10 +49,9 @@ def test_the_python_lines_run_and_end_in_metres(demo_folder: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_the_commands_that_need_data_run(demo_folder: Path) -> None:
-    data = Path(os.environ.get("DEPTHPOSE_DATA") or pytest.skip("DEPTHPOSE_DATA names no data"))
-    (demo_folder / PUBLISHED).symlink_to(data / "reference/psmnet/published_kitti2015.tar")
-    (demo_folder / "KITTI").symlink_to(data / "depth/kitti_object")
+def test_the_commands_that_need_data_run(demo_folder: Path, real: Path) -> None:
+    (demo_folder / PUBLISHED).symlink_to(real / "reference/psmnet/published_kitti2015.tar")
+    (demo_folder / "KITTI").symlink_to(real / "depth/kitti_object")
     lines = [line for line in commands() if "psmnet" in line or "KITTI" in line]
     assert len(lines) >= 5
     for line in lines:

@@ -10,7 +10,7 @@ from depthpose.depth.config import PSMNetConfig
 MARGIN = 1.1
 """Allocators keep gaps: measured peaks stay below the sum of the tensors times this ..."""
 
-OVERHEAD_BYTES = 96 << 20
+OVERHEAD_BYTES = 128 << 20
 """... plus this, which the first convolutions take for themselves whatever the size."""
 
 CHUNK_BYTES = 2 << 20
