@@ -1,6 +1,6 @@
-"""OpenCV's matcher, the user's own, and what is no pair."""
+"""What matchers take and refuse; the matcher of OpenCV; functions of the user's."""
 
-import importlib
+import sys
 
 import numpy as np
 import pytest
@@ -9,138 +9,125 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.config import SGBMConfig
-from depthpose.depth.stereo import CallableMatcher, Matcher, SGBMMatcher, check_pair, fill_holes
+from depthpose.depth.stereo import CallableMatcher, SGBMMatcher, check_pair, fill_holes
 
-NAN = torch.nan
-
-
-def shifted_pair(shift: int = 12) -> tuple[Tensor, Tensor]:
-    """A wide texture seen from two places ``shift`` px apart."""
-    wide = torch.rand(3, 60, 300 + shift, generator=torch.Generator().manual_seed(0))
-    return wide[..., :300].contiguous(), wide[..., shift:].contiguous()
+GOOD = torch.full((3, 8, 10), 0.5)
+NAN = float("nan")
 
 
-def test_sgbm_finds_a_constant_shift() -> None:
-    left, right = shifted_pair()
-    match = SGBMMatcher(SGBMConfig(num_disparities=32)).match(left, right)
-    found = match.disparity_px[torch.isfinite(match.disparity_px)]
-    assert found.numel() > 0.5 * match.disparity_px.numel()
-    assert float((found - 12).abs().median()) < 0.1
-    assert bool(torch.isnan(match.disparity_px[:, :31]).all())
+@pytest.mark.parametrize(
+    ("left", "right", "text"),
+    [
+        (GOOD, GOOD[:, :7], "left image is 8x10 and right image 7x10; .*crop or resize both"),
+        (GOOD, GOOD[:, :, :9], "left image is 8x10 and right image 8x9"),
+        (GOOD[:, :0], GOOD, r"left image is empty: shape \(3, 0, 10\)"),
+        (GOOD, GOOD[:, :, :0], "right image is empty"),
+        (GOOD * NAN, GOOD, "left image holds NaN or infinite values"),
+        (GOOD, GOOD / 0, "right image holds NaN or infinite values"),
+        (GOOD * 255, GOOD, r"left image must lie in \[0, 1\], got 127.5 .. 127.5; divide 8-bit"),
+        (GOOD - 1, GOOD, r"must lie in \[0, 1\], got -0.5"),
+        (GOOD.to(torch.uint8), GOOD, "must be float in .*got torch.uint8; divide by 255"),
+        (GOOD[0], GOOD, r"must have shape \(3, H, W\), got \(8, 10\)"),
+        (GOOD[None], GOOD, "match pairs one by one"),
+        (GOOD.permute(1, 2, 0), GOOD, "move channels first"),
+        (torch.ones(4, 8, 10), GOOD, "drop alpha"),
+        (GOOD.numpy(), GOOD, "left image must be a tensor, got ndarray"),
+        (None, GOOD, "left image must be a tensor, got NoneType"),
+    ],
+)
+def test_unusable_pairs_are_refused_with_a_remedy(left: object, right: object, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        check_pair(left, right)
 
 
-def test_filled_holes_leave_none_and_say_which() -> None:
-    left, right = shifted_pair()
-    match = SGBMMatcher(SGBMConfig(num_disparities=32, with_filled_holes=True)).match(left, right)
-    assert bool(torch.isfinite(match.disparity_px).all())
-    assert match.confidence is not None
-    assert set(match.confidence.unique().tolist()) == {0.0, 1.0}
+def test_function_of_the_users_is_a_matcher() -> None:
+    matcher = CallableMatcher(lambda left, right: left[0] + right[0])
+    assert torch.equal(matcher.match(GOOD, GOOD).disparity_px, torch.ones(8, 10))
 
 
-def literal_fill(row: list[float]) -> list[float]:
-    filled = list(row)
-    for i, value in enumerate(row):
-        if np.isnan(value):
-            before = [v for v in row[:i] if not np.isnan(v)][-1:]
-            after = [v for v in row[i:] if not np.isnan(v)][:1]
-            filled[i] = min(before + after)
-    return filled
+def test_function_may_ask_for_arrays() -> None:
+    def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        assert left.shape == right.shape == (8, 10, 3)
+        return np.where(left[..., 0] > 0.6, 1, np.nan) if left.max() > 1 else np.ones((8, 10), int)
+
+    matcher = CallableMatcher(match, with_numpy_images=True)
+    assert torch.equal(matcher.match(GOOD, GOOD).disparity_px, torch.ones(8, 10))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_hole_takes_the_smaller_neighbour_of_its_row(seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    disparity_px = torch.rand(6, 15, generator=generator)
-    disparity_px[torch.rand(6, 15, generator=generator) < 0.6] = NAN
-    disparity_px[:, 7] = 0.5  # every row has a value
-    expected = [literal_fill(row) for row in disparity_px.tolist()]
-    torch.testing.assert_close(fill_holes(disparity_px), torch.tensor(expected))
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (torch.ones(8, 9), r"answered shape \(8, 9\) for images of \(8, 10\)"),
+        (torch.full((8, 10), float("inf")), "infinite disparity; use NaN"),
+        (torch.full((8, 10), NAN), "NaN for every pixel"),
+        (-torch.ones(8, 10), "negative disparity .least -1 px.; is the pair swapped"),
+        ("no", "answered str; let it answer a tensor or array"),
+        (np.array(["a"]), "answered ndarray"),
+    ],
+)
+def test_answers_that_are_no_disparity_are_refused(answer: object, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        CallableMatcher(lambda *_: answer).match(GOOD, GOOD)
 
 
-def test_an_empty_row_takes_the_nearest_row() -> None:
-    disparity_px = torch.tensor([[1.0, 1.0], [NAN, NAN], [NAN, NAN], [5.0, 5.0]])
-    assert fill_holes(disparity_px)[:, 0].tolist() == [1.0, 1.0, 5.0, 5.0]
+def shifted_pair(shift_px: int) -> tuple[Tensor, Tensor]:
+    """A textured wall seen by both cameras."""
+    texture = torch.rand(3, 60, 200, generator=torch.Generator().manual_seed(0))
+    return texture[..., :160], texture[..., shift_px : 160 + shift_px]
 
 
-def test_nothing_to_fill_from_is_refused() -> None:
-    with pytest.raises(InputError, match="no pixel was matched"):
-        fill_holes(torch.full((3, 3), NAN))
+def test_sgbm_finds_the_shift_of_a_wall() -> None:
+    pytest.importorskip("cv2")
+    left, right = shifted_pair(12)
+    found = SGBMMatcher(SGBMConfig(num_disparities=32)).match(left, right).disparity_px
+    assert bool(found[:, :12].isnan().all())
+    assert float(found[5:-5, 40:].nanmedian()) == pytest.approx(12, abs=0.1)
 
 
-def test_an_image_narrower_than_the_range_is_refused() -> None:
-    with pytest.raises(InputError, match="take a smaller multiple of 16"):
-        SGBMMatcher().match(torch.zeros(3, 20, 100), torch.zeros(3, 20, 100))
+def test_sgbm_fills_what_it_did_not_match_and_says_where() -> None:
+    pytest.importorskip("cv2")
+    config = SGBMConfig(num_disparities=32, with_filled_holes=True)
+    found = SGBMMatcher(config).match(*shifted_pair(12))
+    assert bool(torch.isfinite(found.disparity_px).all())
+    assert found.confidence is not None
+    assert float(found.confidence[:, :12].max()) == 0
+    assert float(found.confidence.max()) == 1
 
 
-def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> None:
-        raise ImportError(name)
+def test_sgbm_refuses_images_narrower_than_its_range() -> None:
+    pytest.importorskip("cv2")
+    with pytest.raises(InputError, match="10 px wide and num_disparities is 192"):
+        SGBMMatcher().match(GOOD, GOOD)
 
-    monkeypatch.setattr(importlib, "import_module", refuse)
+
+def test_missing_opencv_says_which_extra_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'depthpose\[opencv\]'"):
         SGBMMatcher()
 
 
-@pytest.mark.parametrize("with_numpy_images", [False, True])
-def test_a_function_is_a_matcher(with_numpy_images: bool) -> None:
-    def answer(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> np.ndarray:
-        assert isinstance(left, np.ndarray) == with_numpy_images
-        assert left.shape == ((4, 5, 3) if with_numpy_images else (3, 4, 5))
-        return np.full((4, 5), 7, np.int32)
-
-    matcher = CallableMatcher(answer, with_numpy_images=with_numpy_images)
-    assert isinstance(matcher, Matcher)
-    match = matcher.match(torch.zeros(3, 4, 5), torch.zeros(3, 4, 5))
-    assert match.disparity_px.unique().tolist() == [7.0]
+def test_holes_take_the_smaller_neighbour_and_empty_rows_the_nearest_row() -> None:
+    holes = torch.tensor([[NAN] * 5, [NAN, 4, NAN, 2, NAN], [7, NAN, NAN, NAN, 9], [NAN] * 5])
+    filled = fill_holes(holes)
+    assert filled[1].tolist() == [4, 4, 2, 2, 2]
+    assert filled[2].tolist() == [7, 7, 7, 7, 9]
+    assert torch.equal(filled[0], filled[1])
+    assert torch.equal(filled[3], filled[2])
 
 
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        ("text", "answered str; let it answer a tensor or array"),
-        (torch.zeros(2, 2), r"answered shape \(2, 2\) for images of \(4, 5\)"),
-        (torch.full((4, 5), torch.inf), "answered infinite disparity"),
-        (torch.full((4, 5), NAN), "answered NaN for every pixel"),
-        (torch.full((4, 5), -1.0), "answered negative disparity.*is the pair swapped"),
-    ],
-)
-def test_an_answer_that_is_no_disparity_is_refused(answer: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        CallableMatcher(lambda _, __: answer).match(torch.zeros(3, 4, 5), torch.zeros(3, 4, 5))
-
-
-GOOD = torch.zeros(3, 8, 9)
+def test_nothing_to_fill_from_is_an_error() -> None:
+    with pytest.raises(InputError, match="no pixel was matched"):
+        fill_holes(torch.full((2, 2), NAN))
 
 
 @pytest.mark.parametrize(
-    ("right", "message"),
+    ("knobs", "text"),
     [
-        (torch.zeros(3, 8, 10), "left image is 8x9 and right image 8x10"),
-        (torch.zeros(8, 9), r"must have shape \(3, H, W\), got \(8, 9\)"),
-        (torch.zeros(1, 3, 8, 9), "match pairs one by one"),
-        (torch.zeros(4, 8, 9), "drop alpha"),
-        (torch.zeros(3, 8, 9, dtype=torch.uint8), "float in .0, 1., got torch.uint8; divide by"),
-        (torch.zeros(3, 0, 9), "is empty"),
-        (torch.full((3, 8, 9), NAN), "NaN or infinite"),
-        (torch.full((3, 8, 9), 200.0), "must lie in .0, 1., got 200"),
-        (-torch.ones(3, 8, 9), "do not normalise: the matcher does"),
+        ({"num_disparities": 100}, "multiple of 16, got 100"),
+        ({"block_size": 4}, "block_size must be odd and positive, got 4"),
+        ({"p1": 9, "p2": 3}, "0 < p1 < p2, got p1=9, p2=3"),
     ],
 )
-def test_what_is_no_pair_is_refused(right: Tensor, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        check_pair(GOOD, right)
-
-
-@pytest.mark.parametrize(
-    ("knobs", "message"),
-    [
-        ({"num_disparities": 100}, "multiple of 16"),
-        ({"block_size": 4}, "odd and positive"),
-        ({"p1": 900, "p2": 800}, "0 < p1 < p2"),
-    ],
-)
-def test_settings_that_opencv_would_misread_are_refused(
-    knobs: dict[str, int], message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        SGBMConfig(**knobs)  # pyright: ignore[reportArgumentType]
+def test_sgbm_config_refuses_nonsense(knobs: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        SGBMConfig(**knobs)

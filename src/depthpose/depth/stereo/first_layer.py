@@ -47,6 +47,10 @@ class LookedPair:
         self.bins = bins
         self.bias = layer.bias
         self.height, self.width = left.shape[-2:]
+        d = torch.arange(bins, device=left.device)[:, None]
+        x = torch.arange(self.width, device=left.device)
+        self._looked_at = (x - d).clamp(min=0).flatten()
+        self._is_beyond_edge = (x >= d + 2)[..., None]
         near = min(self.width, bins + 2)
         self._near = [
             [_look(left[..., : near + 1], layer._left[:, s, :, i])[:, :near] for s in range(3)]
@@ -75,17 +79,14 @@ class LookedPair:
     def rows(self, first: int, stop: int) -> Float[Tensor, "1 k n d w"]:
         """Rows ``first .. stop - 1`` of the layer's output, all disparities and columns."""
         y = slice(first, stop)
-        shape = (stop - first, self.bins, self.width, len(self.bias))
-        out = self.bias.new_empty(shape)
-        for d in range(self.bins):
-            variant = 0 if d == 0 else 2 if d == self.bins - 1 else 1
-            left_sum, right_sum = self._sums[variant]
-            plane = out[:, d]
-            edge = min(d + 2, self.width)
-            plane[:, :edge] = self.bias
-            if edge < self.width:
-                shifted = right_sum[y, edge - d : self.width - d]
-                torch.add(left_sum[y, edge:], shifted, out=plane[:, edge:])
+        left_sum, right_sum = self._sums[1]
+        out = right_sum[y].index_select(1, self._looked_at)
+        out = out.view(stop - first, self.bins, self.width, -1)
+        out += left_sum[y, None]
+        for d, (left_end, right_end) in ((0, self._sums[0]), (self.bins - 1, self._sums[2])):
+            shifted = right_end[y].index_select(1, self._looked_at.view(self.bins, -1)[d])
+            torch.add(left_end[y], shifted, out=out[:, d])
+        torch.where(self._is_beyond_edge, out, self.bias, out=out)
         self._add_edge(out, y)
         self._correct_last_column(out, y)
         return out.relu_().permute(3, 0, 1, 2)[None]

@@ -72,23 +72,22 @@ class CallableMatcher:
         return image.permute(1, 2, 0).cpu().numpy() if self.with_numpy_images else image
 
 
-def check_pair(left: Tensor, right: Tensor) -> None:
+def check_pair(left: object, right: object) -> None:
     """Refuse what is not a pair of images, with a remedy.
 
     Raises:
         InputError: not tensors, not ``(3, H, W)``, not float, empty, of two sizes, not finite or
             not in [0, 1].
     """
-    for name, image in (("left", left), ("right", right)):
-        _check_image(name, image)
-    if left.shape != right.shape:
+    first, second = _checked("left", left), _checked("right", right)
+    if first.shape != second.shape:
         raise InputError(
-            f"left image is {_size(left)} and right image {_size(right)}; a rectified pair has one "
-            f"size: crop or resize both alike"
+            f"left image is {_size(first)} and right image {_size(second)}; a rectified pair has "
+            f"one size: crop or resize both alike"
         )
 
 
-def _check_image(name: str, image: Tensor) -> None:
+def _checked(name: str, image: object) -> Tensor:
     if not isinstance(image, Tensor):
         raise InputError(
             f"{name} image must be a tensor, got {type(image).__name__}; read files with "
@@ -103,6 +102,11 @@ def _check_image(name: str, image: Tensor) -> None:
         raise InputError(f"{name} image must be float in [0, 1], got {image.dtype}; divide by 255")
     if not image.numel():
         raise InputError(f"{name} image is empty: shape {tuple(image.shape)}; give it pixels")
+    _check_range(name, image)
+    return image
+
+
+def _check_range(name: str, image: Tensor) -> None:
     if not bool(torch.isfinite(image).all()):
         raise InputError(f"{name} image holds NaN or infinite values; replace or mask them first")
     low, high = float(image.min()), float(image.max())

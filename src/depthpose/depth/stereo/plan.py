@@ -13,8 +13,8 @@ MARGIN = 1.1
 OVERHEAD_BYTES = 128 << 20
 """... plus this, which the first convolutions take for themselves whatever the size."""
 
-CHUNK_BYTES = 2 << 20
-"""Size of one piece of the soft arg-min; it fits a core's cache."""
+CHUNK_BYTES = 6 << 20
+"""Size of one piece of the soft arg-min; it fits the caches."""
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo.features import ConvNorm, FeatureExtractor
 
-# Channels, disparities, rows and columns differ between the volumes of one signature.
 Volume = Float[Tensor, "b _ _ _ _"]
-Maps = Float[Tensor, "b _ _"]
+Maps = Float[Tensor, "b h w"]
 
 
 def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:
@@ -76,7 +75,7 @@ class Head(nn.Module):
 
 def concatenation_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
-) -> Float[Tensor, "b 2*c {bins} h w"]:
+) -> Volume:
     """Put left features beside the right ones that each disparity would match them with.
 
     Voxel ``(d, y, x)`` holds ``left[y, x]`` and ``right[y, x - d]``, or zeros where the right

@@ -1,0 +1,242 @@
+"""Laws of fast inference: the same answer as the plain network, whatever the size and the bound."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig, PSMNetConfig
+from depthpose.depth.stereo import (
+    Footprint,
+    PSMNet,
+    PSMNetInference,
+    PSMNetMatcher,
+    Steps,
+    normalise,
+    tile_change_px,
+)
+from depthpose.depth.stereo.expectation import Size, expected_disparity
+from depthpose.depth.stereo.first_layer import FirstLayer
+from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
+from depthpose.depth.stereo.psmnet_matcher import lower_where_disagreeing, pad_top_right
+from depthpose.depth.stereo.tiles import Tiling, match_tiles
+from depthpose.depth.types import Match
+
+SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4, 2))
+
+
+def random_network(config: PSMNetConfig, seed: int = 0) -> PSMNet:
+    """A network in eval mode whose batch norms do something."""
+    torch.manual_seed(seed)
+    network = PSMNet(config)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+            module.weight.data.uniform_(0.5, 1.2)
+            module.bias.data.normal_(0, 0.1)
+    return network.eval()
+
+
+def plain(network: PSMNet, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """The plain network with the matcher's padding."""
+    h, w = left.shape[-2:]
+    pair = [pad_top_right(normalise(i), network.config.min_side_px)[None] for i in (left, right)]
+    with torch.no_grad():
+        return network(*pair)[-1][0, -h:, :w]
+
+
+@pytest.mark.parametrize(
+    ("config", "size"),
+    [
+        (SMALL, (32, 48)),
+        (SMALL, (96, 128)),
+        (SMALL, (37, 101)),
+        (SMALL, (1, 1)),
+        (PSMNetConfig(max_disparity_px=64, width=8, blocks=(1, 1, 1, 1), pools=(2,)), (48, 32)),
+        (
+            PSMNetConfig(
+                max_disparity_px=16, width=3, blocks=(1, 2, 2, 1), pools=(4, 2), align_corners=False
+            ),
+            (64, 80),
+        ),
+    ],
+)
+def test_inference_equals_the_plain_network(config: PSMNetConfig, size: tuple[int, int]) -> None:
+    network = random_network(config)
+    left, right = torch.rand(2, 3, *size)
+    found = PSMNetMatcher(network).match(left, right)
+    assert found.disparity_px.shape == size
+    assert torch.allclose(found.disparity_px, plain(network, left, right), atol=1e-3)
+    assert found.confidence is not None
+    assert bool(((found.confidence >= 0) & (found.confidence <= 1)).all())
+
+
+@pytest.mark.parametrize("rows", [2, 4, 6, 10, 64])
+def test_slabs_of_any_height_give_one_answer_in_double_precision(rows: int) -> None:
+    network = random_network(SMALL).double()
+    left, right = torch.rand(2, 3, 80, 96, dtype=torch.float64)
+    inference = PSMNetInference(network, torch.float64)
+    disparity_px = inference.match(left, right, Steps(rows=rows, chunk_bytes=1)).disparity_px
+    with torch.no_grad():
+        expected_px = network(left[None], right[None])[-1][0]
+    assert float((disparity_px - expected_px).abs().max()) < 1e-9
+
+
+def test_bf16_stays_near() -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 64, 96)
+    found = PSMNetMatcher(network, MatcherConfig(precision="bf16")).match(left, right)
+    assert found.disparity_px.dtype == torch.float32
+    assert float((found.disparity_px - plain(network, left, right)).abs().mean()) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("width", "bins"), [(20, 8), (10, 8), (9, 8), (8, 8), (6, 8), (3, 8), (30, 4)]
+)
+def test_first_layer_equals_a_convolution_over_the_volume(width: int, bins: int) -> None:
+    left, right = torch.randn(2, 1, 3, 5, width, dtype=torch.float64)
+    weight = torch.randn(4, 6, 3, 3, 3, dtype=torch.float64)
+    bias = torch.randn(4, dtype=torch.float64)
+    volume = concatenation_volume(left, right, bins)
+    expected = F.relu(F.conv3d(volume, weight, bias, padding=1)).transpose(2, 3)
+    looked = FirstLayer(weight, bias, left).look(left, right, bins)
+    assert torch.allclose(looked.rows(0, 5), expected, atol=1e-12)
+    assert torch.allclose(looked.rows(1, 3), expected[:, :, 1:3], atol=1e-12)
+
+
+@pytest.mark.parametrize("align_corners", [True, False])
+@pytest.mark.parametrize("chunk_bytes", [1, 5000, 1 << 30])
+def test_chunked_expectation_equals_the_whole_one(align_corners: bool, chunk_bytes: int) -> None:
+    cost = 3 * torch.randn(6, 7, 8, dtype=torch.float64)
+    found, confidence = expected_disparity(
+        cost,
+        Size(32, 24, 28),
+        align_corners=align_corners,
+        chunk_bytes=chunk_bytes,
+        with_confidence=True,
+    )
+    volume = cost.permute(2, 0, 1)[None, None]
+    expected = soft_argmin(volume, (32, 24, 28), align_corners=align_corners)[0]
+    assert torch.allclose(found, expected, atol=1e-10)
+    assert confidence is not None
+    full = F.interpolate(volume, (32, 24, 28), mode="trilinear", align_corners=align_corners)
+    distance = (torch.arange(32)[:, None, None] - expected).abs()
+    brute = (full[0, 0].softmax(0) * (distance <= 2)).sum(0)
+    assert torch.allclose(confidence, brute, atol=1e-10)
+
+
+def test_confidence_is_one_where_one_disparity_wins_and_small_where_two_do() -> None:
+    cost = torch.zeros(4, 4, 16)
+    cost[..., 3] = 100
+    cost[2:, :, 12] = 100
+    _, confidence = expected_disparity(
+        cost, Size(64, 4, 4), align_corners=True, chunk_bytes=1 << 20, with_confidence=True
+    )
+    assert confidence is not None
+    assert float(confidence[:2].min()) > 0.9
+    assert float(confidence[2:].max()) < 0.1
+
+
+@pytest.mark.parametrize("size", [(64, 96), (160, 320)])
+def test_bounded_answer_is_the_unbounded_one_and_the_least_bound_works(
+    size: tuple[int, int],
+) -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, *size)
+    with pytest.raises(InputError, match="the least that works is") as caught:
+        PSMNetMatcher(network, MatcherConfig(max_memory_bytes=1000)).match(left, right)
+    assert "max_memory_bytes=1000 is too small for images of" in str(caught.value)
+    least = int(str(caught.value).split("the least that works is ")[1].split(";")[0])
+    free = PSMNetMatcher(network).match(left, right)
+    bound = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
+    assert float((free.disparity_px - bound.disparity_px).abs().max()) < 1e-3
+    with pytest.raises(InputError, match=f"the least that works is {least}"):
+        PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least - 1)).match(left, right)
+
+
+def test_plan_takes_larger_slabs_under_a_larger_bound() -> None:
+    footprint = Footprint(config=PSMNetConfig(), height=384, width=1248, dtype=torch.float32)
+    least = footprint.estimate_bytes(Steps(rows=2))
+    rows = [footprint.plan(round(least * by)).rows for by in (1, 1.05, 1.1, 2)]
+    assert rows == sorted(rows)
+    assert rows[0] == 2
+    assert rows[-1] == footprint.plan(None).rows
+    assert footprint.estimate_bytes(Steps()) < 1_000_000_000
+
+
+@pytest.mark.parametrize("overlap", [0, 8])
+def test_tiles_of_a_pointwise_matcher_change_nothing(overlap: int) -> None:
+    left, right = torch.rand(2, 3, 50, 90)
+    answer = match_tiles(
+        lambda a, b: Match(disparity_px=a[0], confidence=b[1]),
+        left,
+        right,
+        Tiling(20, 30, overlap, 16),
+    )
+    assert torch.allclose(answer.disparity_px, left[0], atol=1e-6)
+    assert answer.confidence is not None
+    assert torch.allclose(answer.confidence, right[1], atol=1e-6)
+
+
+def test_each_tile_sees_its_disparity_range_to_the_left() -> None:
+    seen = []
+
+    def match(left: torch.Tensor, right: torch.Tensor) -> Match:
+        seen.append(tuple(left.shape[-2:]))
+        return Match(disparity_px=torch.zeros(left.shape[-2:]))
+
+    left, right = torch.rand(2, 3, 20, 100)
+    assert match_tiles(match, left, right, Tiling(20, 50, 4, 16)).confidence is None
+    assert seen == [(20, 54), (20, 70)]
+
+
+def test_tile_change_is_zero_for_one_tile_and_needs_tiles() -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 64, 96)
+    matcher = PSMNetMatcher(network, MatcherConfig(tile_px=(64, 96)))
+    assert tile_change_px(matcher, left, right) < 1e-5
+    matcher = PSMNetMatcher(network, MatcherConfig(tile_px=(32, 48), tile_overlap_px=8))
+    assert 0 < tile_change_px(matcher, left, right) < 32
+    with pytest.raises(InputError, match="set tile_px in its config"):
+        tile_change_px(PSMNetMatcher(network), left, right)
+
+
+def test_left_right_check_lowers_confidence_where_views_disagree() -> None:
+    found = Match(disparity_px=torch.full((2, 20), 5.0), confidence=torch.ones(2, 20))
+    right_px = torch.full((2, 20), 5.0)
+    right_px[:, 10:] = 9.0
+    confidence = lower_where_disagreeing(found, right_px).confidence
+    assert confidence is not None
+    assert torch.allclose(confidence[:, 5:14], torch.ones(2, 9))
+    assert float(confidence[:, 16:].max()) < 0.6
+    assert float(confidence[:, :4].max()) == pytest.approx(0.5)
+
+
+def test_left_right_check_runs_through_the_matcher() -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 40, 70)
+    plain_match = PSMNetMatcher(network).match(left, right)
+    checked = PSMNetMatcher(network, MatcherConfig(with_left_right_check=True)).match(left, right)
+    assert torch.allclose(plain_match.disparity_px, checked.disparity_px, atol=1e-4)
+    assert plain_match.confidence is not None
+    assert checked.confidence is not None
+    assert bool((checked.confidence <= plain_match.confidence + 1e-5).all())
+
+
+def test_matcher_keeps_its_own_weights() -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 32, 48)
+    matcher = PSMNetMatcher(network)
+    before = matcher.match(left, right).disparity_px
+    for parameter in network.parameters():
+        parameter.data.zero_()
+    assert torch.equal(matcher.match(left, right).disparity_px, before)
+
+
+def test_unknown_device_is_refused() -> None:
+    with pytest.raises(InputError, match="device 'toaster' cannot be used here"):
+        PSMNetMatcher(random_network(SMALL), MatcherConfig(device="toaster"))
