@@ -117,6 +117,13 @@ def plain_flops(network: PSMNet, pair: Pair) -> int:
     return counter.get_total_flops()
 
 
+def saved_flops(network: PSMNet, pair: Pair) -> int:
+    """Count the operations of the first volume convolution, which ours does in 2D."""
+    c, bins = network.config.width, network.config.max_disparity_px // 4
+    rows, columns = (max(256, -(-side // 16) * 16) // 4 for side in pair[0].shape[-2:])
+    return 2 * 27 * 2 * c * c * bins * rows * columns
+
+
 def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     """Run the plain network in float64."""
     double = PSMNet(network.config).double().eval()
@@ -142,8 +149,9 @@ def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> l
         rows.append(row)
         peak = peak_flops(torch.bfloat16 if "bf16" in name else torch.float32)
         row["ratio"] = rows[0]["seconds"] / row["seconds"]
-        row["plain_gflop"], row["peak_gflops"] = flops / 1e9, peak / 1e9
-        row["share_of_peak"] = flops / row["seconds"] / peak
+        done = flops - (saved_flops(network, pair) if config else 0)
+        row["gflop"], row["peak_gflops"] = done / 1e9, peak / 1e9
+        row["share_of_peak"] = done / row["seconds"] / peak
         print(as_line(row), flush=True)
     return rows
 
@@ -153,7 +161,7 @@ def as_line(row: dict) -> str:
     return (
         f"| {row['size']} | {row['what']} | {row['seconds']:.2f} | {row['first_seconds']:.2f} "
         f"| {row['ratio']:.2f} | {row['max_px']:.1e} | {row['mean_px']:.1e} "
-        f"| {row['plain_gflop']:.0f} | {row['share_of_peak']:.2f} |"
+        f"| {row['gflop']:.0f} | {row['share_of_peak']:.2f} |"
     )
 
 

@@ -1,5 +1,8 @@
 """Laws of fast inference: the same answer as the plain network, whatever the size and the bound."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -212,7 +215,7 @@ def test_left_right_check_lowers_confidence_where_views_disagree() -> None:
     confidence = lower_where_disagreeing(found, right_px).confidence
     assert confidence is not None
     assert torch.allclose(confidence[:, 5:14], torch.ones(2, 9))
-    assert float(confidence[:, 16:].max()) < 0.6
+    assert float(confidence[:, 16:].max()) < 0.7
     assert float(confidence[:, :4].max()) == pytest.approx(0.5)
 
 
@@ -240,3 +243,32 @@ def test_matcher_keeps_its_own_weights() -> None:
 def test_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="device 'toaster' cannot be used here"):
         PSMNetMatcher(random_network(SMALL), MatcherConfig(device="toaster"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_peak_memory_of_a_bounded_run_stays_below_its_bound() -> None:
+    """In a process of its own: memory that earlier tests left behind would hide the rise."""
+    code = """
+import torch
+from pathlib import Path
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.stereo import Footprint, PSMNet, PSMNetMatcher, Steps
+
+def kilobytes(field):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if field in line).split()[1])
+
+network = PSMNet().eval()
+footprint = Footprint(config=network.config, height=256, width=1024, dtype=torch.float32)
+least = footprint.estimate_bytes(Steps(rows=2))
+matcher = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least))
+pair = torch.rand(2, 3, 256, 1024)
+before = kilobytes("VmRSS")
+Path("/proc/self/clear_refs").write_text("5")
+matcher.match(*pair)
+print(least, 1024 * (kilobytes("VmHWM") - before))
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    least, rise = map(int, done.stdout.split())
+    assert rise <= least

@@ -22,8 +22,8 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
-AGREEMENT_PX = 1.0
-"""Difference of left and right disparity at which the confidence is down to 1/e."""
+AGREEMENT_PX = 3.0
+"""Difference of left and right disparity at which their agreement is down to 1/e."""
 
 
 class PSMNetMatcher:
