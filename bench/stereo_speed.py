@@ -22,11 +22,14 @@ from depthpose.core.files import read_image
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import (
     PSMNet,
+    PSMNetInference,
     PSMNetMatcher,
+    Steps,
     normalise,
     psmnet_from_published,
     read_psmnet,
 )
+from depthpose.depth.stereo.psmnet_matcher import pad_top_right
 
 Pair = tuple[Tensor, Tensor]
 
@@ -125,10 +128,17 @@ def saved_flops(network: PSMNet, pair: Pair) -> int:
 
 
 def exact_match(network: PSMNet, pair: Pair) -> Tensor:
-    """Run the plain network in float64."""
+    """Run in float64.
+
+    By our inference, which a test holds equal to the plain network within 1e-9 in float64: the
+    plain network would need 16 GB at 375x1242.
+    """
     double = PSMNet(network.config).double().eval()
     double.load_state_dict(network.state_dict())
-    return plain_match(double, pair)
+    h, w = pair[0].shape[-2:]
+    least = network.config.min_side_px
+    left, right = (pad_top_right(normalise(i.double()), least) for i in pair)
+    return PSMNetInference(double, torch.float64).match(left, right, Steps()).disparity_px[-h:, :w]
 
 
 def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> list[dict]:
