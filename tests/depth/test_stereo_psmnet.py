@@ -1,6 +1,5 @@
 """Laws of the stereo network as it is trained, and of the import of published weights."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +17,6 @@ from depthpose.depth.stereo import PSMNet, PSMNetMatcher, normalise, psmnet_from
 from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
 
 TINY = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 1, 1, 1), pools=(4, 2))
-
-
-def data_file(name: str) -> Path:
-    """A real sample, or a skip that says what is missing."""
-    root = os.environ.get("DEPTHPOSE_DATA")
-    if not root or not (Path(root) / name).is_file():
-        pytest.skip(f"$DEPTHPOSE_DATA does not hold {name}")
-    return Path(root) / name
 
 
 def published_state() -> dict[str, Tensor]:
@@ -196,15 +187,15 @@ def test_matcher_config_refuses_nonsense(knobs: dict, text: str) -> None:
 
 
 @pytest.mark.data
-def test_published_weights_give_the_published_disparity() -> None:
-    weights = data_file("reference/psmnet/published_kitti2015.tar")
-    with np.load(data_file("reference/psmnet/kitti2015_000046_10.npz")) as reference:
+def test_published_weights_give_the_published_disparity(real: Path) -> None:
+    weights = real / "reference/psmnet/published_kitti2015.tar"
+    with np.load(real / "reference/psmnet/kitti2015_000046_10.npz") as reference:
         top, left_column = int(reference["top"]), int(reference["left"])
         expected = torch.from_numpy(reference["disparity"])
     crop = (slice(None), slice(top, top + 256), slice(left_column, left_column + 512))
     folder = "depth/kitti_2015/training"
-    left = read_image(data_file(f"{folder}/image_2/000046_10.png"))[crop]
-    right = read_image(data_file(f"{folder}/image_3/000046_10.png"))[crop]
+    left = read_image(real / f"{folder}/image_2/000046_10.png")[crop]
+    right = read_image(real / f"{folder}/image_3/000046_10.png")[crop]
     network = psmnet_from_published(read_torch_file(weights)["state_dict"], align_corners=True)
     with torch.no_grad():
         plain = network(normalise(left)[None], normalise(right)[None])[-1][0]
@@ -217,13 +208,13 @@ def test_published_weights_give_the_published_disparity() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("align_corners", "epe_px"), [(True, 0.27), (False, 1.17)])
 def test_whole_frame_error_shows_which_corners_the_weights_want(
-    align_corners: bool, epe_px: float
+    real: Path, align_corners: bool, epe_px: float
 ) -> None:
-    weights = data_file("reference/psmnet/published_kitti2015.tar")
+    weights = real / "reference/psmnet/published_kitti2015.tar"
     folder = "depth/kitti_2015/training"
-    left = read_image(data_file(f"{folder}/image_2/000046_10.png"))
-    right = read_image(data_file(f"{folder}/image_3/000046_10.png"))
-    truth_px = read_disparity_png(data_file(f"{folder}/disp_occ_0/000046_10.png"))
+    left = read_image(real / f"{folder}/image_2/000046_10.png")
+    right = read_image(real / f"{folder}/image_3/000046_10.png")
+    truth_px = read_disparity_png(real / f"{folder}/disp_occ_0/000046_10.png")
     state = read_torch_file(weights)["state_dict"]
     matcher = PSMNetMatcher(psmnet_from_published(state, align_corners=align_corners))
     found = matcher.match(left, right)
