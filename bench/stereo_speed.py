@@ -27,9 +27,9 @@ from depthpose.depth.stereo import (
     Steps,
     normalise,
     psmnet_from_published,
-    read_psmnet,
 )
 from depthpose.depth.stereo.psmnet_matcher import pad_top_right
+from depthpose.depth.weights import read_matcher
 
 Pair = tuple[Tensor, Tensor]
 
@@ -53,7 +53,7 @@ def network_for(weights: Path | None) -> PSMNet:
         torch.manual_seed(0)
         return PSMNet().eval()
     if weights.suffix == ".safetensors":
-        return read_psmnet(weights)
+        return read_matcher(weights)
     return psmnet_from_published(read_torch_file(weights)["state_dict"], align_corners=True)
 
 

@@ -1,6 +1,6 @@
 """Every knob of the depth room: frozen dataclasses that refuse a value where it is born."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from depthpose.core.errors import InputError
@@ -25,6 +25,9 @@ class PSMNetConfig:
     align_corners: bool = True
     """How the weights expect maps to be enlarged: True for the published KITTI 2015 weights."""
 
+    work_focal_px: float | None = None
+    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
+
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
         if self.max_disparity_px < 16 or self.max_disparity_px % 16:
@@ -38,6 +41,8 @@ class PSMNetConfig:
             raise InputError(f"each stage needs 1 block or more, got blocks={self.blocks}")
         if not self.pools or min(self.pools) < 1:
             raise InputError(f"pools must hold windows of 1 pixel or more, got {self.pools}")
+        if self.work_focal_px is not None and self.work_focal_px <= 0:
+            raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
 
     @property
     def min_side_px(self) -> int:
@@ -139,3 +144,115 @@ class SGBMConfig:
             raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
         if self.mode not in ("sgbm", "hh", "sgbm_3way", "hh4"):
             raise InputError(f"mode must be 'sgbm', 'hh', 'sgbm_3way' or 'hh4', got {self.mode!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratorConfig:
+    """Size and conventions of the view synthesis network (pix2pix's U-Net), and its rig.
+
+    The generator draws what one rig would have seen, so its weights carry that rig: an image is
+    brought to ``virtual_focal_px`` before, and depth is virtual focal x baseline / disparity.
+    """
+
+    width: int = 64
+    """Channels of the first level; they double up to eight times it."""
+
+    levels: int = 8
+    """Halvings down to the bottleneck; image sides are padded to multiples of 2 ** levels."""
+
+    with_dropout: bool = True
+    """Dropout of 0.5 in the inner decoder blocks while training."""
+
+    test_mode: Literal["running", "batch"] = "running"
+    """Norm at test: the statistics of training without dropout, or the image's own with it."""
+
+    virtual_focal_px: float = 721.5377
+    """Focal length of the imitated rig [px]; KITTI's by default."""
+
+    virtual_baseline_m: float = 0.5327
+    """Baseline of the imitated rig [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if self.width < 1:
+            raise InputError(f"width must be 1 or more channels, got {self.width}; take 64")
+        if not 2 <= self.levels <= 10:
+            raise InputError(f"levels must be 2 .. 10, got {self.levels}; take 8")
+        if self.test_mode not in ("running", "batch"):
+            raise InputError(f"test_mode must be 'running' or 'batch', got {self.test_mode!r}")
+        if self.virtual_focal_px <= 0 or self.virtual_baseline_m <= 0:
+            raise InputError(
+                f"the virtual rig needs a positive focal length and baseline, got "
+                f"{self.virtual_focal_px} px and {self.virtual_baseline_m} m"
+            )
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels after each level of the encoder."""
+        return tuple(self.width * min(2**level, 8) for level in range(self.levels))
+
+    @property
+    def side_multiple_px(self) -> int:
+        """Both sides of an image are multiples of this [px]."""
+        return 2**self.levels
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentConfig:
+    """Random changes of a training pair (thesis, 2.4.2)."""
+
+    crop_px: tuple[int, int] = (256, 512)
+    """Rows and columns of the crop."""
+
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Range of the size at which a pair is seen; images that are too small for the crop grow."""
+
+    jitter: float = 0.2
+    """Brightness, contrast and saturation are each scaled by 1 +- this."""
+
+    flip_share: float = 0.5
+    """Share of pairs that are mirrored and swapped."""
+
+    def __post_init__(self) -> None:
+        """Refuse changes that would break a pair."""
+        if min(self.crop_px) < 1:
+            raise InputError(f"crop_px must be two positive sizes, got {self.crop_px}")
+        if not 0 < self.scale[0] <= self.scale[1]:
+            raise InputError(f"scale must be a range of positive sizes, got {self.scale}")
+        if not 0 <= self.jitter < 1:
+            raise InputError(f"jitter must be in [0, 1), got {self.jitter}; the thesis takes 0.2")
+        if not 0 <= self.flip_share <= 1:
+            raise InputError(f"flip_share must be in [0, 1], got {self.flip_share}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Which pairs a training sees, and how."""
+
+    folders: tuple[str, ...] = ()
+    """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
+
+    split: str | None = None
+    """Name or file of a split, for the first folder."""
+
+    exclude: tuple[str, ...] = ()
+    """Names of frames to leave out."""
+
+    limit: int | None = None
+    """Take so many pairs of each folder, spread evenly; None: all."""
+
+    focal_px: float | None = None
+    """Bring every pair to this focal length [px]; None: leave sizes as they are."""
+
+    with_cache: bool = False
+    """Keep decoded pairs in memory (8 bit): for sets that fit."""
+
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    """Random changes."""
+
+    def __post_init__(self) -> None:
+        """Refuse what selects nothing."""
+        if self.limit is not None and self.limit < 1:
+            raise InputError(f"limit must be 1 pair or more, got {self.limit}")
+        if self.focal_px is not None and self.focal_px <= 0:
+            raise InputError(f"focal_px must be positive, got {self.focal_px}")

@@ -6,13 +6,12 @@ from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import (
     PSMNetMatcher,
-    load_psmnet,
     normalise,
     tile_change_px,
 )
 from depthpose.depth.stereo.published import psmnet_from_published
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
-from depthpose.depth.stereo.weights import import_psmnet, read_psmnet
+from depthpose.depth.stereo.weights import import_psmnet
 
 __all__ = [
     "CallableMatcher",
@@ -26,9 +25,7 @@ __all__ = [
     "check_pair",
     "fill_holes",
     "import_psmnet",
-    "load_psmnet",
     "normalise",
     "psmnet_from_published",
-    "read_psmnet",
     "tile_change_px",
 ]

@@ -95,6 +95,8 @@ def soft_argmin(cost: Volume, size: tuple[int, int, int], *, align_corners: bool
     ``sum_d d softmax(cost)_d`` [px], eq. 2.2 of the thesis; costs are likelihoods here, so no
     sign stands before them.
     """
+    if cost.dtype in (torch.bfloat16, torch.float16):
+        cost = cost.float()  # 8 bits of mantissa would round the expectation to whole pixels
     full = F.interpolate(cost, size=size, mode="trilinear", align_corners=align_corners)[:, 0]
     disparity_px = torch.arange(size[0], dtype=full.dtype, device=full.device)
     return (full.softmax(1) * disparity_px[:, None, None]).sum(1)

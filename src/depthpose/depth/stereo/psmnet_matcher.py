@@ -1,7 +1,5 @@
 """PSMNet as a matcher: images of any size in, disparity and confidence out."""
 
-from pathlib import Path
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -15,7 +13,6 @@ from depthpose.depth.stereo.matcher import check_pair
 from depthpose.depth.stereo.plan import Footprint
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.tiles import Tiling, match_tiles
-from depthpose.depth.stereo.weights import read_psmnet
 from depthpose.depth.types import Match
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -96,15 +93,6 @@ class PSMNetMatcher:
         found = self._inference.match(*padded, steps, with_confidence=self.config.with_confidence)
         confidence = None if found.confidence is None else found.confidence[-h:, :w]
         return Match(disparity_px=found.disparity_px[-h:, :w], confidence=confidence)
-
-
-def load_psmnet(path: Path, config: MatcherConfig | None = None) -> PSMNetMatcher:
-    """Read weights and make them a matcher.
-
-    Raises:
-        InputError: not weights of PSMNet.
-    """
-    return PSMNetMatcher(read_psmnet(path), config)
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:

@@ -1,4 +1,4 @@
-"""PSMNet's weights on disk: ours read and written, published ones brought in."""
+"""Published weights of PSMNet, brought in."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,30 +8,14 @@ from torch import Tensor
 from depthpose.core.checkpoint import (
     Checkpoint,
     file_sha256,
-    load_weights,
-    read_checkpoint,
     read_torch_file,
     save_checkpoint,
 )
-from depthpose.core.config import config_from_dict, config_to_dict
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.published import psmnet_from_published
 
 KIND = "psmnet"
-
-
-def read_psmnet(path: Path) -> PSMNet:
-    """Build the network that a weights file describes, in eval mode.
-
-    Raises:
-        InputError: not weights of PSMNet, or weights that do not fit their own config.
-    """
-    checkpoint = read_checkpoint(path, KIND)
-    network = PSMNet(config_from_dict(checkpoint.config, PSMNetConfig, source=str(path)))
-    load_weights(network, checkpoint, str(path))
-    return network.eval()
 
 
 def import_psmnet(file: Path, out: Path, *, align_corners: bool) -> None:

@@ -1,0 +1,93 @@
+"""``depthpose depth train view|stereo|finetune``."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from depthpose.core.errors import InputError
+
+
+def train(
+    stage: tyro.conf.Positional[Literal["view", "stereo", "finetune"]],
+    out: Path,
+    config: Path | None = None,
+    data: tuple[str, ...] = (),
+    generator: str | None = None,
+    matcher: str | None = None,
+    start: str | None = None,
+    steps: int | None = None,
+    seed: int | None = None,
+    device: Literal["auto", "cpu"] | None = None,
+    precision: Literal["fp32", "bf16", "fp16"] | None = None,
+    resume: bool = False,
+) -> int:
+    """Train the generator (view), the matcher (stereo), or the generator through it (finetune).
+
+    A config holds every knob; the words below change what they name. The run folder keeps config,
+    metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
+    stopped the training, and ends with the weights of a run that nothing stopped. Several GPUs or
+    machines: 'accelerate launch -m depthpose depth train ...'.
+
+        depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
+
+    Args:
+        stage: what is trained.
+        out: the run folder.
+        config: YAML with what differs from the thesis's settings.
+        data: folders of pairs; they replace the config's.
+        generator: finetune: weights of the generator to begin with.
+        matcher: finetune: weights of the matcher, which is not changed.
+        start: view, stereo: weights to begin with.
+        steps: optimiser steps in place of the config's length.
+        seed: decides initial weights, order, augmentation and dropout.
+        device: auto takes what accelerate finds; cpu takes no GPU.
+        precision: arithmetic of the forward pass.
+        resume: go on from the state that OUT holds.
+    """
+    from depthpose.core.config import read_config
+    from depthpose.depth.train import STAGES, Run
+
+    kind, run_stage = STAGES[stage]
+    chosen = kind() if config is None else read_config(config, kind)
+    loop = _changed(chosen.loop, seed=seed, device=device, precision=precision)
+    if steps is not None:
+        loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    pairs = _changed(chosen.pairs, folders=data or None)
+    words = {"generator": generator, "matcher": matcher, "start": start}
+    knobs = {field.name: field.type for field in dataclasses.fields(kind)}
+    for word, value in words.items():
+        if value is not None and (word not in knobs or (word != "start" and stage != "finetune")):
+            raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
+    chosen = _changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
+    with _progress_bar() as on_step:
+        path = run_stage(chosen, Run(folder=out, resume=resume, on_step=on_step))
+    print(f"trained weights: {path}")
+    return 0
+
+
+def _changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
+    return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
+
+
+class _progress_bar:  # noqa: N801 - reads as a verb where it is used
+    """A bar with time left and the latest numbers."""
+
+    def __enter__(self) -> Callable[[Any], None]:
+        from tqdm import tqdm
+
+        self.bar = tqdm(unit=" steps", disable=None)
+        return self.show
+
+    def show(self, progress: Any) -> None:  # noqa: ANN401
+        if self.bar.total is None:
+            self.bar.reset(progress.steps)
+            self.bar.initial = self.bar.n = progress.step - 1
+        self.bar.update(progress.step - self.bar.n)
+        if progress.numbers:
+            self.bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()

@@ -1,0 +1,23 @@
+"""The one training loop: a task in, trained weights and a run folder out."""
+
+from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam
+from depthpose.core.loop.journal import Journal, read_metrics
+from depthpose.core.loop.loop import Interrupted, Progress, train
+from depthpose.core.loop.task import Evidence, Samples, Task, Turn, shuffled_index, ticket_generator
+
+__all__ = [
+    "AdamConfig",
+    "Evidence",
+    "Interrupted",
+    "Journal",
+    "LoopConfig",
+    "Progress",
+    "Samples",
+    "Task",
+    "Turn",
+    "make_adam",
+    "read_metrics",
+    "shuffled_index",
+    "ticket_generator",
+    "train",
+]

@@ -1,0 +1,146 @@
+"""Knobs of the loop and of Adam, and how a learning rate changes over a training."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import nn
+
+from depthpose.core.errors import InputError
+
+Schedule = Literal["constant", "constant-linear", "halving", "cosine"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamConfig:
+    """Adam (Kingma and Ba 2015), and its learning rate over the training."""
+
+    learning_rate: float = 1e-4
+    """Step size at the start."""
+
+    beta1: float = 0.9
+    """Decay of the mean of the gradient; 0.5 for adversarial training."""
+
+    beta2: float = 0.999
+    """Decay of the mean of its square."""
+
+    schedule: Schedule = "constant"
+    """constant; constant-linear (second half falls to zero); halving; cosine (falls to zero)."""
+
+    halvings: int = 4
+    """How often ``halving`` halves, at equal distances."""
+
+    warmup_steps: int = 0
+    """Steps over which the rate rises linearly from zero."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot train."""
+        if not 0 < self.learning_rate < 1:
+            raise InputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
+        if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
+            raise InputError(f"betas must be in [0, 1), got {self.beta1} and {self.beta2}")
+        if self.schedule not in ("constant", "constant-linear", "halving", "cosine"):
+            raise InputError(
+                f"schedule must be constant, constant-linear, halving or cosine, "
+                f"got {self.schedule!r}"
+            )
+
+    def rate_at(self, step: int, steps: int) -> float:
+        """Learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
+        done = step / steps
+        factors = {
+            "constant": 1.0,
+            "constant-linear": min(1.0, 2 * (1 - done)),
+            "halving": 0.5 ** math.floor((self.halvings) * done),
+            "cosine": 0.5 * (1 + math.cos(math.pi * done)),
+        }
+        warm = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
+        return self.learning_rate * factors[self.schedule] * warm
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """How long and how a task is trained; the task says what."""
+
+    steps: int | None = None
+    """Optimiser steps; or give ``epochs``."""
+
+    epochs: float | None = None
+    """Passes over the data; or give ``steps``."""
+
+    batch_size: int = 4
+    """Samples of a micro-batch, in each process."""
+
+    accumulate: int = 1
+    """Micro-batches whose gradients are averaged before a step."""
+
+    precision: Literal["fp32", "bf16", "fp16"] = "fp32"
+    """Arithmetic of the forward pass; fp16 needs a GPU."""
+
+    clip_norm: float | None = None
+    """Largest norm of an optimiser's gradient; None: as it is."""
+
+    seed: int = 0
+    """Decides order, augmentation and dropout; the initial weights are the task's."""
+
+    save_every_steps: int = 200
+    """Steps that a kill can cost."""
+
+    validate_every_steps: int = 1000
+    """Steps between two looks at held-out samples; the last step always looks."""
+
+    log_every_steps: int = 10
+    """Steps averaged into one line of metrics."""
+
+    workers: int = 0
+    """Processes that make samples; 0: the training process itself."""
+
+    ema_decay: float | None = None
+    """Decay of the moving average of the weights, which is then what is exported; None: off."""
+
+    device: Literal["auto", "cpu"] = "auto"
+    """auto: the accelerator that ``accelerate`` finds; cpu: none."""
+
+    def __post_init__(self) -> None:
+        """Refuse a loop that cannot run."""
+        if (self.steps is None) == (self.epochs is None):
+            raise InputError(
+                f"a training is as long as steps or epochs say: give one of the two, got "
+                f"steps={self.steps}, epochs={self.epochs}"
+            )
+        counts = {
+            "steps": self.steps,
+            "epochs": self.epochs,
+            "batch_size": self.batch_size,
+            "accumulate": self.accumulate,
+            "save_every_steps": self.save_every_steps,
+            "validate_every_steps": self.validate_every_steps,
+            "log_every_steps": self.log_every_steps,
+            "clip_norm": self.clip_norm,
+        }
+        for name, value in counts.items():
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{name} must be positive, got {value}")
+        if self.workers < 0:
+            raise InputError(f"workers must be 0 or more processes, got {self.workers}")
+        if self.precision not in ("fp32", "bf16", "fp16"):
+            raise InputError(f"precision must be fp32, bf16 or fp16, got {self.precision!r}")
+        if self.ema_decay is not None and not 0 < self.ema_decay < 1:
+            raise InputError(f"ema_decay must be between 0 and 1, got {self.ema_decay}; try 0.999")
+
+    def total_steps(self, samples: int, processes: int) -> int:
+        """Number of optimiser steps for a dataset of ``samples`` on ``processes``."""
+        if self.steps is not None:
+            return self.steps
+        assert self.epochs is not None
+        return max(
+            1, round(self.epochs * samples / (self.batch_size * self.accumulate * processes))
+        )
+
+
+def make_adam(parameters: Iterable[nn.Parameter], config: AdamConfig) -> torch.optim.Adam:
+    """Make the optimiser; the loop sets its learning rate before each step."""
+    betas = (config.beta1, config.beta2)
+    return torch.optim.Adam(parameters, lr=config.learning_rate, betas=betas)

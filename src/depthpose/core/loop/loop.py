@@ -1,0 +1,346 @@
+"""The loop itself, on Hugging Face accelerate.
+
+Accelerate brings devices, processes and precision. Gradients are averaged here, after the backward
+pass: that way a step may run any network any number of times (a discriminator sees a real and a
+fake pair), and N processes equal one that accumulates N micro-batches.
+"""
+
+import math
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.loop.config import LoopConfig
+from depthpose.core.loop.journal import Journal, has_state, read_state
+from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
+
+_PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
+
+
+class Interrupted(KeyboardInterrupt):
+    """The training was asked to stop (SIGTERM, Ctrl-C); its state is saved."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where a training is, for whoever shows it.
+
+    Attributes:
+        step: steps done.
+        steps: steps in all.
+        numbers: the latest metrics; empty between two log steps.
+    """
+
+    step: int
+    steps: int
+    numbers: dict[str, float]
+
+
+def train(
+    task: Task,
+    samples: Samples,
+    config: LoopConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    on_step: Callable[[Progress], None] | None = None,
+) -> None:
+    """Train ``task`` until its last step; its modules hold the result.
+
+    Under ``accelerate launch`` every process calls this; batch norm statistics are rank 0's.
+
+    Args:
+        task: what is trained.
+        samples: training samples by ticket.
+        config: how long and how.
+        folder: the run folder.
+        resume: go on from the folder's last state; the result is that of an uninterrupted run.
+        on_step: told after each step, in the main process.
+
+    Raises:
+        InputError: nothing to train on, a folder with a state and no ``resume`` (or the reverse),
+            a precision that this machine lacks, or a loss that is no longer finite.
+        Interrupted: asked to stop; the state is saved first.
+    """
+    if not len(samples):
+        raise InputError("there is no sample to train on; the dataset is empty.")
+    run = _Run(task, samples, config, folder)
+    run.start(resume=resume)
+    with _polite_stop() as is_asked_to_stop:
+        run.walk(on_step, is_asked_to_stop)
+
+
+class _Run:
+    def __init__(self, task: Task, samples: Samples, config: LoopConfig, folder: Path) -> None:
+        self.task, self.samples, self.config = task, samples, config
+        self.accelerator = _make_accelerator(config)
+        self.world = self.accelerator.num_processes
+        self.steps = config.total_steps(len(samples), self.world)
+        self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
+        self.step = 0
+        self.sums: dict[str, tuple[float, int]] = {}
+        self.average: dict[str, dict[str, Tensor]] = {}
+
+    def start(self, *, resume: bool) -> None:
+        """Bring everything to the device and, where asked, to the state of an earlier run."""
+        folder = self.journal.folder
+        if has_state(folder) and not resume:
+            raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
+        for module in self.task.modules.values():
+            module.to(self.accelerator.device)
+        self.optimizers = {
+            name: self.accelerator.prepare(optimizer)
+            for name, (optimizer, _) in self.task.optimizers.items()
+        }
+        if self.config.ema_decay is not None:
+            self.average = {name: _copied(m) for name, m in self.task.modules.items()}
+        if resume and has_state(folder):
+            self._restore(read_state(folder))
+        else:
+            self._agree_on_weights()
+        self.journal.open(self.step)
+
+    def walk(
+        self, on_step: Callable[[Progress], None] | None, is_asked_to_stop: Callable[[], bool]
+    ) -> None:
+        """Take the remaining steps."""
+        batches = self._batches()
+        while self.step < self.steps:
+            micro_batches = [next(batches) for _ in range(self.config.accumulate)]
+            self._take_step(micro_batches)
+            self.step += 1
+            numbers = self._log()
+            if self._is_due(self.config.validate_every_steps):
+                self._validate()
+            stop = self._any_process(is_asked_to_stop())
+            if stop or self._is_due(self.config.save_every_steps):
+                self.save()
+            if on_step is not None and self.accelerator.is_main_process:
+                on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
+            if stop and self.step < self.steps:
+                self.journal.close()
+                raise Interrupted(f"stopped after step {self.step} of {self.steps}")
+        self._load(self.average)  # what is exported
+        self.journal.close()
+
+    def save(self) -> None:
+        """Write the state, all or nothing."""
+        scaler = self.accelerator.scaler
+        self.journal.save(
+            {
+                "step": self.step,
+                "modules": {name: m.state_dict() for name, m in self.task.modules.items()},
+                "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
+                "scaler": {} if scaler is None else scaler.state_dict(),
+                "average": self.average,
+            }
+        )
+
+    def _take_step(self, micro_batches: list[Any]) -> None:
+        """All micro-batches take their first turn together, then the second, and so on."""
+        walks = [iter(self.task.step(batch)) for batch in micro_batches]
+        turn_number = 0
+        while True:
+            turns = list(self._backward_all(walks, turn_number))
+            if not turns:
+                break
+            self._move(turns[0])
+            turn_number += 1
+        if self.config.ema_decay is not None:
+            self._update_average(self.config.ema_decay)
+
+    def _backward_all(self, walks: list[Iterator[Turn]], number: int) -> Iterator[str]:
+        for place, walk in enumerate(walks):
+            # Dropout follows the micro-batch, not the process that happens to hold it.
+            micro = place * self.world + self.accelerator.process_index
+            torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
+            with self.accelerator.autocast():
+                turn = next(walk, None)
+            if turn is None:
+                continue
+            self._refuse_bad_loss(turn.optimizer, float(turn.loss.detach()))
+            parameters = _parameters(self.optimizers[turn.optimizer])
+            self.accelerator.backward(turn.loss / len(walks), inputs=parameters)
+            self._remember({"loss": turn.loss.detach(), **turn.facts}, turn.optimizer)
+            yield turn.optimizer
+
+    def _move(self, name: str) -> None:
+        """Average the gradients over processes and step the optimiser."""
+        optimizer = self.optimizers[name]
+        _, adam = self.task.optimizers[name]
+        for group in optimizer.param_groups:
+            group["lr"] = adam.rate_at(self.step, self.steps)
+        parameters = _parameters(optimizer)
+        if self.world > 1:
+            self._average_gradients(parameters)
+        if self.config.clip_norm is not None:
+            self.accelerator.unscale_gradients(optimizer)
+            torch.nn.utils.clip_grad_norm_(parameters, self.config.clip_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+
+    def _average_gradients(self, parameters: list[Tensor]) -> None:
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+        flat = torch.cat([grad.flatten() for grad in grads])
+        mean: Tensor = self.accelerator.reduce(flat, "mean")
+        parts = mean.split([grad.numel() for grad in grads])
+        for parameter, part in zip(parameters, parts, strict=True):
+            parameter.grad = part.view_as(parameter)
+
+    def _batches(self) -> Iterator[Any]:
+        first = self.step * self.config.accumulate
+        loader = DataLoader(
+            self.samples,  # pyright: ignore[reportArgumentType]
+            batch_sampler=_Tickets(self, first),
+            num_workers=self.config.workers,
+            pin_memory=self.accelerator.device.type == "cuda",
+        )
+        from accelerate.utils import send_to_device
+
+        return (send_to_device(batch, self.accelerator.device) for batch in loader)
+
+    def _validate(self) -> None:
+        if self.accelerator.is_main_process:
+            own = {name: _copied(m) for name, m in self.task.modules.items() if self.average}
+            self._load(self.average)
+            self.journal.show(self.step, self.task.validate())
+            self._load(own)
+        self.accelerator.wait_for_everyone()
+
+    def _load(self, states: dict[str, dict[str, Tensor]]) -> None:
+        for name, state in states.items():
+            self.task.modules[name].load_state_dict(state)
+
+    def _is_due(self, every: int) -> bool:
+        return self.step % every == 0 or self.step == self.steps
+
+    def _remember(self, facts: dict[str, Tensor], owner: str) -> None:
+        for name, value in facts.items():
+            total, count = self.sums.get(f"{owner}/{name}", (0.0, 0))
+            self.sums[f"{owner}/{name}"] = (total + float(value), count + 1)
+
+    def _log(self) -> dict[str, float]:
+        if not self._is_due(self.config.log_every_steps):
+            return {}
+        numbers = {name: total / count for name, (total, count) in self.sums.items()}
+        self.sums = {}
+        self.journal.log(self.step, numbers)
+        return numbers
+
+    def _refuse_bad_loss(self, owner: str, loss: float) -> None:
+        # fp16 overflows now and then, and its scaler skips such steps by itself.
+        if self.config.precision != "fp16" and not math.isfinite(loss):
+            raise InputError(
+                f"the {owner}'s loss is {loss} at step {self.step}. Lower its "
+                "learning_rate, set clip_norm, or use precision fp32; --resume goes on from the "
+                "last state."
+            )
+
+    def _any_process(self, is_asked: bool) -> bool:
+        if self.world == 1:
+            return is_asked
+        flag = torch.tensor([float(is_asked)], device=self.accelerator.device)
+        return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
+
+    def _agree_on_weights(self) -> None:
+        """Every process begins with rank 0's weights, whatever seed built its own."""
+        if self.world > 1:
+            from accelerate.utils import broadcast
+
+            for module in self.task.modules.values():
+                for tensor in module.state_dict().values():
+                    tensor.copy_(broadcast(tensor))
+
+    @torch.no_grad()
+    def _update_average(self, decay: float) -> None:
+        for name, module in self.task.modules.items():
+            for key, tensor in module.state_dict().items():
+                held = self.average[name][key]
+                if tensor.is_floating_point():
+                    held.lerp_(tensor, 1 - decay)
+                else:
+                    held.copy_(tensor)
+
+    def _restore(self, state: Any) -> None:  # noqa: ANN401
+        self.step = int(state["step"])
+        for name, module in self.task.modules.items():
+            module.load_state_dict(state["modules"][name])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        if self.accelerator.scaler is not None and state["scaler"]:
+            self.accelerator.scaler.load_state_dict(state["scaler"])
+        for name, held in self.average.items():
+            for key, tensor in state["average"][name].items():
+                held[key].copy_(tensor)
+
+
+class _Tickets:
+    """Tickets of this process's micro-batches, from the first that is still to do.
+
+    Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N processes
+    see in a step what one process sees that accumulates N times as much.
+    """
+
+    def __init__(self, run: _Run, first: int) -> None:
+        self.size = run.config.batch_size
+        self.world, self.rank = run.world, run.accelerator.process_index
+        self.places = range(first, run.steps * run.config.accumulate)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for place in self.places:
+            start = (place * self.world + self.rank) * self.size
+            yield list(range(start, start + self.size))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
+    try:
+        from accelerate import Accelerator
+    except ImportError as error:
+        raise MissingExtraError("accelerate", "train", "training") from error
+    try:
+        return Accelerator(
+            cpu=config.device == "cpu", mixed_precision=_PRECISIONS[config.precision]
+        )
+    except ValueError as error:
+        raise InputError(
+            f"precision {config.precision!r} cannot be used here ({error}); take fp32 or bf16"
+        ) from error
+
+
+def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    return [p for group in optimizer.param_groups for p in group["params"]]
+
+
+def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
+
+
+@contextmanager
+def _polite_stop() -> Iterator[Callable[[], bool]]:
+    """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
+    asked: list[int] = []
+
+    def remember(number: int, _: FrameType | None) -> None:
+        asked.append(number)
+
+    try:
+        before = {s: signal.signal(s, remember) for s in (signal.SIGTERM, signal.SIGINT)}
+    except ValueError:  # not the main thread: whoever runs us handles signals
+        before = {}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,65 @@
+"""The generator with the world around it: any size, [0, 1], test-time norm."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.depth.synthesis.generator import UNetGenerator
+
+
+class Synthesiser:
+    """Draws the right view of images of any size.
+
+    Norm and dropout follow ``config.test_mode``, which the weights record: ``running`` uses the
+    statistics of training and no dropout; ``batch`` those of the image itself, as pix2pix tests,
+    with dropout on.
+    """
+
+    def __init__(self, generator: UNetGenerator, device: torch.device | str = "cpu") -> None:
+        self.generator = generator.to(device).eval()
+        self.device = torch.device(device)
+        if generator.config.test_mode == "batch":
+            _keep_training(self.generator)
+
+    @torch.no_grad()
+    def synthesise(self, left: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+        """Draw the right view; images are RGB in [0, 1]."""
+        image = left.to(self.device, torch.float32)[None]
+        return draw_right(self.generator, image)[0].to(left.device)
+
+
+def draw_right(
+    generator: UNetGenerator, left: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b 3 h w"]:
+    """Draw right views, RGB in [0, 1], padding by reflection; gradients flow."""
+    height, width = left.shape[-2:]
+    padded = pad_to_multiple(2 * left - 1, generator.config.side_multiple_px)
+    return (generator(padded)[..., :height, :width] + 1) / 2
+
+
+def pad_to_multiple(
+    image: Float[Tensor, "b c h w"], multiple: int
+) -> Float[Tensor, "b c padded_h padded_w"]:
+    """Mirror the right and lower border until both sides are multiples of ``multiple``.
+
+    A mirror is as long as the image at most, so small images are mirrored several times.
+    """
+    while image.shape[-2] % multiple or image.shape[-1] % multiple:
+        height, width = image.shape[-2:]
+        down = min(-height % multiple, max(height - 1, 1))
+        right = min(-width % multiple, max(width - 1, 1))
+        mode = "reflect" if min(height, width) > 1 else "replicate"
+        image = F.pad(image, (0, right, 0, down), mode=mode)
+    return image
+
+
+def _keep_training(module: nn.Module) -> None:
+    """Batch norm by the image's own statistics, without touching the stored ones; dropout on."""
+    for part in module.modules():
+        if isinstance(part, nn.BatchNorm2d):
+            part.train()
+            part.track_running_stats = False
+            part.running_mean = part.running_var = None
+        elif isinstance(part, nn.Dropout):
+            part.train()

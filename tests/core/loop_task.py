@@ -1,0 +1,72 @@
+"""A small adversarial task for tests of the loop; also a program, to be killed and launched."""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from depthpose.core.loop import (
+    AdamConfig,
+    Evidence,
+    LoopConfig,
+    Turn,
+    make_adam,
+    shuffled_index,
+    ticket_generator,
+    train,
+)
+
+ADAM = AdamConfig(learning_rate=0.01, schedule="cosine")
+
+
+class ToyTask:
+    """A regressor with dropout and batch norm, and a judge that takes the first turn."""
+
+    def __init__(self, pause_s: float = 0.0, factor: float = 1.0) -> None:
+        torch.manual_seed(5)
+        self.pause_s, self.factor = pause_s, factor
+        layers = [nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.3), nn.Linear(8, 1)]
+        self.modules = {"regressor": nn.Sequential(*layers), "judge": nn.Linear(1, 1)}
+        self.optimizers = {
+            n: (make_adam(m.parameters(), ADAM), ADAM) for n, m in self.modules.items()
+        }
+
+    def step(self, batch: tuple[Tensor, Tensor]) -> Iterator[Turn]:
+        time.sleep(self.pause_s)
+        x, y = batch
+        found = self.modules["regressor"](x)
+        judge = self.modules["judge"]
+        yield Turn("judge", (judge(found.detach()) - judge(y)).square().mean(), {})
+        loss = (found - y).square().mean() + 0.1 * judge(found).square().mean()
+        yield Turn("regressor", self.factor * loss, {"double": 2 * loss.detach()})
+
+    def validate(self) -> Evidence:
+        picture = torch.full((3, 4, 4), 0.5)
+        return Evidence(numbers={"held_out/one": 1.0}, pictures={"grey": picture})
+
+
+class ToySamples:
+    def __len__(self) -> int:
+        return 20
+
+    def __getitem__(self, ticket: int) -> tuple[Tensor, Tensor]:
+        index = shuffled_index(ticket, 20, 3)
+        noise = torch.randn(3, generator=ticket_generator(ticket, 3))
+        x = torch.tensor([index / 20, 1.0, -0.5]) + 0.1 * noise
+        return x, x.sum(0, keepdim=True)
+
+
+def weights(task: ToyTask) -> dict[str, Tensor]:
+    return {f"{n}.{k}": t for n, m in task.modules.items() for k, t in m.state_dict().items()}
+
+
+if __name__ == "__main__":
+    folder, steps, accumulate, pause_s = Path(sys.argv[1]), *map(float, sys.argv[2:5])
+    config = LoopConfig(
+        steps=int(steps), batch_size=4, accumulate=int(accumulate), save_every_steps=3, device="cpu"
+    )
+    toy = ToyTask(pause_s)
+    train(toy, ToySamples(), config, folder, resume=True)

@@ -1,0 +1,272 @@
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tests.core.loop_task import ToySamples, ToyTask, weights
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.loop import (
+    AdamConfig,
+    Interrupted,
+    LoopConfig,
+    Progress,
+    read_metrics,
+    shuffled_index,
+    ticket_generator,
+    train,
+)
+
+PROGRAM = Path(__file__).with_name("loop_task.py")
+
+
+def loop(**changes: object) -> LoopConfig:
+    knobs = {"steps": 12, "batch_size": 4, "save_every_steps": 4, "device": "cpu", **changes}
+    return LoopConfig(**knobs)  # pyright: ignore[reportArgumentType]
+
+
+def trained(folder: Path, config: LoopConfig, **words: object) -> ToyTask:
+    task = ToyTask()
+    train(task, ToySamples(), config, folder, **words)  # pyright: ignore[reportArgumentType]
+    return task
+
+
+def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
+    assert one.keys() == other.keys()
+    for name in one:
+        assert torch.equal(one[name], other[name]), name
+
+
+def interrupted(folder: Path, config: LoopConfig, after: int) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.step == after:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Interrupted, match=r"stopped after step"):
+        trained(folder, config, on_step=stop)
+
+
+@pytest.mark.parametrize("changes", [{}, {"ema_decay": 0.9}, {"accumulate": 2, "clip_norm": 0.1}])
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    tmp_path: Path, changes: dict[str, object]
+) -> None:
+    whole = trained(tmp_path / "whole", loop(**changes))
+    interrupted(tmp_path / "parts", loop(**changes), after=5)
+    parts = trained(tmp_path / "parts", loop(**changes), resume=True)
+    assert_equal(weights(whole), weights(parts))
+    one, other = (read_metrics(tmp_path / name) for name in ("whole", "parts"))
+    assert one[-1] == other[-1]
+
+
+def test_training_learns_and_says_so(tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    task = trained(tmp_path, loop(steps=200, log_every_steps=20), on_step=seen.append)
+    rows = [row for row in read_metrics(tmp_path) if "regressor/loss" in row]
+    assert rows[-1]["regressor/loss"] < 0.3 * rows[0]["regressor/loss"]
+    assert rows[0]["regressor/double"] == pytest.approx(2 * rows[0]["regressor/loss"])
+    assert [p.step for p in seen] == list(range(1, 201))
+    assert seen[-1].steps == 200
+    assert (tmp_path / "pictures" / "0000200_grey.png").is_file()
+    assert any((tmp_path / "tensorboard").iterdir())
+    assert all(bool(t.isfinite().all()) for t in weights(task).values())
+
+
+def test_lines_after_the_state_are_dropped_on_resume(tmp_path: Path) -> None:
+    interrupted(tmp_path, loop(log_every_steps=1), after=6)
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps({"step": 9, "regressor/loss": 7.0}) + '\n{"step": 1')
+    trained(tmp_path, loop(log_every_steps=1), resume=True)
+    steps = [row["step"] for row in read_metrics(tmp_path) if "regressor/loss" in row]
+    assert steps == list(range(1, 13))
+
+
+def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
+    path: list[Tensor] = []
+    task = ToyTask()
+
+    def note(_: Progress) -> None:
+        path.append(weights(task)["judge.weight"].clone())
+
+    average = weights(task)["judge.weight"].clone()
+    config = loop(steps=6, ema_decay=0.8, validate_every_steps=100)
+    train(task, ToySamples(), config, tmp_path, on_step=note)
+    for weight in path:
+        average = 0.8 * average + 0.2 * weight
+    torch.testing.assert_close(weights(task)["judge.weight"], average)
+
+
+def test_a_folder_with_a_state_is_not_overwritten(tmp_path: Path) -> None:
+    trained(tmp_path, loop(steps=2))
+    with pytest.raises(InputError, match=r"holds a training\. Add --resume"):
+        trained(tmp_path, loop(steps=2))
+
+
+def test_a_full_disk_keeps_the_last_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained(tmp_path, loop(steps=4))
+    before = (tmp_path / "state.pt").read_bytes()
+
+    def refuse(state: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", refuse)
+    with pytest.raises(InputError, match="No space left"):
+        trained(tmp_path, loop(steps=8), resume=True)
+    assert (tmp_path / "state.pt").read_bytes() == before
+    assert not list(tmp_path.glob(".part-*"))
+
+
+def test_a_loss_that_is_not_finite_stops_with_advice(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"loss is inf at step 0\. Lower its learning_rate"):
+        train(ToyTask(factor=float("inf")), ToySamples(), loop(), tmp_path)
+
+
+def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
+    class Nothing(ToySamples):
+        def __len__(self) -> int:
+            return 0
+
+    with pytest.raises(InputError, match="no sample to train on"):
+        train(ToyTask(), Nothing(), loop(), tmp_path)
+
+
+def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'fp16' cannot be used here"):
+        trained(tmp_path, loop(precision="fp16"))
+
+
+def test_each_epoch_is_a_shuffle_of_its_own() -> None:
+    epochs = [[shuffled_index(20 * e + i, 20, 7) for i in range(20)] for e in range(2)]
+    assert [sorted(epoch) for epoch in epochs] == [list(range(20))] * 2
+    assert epochs[0] != epochs[1]
+    assert epochs[0] != [shuffled_index(i, 20, 8) for i in range(20)]
+
+
+def test_a_ticket_draws_the_same_numbers_again() -> None:
+    one, again, other = (torch.rand(4, generator=ticket_generator(t, 1)) for t in (5, 5, 6))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("schedule", "rates"),
+    [
+        ("constant", [1.0, 1.0, 1.0, 1.0]),
+        ("constant-linear", [1.0, 1.0, 1.0, 0.5]),
+        ("halving", [1.0, 0.5, 0.25, 0.125]),
+        ("cosine", [1.0, 0.8535534, 0.5, 0.1464466]),
+    ],
+)
+def test_schedules_by_hand(schedule: str, rates: list[float]) -> None:
+    adam = AdamConfig(learning_rate=0.5, schedule=schedule)  # pyright: ignore[reportArgumentType]
+    assert [adam.rate_at(s, 40) / 0.5 for s in (0, 10, 20, 30)] == pytest.approx(rates)
+
+
+def test_warm_up_rises_from_zero() -> None:
+    adam = AdamConfig(learning_rate=0.1, warmup_steps=4)
+    assert [adam.rate_at(s, 40) for s in range(5)] == pytest.approx([0.025, 0.05, 0.075, 0.1, 0.1])
+
+
+def test_epochs_become_steps() -> None:
+    config = LoopConfig(epochs=20.0, batch_size=4, accumulate=2)
+    assert config.total_steps(400, 1) == 1000
+    assert config.total_steps(400, 2) == 500
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"epochs": 3.0}, "give one of the two"),
+        ({"steps": None}, "give one of the two"),
+        ({"batch_size": 0}, "batch_size must be positive, got 0"),
+        ({"workers": -1}, "workers must be 0 or more"),
+        ({"ema_decay": 1.0}, "ema_decay must be between 0 and 1"),
+    ],
+)
+def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        loop(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"learning_rate": 0.0}, "learning_rate must be in"),
+        ({"beta1": 1.0}, "betas must be in"),
+    ],
+)
+def test_bad_knobs_of_adam_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AdamConfig(**changes)  # pyright: ignore[reportArgumentType]
+
+
+def program(folder: Path, steps: int, accumulate: int, pause_s: float = 0.0) -> list[str]:
+    return [str(PROGRAM), str(folder), str(steps), str(accumulate), str(pause_s)]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(PROGRAM.parents[2]), "OMP_NUM_THREADS": "1"}
+
+
+def test_two_processes_equal_one_that_accumulates(tmp_path: Path) -> None:
+    """Weights agree to float32 rounding; batch norm statistics are each process's own."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    for folder, words in ((one, program(one, 6, 2)), (two, [*launch, *program(two, 6, 1)])):
+        folder.mkdir()
+        subprocess.run([sys.executable, *words], check=True, env=environment(), capture_output=True)
+    states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (one, two)]
+    for network in states[0]:
+        for name, tensor in states[0][network].items():
+            if "running" not in name and "num_batches" not in name:
+                torch.testing.assert_close(tensor, states[1][network][name], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        folder.mkdir()
+    steps = 400
+    subprocess.run(
+        [sys.executable, *program(whole, steps, 1)], check=True, env=environment(),
+        capture_output=True,
+    )  # fmt: skip
+    moments, kills = random.Random(0), 0
+    while kills < 20:
+        words = [sys.executable, *program(killed, steps, 1, 0.1)]
+        process = subprocess.Popen(words, env=environment(), stderr=subprocess.DEVNULL)
+        _wait_for_progress(killed, process)
+        time.sleep(moments.uniform(0.0, 1.0))
+        process.kill()
+        process.wait()
+        kills += 1
+        state = killed / "state.pt"
+        assert not state.exists() or torch.load(state, weights_only=True)["step"] <= steps
+    subprocess.run(
+        [sys.executable, *program(killed, steps, 1)], check=True, env=environment(),
+        capture_output=True,
+    )  # fmt: skip
+    states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (whole, killed)]
+    for network in states[0]:
+        assert_equal(states[0][network], states[1][network])
+    assert not list(killed.glob(".part-*"))
+
+
+def _wait_for_progress(folder: Path, process: subprocess.Popen[bytes]) -> None:
+    """Let the process load and begin, so that the kill meets training, not importing."""
+    state = folder / "state.pt"
+    before = state.stat().st_mtime_ns if state.exists() else 0
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None:
+        if state.exists() and state.stat().st_mtime_ns != before:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the training did not go on")

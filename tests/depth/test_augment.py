@@ -1,0 +1,161 @@
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.demo.scene import make_street
+from depthpose.depth.augment import (
+    TrainingPair,
+    augment,
+    crop_pair,
+    flip_and_swap,
+    jitter_colors,
+    scale_pair,
+)
+from depthpose.depth.config import AugmentConfig
+from depthpose.depth.disparity import warp_right_to_left
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def smooth_image(width: int, seed: int) -> Tensor:
+    noise = torch.rand(1, 3, 8, 20, generator=generator(seed))
+    return torch.nn.functional.interpolate(noise, (40, width), mode="bicubic")[0].clamp(0, 1)
+
+
+def plane_pair(disparity_px: int = 6, seed: int = 0) -> TrainingPair:
+    """A frontal plane: left[x] = right[x - d], so both views have disparity d."""
+    wide = smooth_image(120 + disparity_px, seed)
+    known = torch.full((40, 120), float(disparity_px))
+    return TrainingPair(wide[..., :120], wide[..., disparity_px:], known, known.clone())
+
+
+def photometric_error(pair: TrainingPair, left_px: Tensor) -> float:
+    return float((warp_right_to_left(pair.right, left_px) - pair.left).abs().nanmean())
+
+
+@pytest.mark.parametrize("disparity_px", [0, 3, 11])
+def test_flip_and_swap_keeps_every_disparity(disparity_px: int) -> None:
+    pair = plane_pair(disparity_px)
+    flipped = flip_and_swap(pair)
+    assert torch.equal(flipped.left_px, pair.right_px.flip(-1))
+    assert photometric_error(flipped, flipped.left_px) < 1e-6
+    for one, other in zip(flip_and_swap(flipped), pair, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_flip_without_a_swap_would_break_the_pair() -> None:
+    pair = plane_pair(8)
+    broken = TrainingPair(*(part.flip(-1) for part in pair))
+    assert photometric_error(broken, broken.left_px) > 0.02
+
+
+def test_flip_and_swap_of_a_street_keeps_left_and_right_consistent() -> None:
+    street = make_street(0.4)
+    assert street.input.right is not None
+    assert street.truth.disparity_px is not None
+    unknown = torch.full_like(street.truth.disparity_px, torch.nan)
+    pair = TrainingPair(street.input.left, street.input.right, street.truth.disparity_px, unknown)
+    flipped = flip_and_swap(pair)
+    assert bool(flipped.left_px.isnan().all()), "nobody knows the right view's disparity"
+    assert torch.equal(flipped.right_px.flip(-1).nan_to_num(0), pair.left_px.nan_to_num(0))
+    # The old left view, looked up in the new pair by the truth that is now the right view's.
+    back = flip_and_swap(flipped)
+    assert photometric_error(back, back.left_px) == photometric_error(pair, pair.left_px)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.4, 2.0), st.integers(1, 12))
+def test_scaling_scales_disparity_by_the_ratio_of_the_widths(scale: float, px: int) -> None:
+    pair = plane_pair(px)
+    scaled = scale_pair(pair, scale, (1, 1))
+    ratio = scaled.left.shape[-1] / 120
+    assert scaled.left_px.unique().tolist() == pytest.approx([px * ratio])
+    assert abs(ratio - scale) <= 0.5 / 120 + 1e-9
+    assert photometric_error(scaled, scaled.left_px) < 0.02
+
+
+def test_scaling_never_mixes_known_with_unknown() -> None:
+    pair = plane_pair(4)
+    pair.left_px[::2] = torch.nan
+    scaled = scale_pair(pair, 0.7, (1, 1))
+    known = scaled.left_px[~scaled.left_px.isnan()]
+    assert known.unique().tolist() == pytest.approx([4 * 84 / 120])
+
+
+def test_small_images_grow_to_the_crop() -> None:
+    scaled = scale_pair(plane_pair(4), 1.0, (80, 200))
+    assert scaled.left.shape[-2] >= 80
+    assert scaled.left.shape[-1] >= 200
+
+
+def test_a_crop_keeps_columns_together() -> None:
+    pair = crop_pair(plane_pair(7), (20, 60), generator(3))
+    assert pair.left.shape == (3, 20, 60)
+    assert photometric_error(pair, pair.left_px) < 1e-6
+
+
+def test_a_crop_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(InputError, match=r"crop of 41x10 .* does not fit into images of 40x120"):
+        crop_pair(plane_pair(), (41, 10), generator())
+
+
+def test_colours_change_alike_in_both_views() -> None:
+    pair = plane_pair(5)
+    changed = jitter_colors(pair, 0.2, generator(1))
+    assert not torch.equal(changed.left, pair.left)
+    assert photometric_error(changed, changed.left_px) < 1e-6
+    assert changed.left.min() >= 0
+    assert changed.left.max() <= 1
+
+
+def test_each_colour_factor_stays_in_its_range() -> None:
+    """On a grey image contrast and saturation do nothing, so brightness shows alone."""
+    flat = torch.full((3, 4, 4), 0.4)
+    unknown = torch.full((4, 4), torch.nan)
+    pair = TrainingPair(flat, flat, unknown, unknown)
+    seen = [float(jitter_colors(pair, 0.2, generator(s)).left.mean()) / 0.4 for s in range(200)]
+    assert 0.8 - 1e-6 <= min(seen) < 0.83
+    assert 1.17 < max(seen) <= 1.2 + 1e-6
+
+
+def test_augmentation_follows_its_generator() -> None:
+    config = AugmentConfig(crop_px=(20, 60), scale=(0.8, 1.3))
+    pair = plane_pair(6)
+    one, again, other = (augment(pair, config, generator(s)) for s in (1, 1, 2))
+    assert torch.equal(one.left, again.left)
+    assert not torch.equal(one.left, other.left)
+    for seed in range(20):
+        made = augment(pair, config, generator(seed))
+        assert photometric_error(made, made.left_px) < 0.03
+
+
+def test_flips_come_at_their_share() -> None:
+    config = AugmentConfig(crop_px=(40, 120), jitter=0.0)
+    pair = plane_pair(6)
+    marked = TrainingPair(pair.left, pair.right, pair.left_px, pair.right_px + 1)
+    flips = [float(augment(marked, config, generator(s)).left_px[0, 0]) == 7 for s in range(200)]
+    assert 70 < sum(flips) < 130
+    never = dataclasses.replace(config, flip_share=0.0)
+    assert all(augment(marked, never, generator(s)).left_px[0, 0] == 6 for s in range(20))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"crop_px": (0, 5)}, "crop_px must be two positive sizes"),
+        ({"scale": (0.0, 1.0)}, "scale must be a range"),
+        ({"scale": (2.0, 1.0)}, "scale must be a range"),
+        ({"jitter": 1.0}, "jitter must be in"),
+        ({"flip_share": 1.5}, "flip_share must be in"),
+    ],
+)
+def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AugmentConfig(**changes)  # pyright: ignore[reportArgumentType]

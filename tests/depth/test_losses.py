@@ -1,0 +1,70 @@
+import math
+
+import pytest
+import torch
+
+from depthpose.depth.losses import (
+    adversarial_loss,
+    discriminator_loss,
+    disparity_loss,
+    heads_loss,
+    l1_loss,
+)
+
+NAN = float("nan")
+LOGITS = torch.tensor([2.0, -1.0]).reshape(1, 1, 1, 2)
+
+
+def log1exp(x: float) -> float:
+    return math.log(1 + math.exp(x))
+
+
+def test_cross_entropy_by_hand() -> None:
+    real = adversarial_loss(LOGITS, "vanilla", is_real=True)
+    fake = adversarial_loss(LOGITS, "vanilla", is_real=False)
+    assert float(real) == pytest.approx((log1exp(-2) + log1exp(1)) / 2, rel=1e-6)
+    assert float(fake) == pytest.approx((log1exp(2) + log1exp(-1)) / 2, rel=1e-6)
+
+
+def test_least_squares_by_hand() -> None:
+    assert float(adversarial_loss(LOGITS, "lsgan", is_real=True)) == pytest.approx((1 + 4) / 2)
+    assert float(adversarial_loss(LOGITS, "lsgan", is_real=False)) == pytest.approx((4 + 1) / 2)
+
+
+def test_the_discriminator_pays_half_of_both_mistakes() -> None:
+    loss = discriminator_loss(LOGITS, -LOGITS, "vanilla")
+    real = (log1exp(-2) + log1exp(1)) / 2
+    fake = (log1exp(-2) + log1exp(1)) / 2
+    assert float(loss) == pytest.approx((real + fake) / 2, rel=1e-6)
+
+
+def test_l1_by_hand() -> None:
+    made, real = torch.zeros(1, 3, 1, 2), torch.tensor([0.5, -1.0]).expand(1, 3, 1, 2)
+    assert float(l1_loss(made, real)) == pytest.approx(0.75)
+
+
+def test_smooth_l1_by_hand() -> None:
+    """0.5 x^2 within 1 px, |x| - 0.5 beyond; unknown, zero and out-of-range truth do not count."""
+    found = torch.tensor([[[5.5, 8.0, 3.0, 3.0, 3.0]]])
+    truth = torch.tensor([[[5.0, 5.0, NAN, 0.0, 96.0]]])
+    assert float(disparity_loss(found, truth, 96)) == pytest.approx((0.125 + 2.5) / 2)
+
+
+def test_the_heads_weigh_a_half_seven_tenths_and_one() -> None:
+    truth = torch.full((1, 1, 1), 5.0)
+    heads = [truth + 1.5, truth + 2.5, truth + 3.5]
+    assert float(heads_loss(heads, truth, 96)) == pytest.approx(0.5 * 1 + 0.7 * 2 + 1.0 * 3)
+
+
+def test_unknown_truth_gives_no_gradient_and_no_nan() -> None:
+    found = torch.ones(1, 1, 3, requires_grad=True)
+    disparity_loss(found, torch.tensor([[[NAN, 3.0, NAN]]]), 96).backward()
+    assert found.grad is not None
+    assert found.grad.flatten().tolist() == [0.0, -1.0, 0.0]
+
+
+def test_no_truth_at_all_costs_nothing() -> None:
+    found = torch.ones(1, 1, 3, requires_grad=True)
+    loss = disparity_loss(found, torch.full((1, 1, 3), NAN), 96)
+    loss.backward()
+    assert float(loss.detach()) == 0
