@@ -68,7 +68,9 @@ def reproduce(
     chosen = reproducing.own_methods(published, weights, matcher, config)
     if train:
         training = evaluating.open_training(train, train_without)
-        chosen += [("", methods.floor_method(name, training)) for name in ("rows", "nearest")]
+        floors = [methods.floor_method(name, training) for name in ("rows", "nearest")]
+        # A floor looks at no right view, but is measured on the frames of the other rows.
+        chosen += [("", floor._replace(with_right=published.with_right)) for floor in floors]
     order = reproducing.Order(
         table=published,
         dataset=dataset,

@@ -243,7 +243,7 @@ def _setting_rows(methods: Sequence[Method]) -> list[dict[str, Any]]:
 def _say_how(order: Order) -> str:
     how = evaluating.describe_protocol(order.protocol)
     return (
-        f"Ours: {how} Frames: {len(order.dataset)} of {order.dataset.name}; the thesis measured "
-        "the 697 of eigen-test. Difference: ours minus the thesis's own row. A row of another "
-        "protocol, or of other frames, does not compare with the printed ones."
+        f"Ours: {how} The printed rows are of the 697 frames of eigen-test. Difference: ours minus "
+        "the thesis's own row. A row of another protocol, or of other frames (see the columns), "
+        "does not compare with the printed ones."
     )

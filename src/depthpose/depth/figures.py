@@ -127,8 +127,8 @@ def _depth(pair: StereoInput, estimate: DepthEstimate) -> Float[Tensor, "3 h w"]
 def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Panel]:
     if lidar_m is None:
         return []
-    # At half the size a LiDAR point is a quarter of a pixel: it is drawn 7 wide.
-    image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=3)
+    # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.
+    image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=2)
     return [Panel(caption="LiDAR", image=image)]
 
 
