@@ -42,7 +42,7 @@ def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> 
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
     ``NAME.color.png``, ``NAME.right.png`` (synthesised) and ``NAME.disparity_px.npy``, each where
-    the estimate has it.
+    the estimate has it. The disparity is that of the frame's own rig.
     """
     base = folder / pair.name
     if estimate.depth_m is not None:
@@ -58,7 +58,7 @@ def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> 
         else draw_depth(estimate.depth_m)
     )
     write_image(_file(base, "color.png"), picture)
-    write_map(_file(base, "disparity_px.npy"), estimate.disparity_px)
+    write_map(_file(base, "disparity_px.npy"), _own_disparity(pair, estimate))
 
 
 def write_estimate_cloud(
@@ -158,6 +158,20 @@ def predict(
             pair = read_input()
             write_estimate(folder, pair, net.estimate_pair(pair))
         yield name
+
+
+def _own_disparity(pair: StereoInput, estimate: DepthEstimate) -> Float[Tensor, "h w"]:
+    """Give the disparity that the frame's own rig sees.
+
+    A synthesised right view is that of the rig the generator learnt, and so is the disparity found
+    in it; read back with the frame's rig it would say other metres.
+    """
+    found_px, depth_m = estimate.disparity_px, estimate.depth_m
+    if estimate.right is None or depth_m is None or not isinstance(pair.camera, StereoRig):
+        return found_px
+    own_px = disparity_from_depth(depth_m, pair.camera)
+    # No depth means no disparity (NaN), or none that is positive: that stays what it was.
+    return torch.where(torch.isfinite(own_px), own_px, found_px.clamp(max=0))
 
 
 def _file(base: Path, ending: str) -> Path:

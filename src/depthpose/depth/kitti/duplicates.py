@@ -5,7 +5,7 @@ Every street has sky above and asphalt below, so whole thumbnails of unrelated s
 over small shifts and zooms, for a car turns and drives on between two frames.
 
 The threshold stands where frames of KITTI whose drives are known separate (95 pairs of KITTI 2015
-from 20 drives): of 4200 pairs from two drives none but those of one crossing, which two drives
+from 20 drives): of some 4200 pairs from two drives none but those of one crossing, which two drives
 show, reaches 0.3; of frames of one drive a second apart 19 of 24 do, those in a turn do not. So
 the search finds the same view again, and not every frame of the same drive.
 """
