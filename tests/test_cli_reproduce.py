@@ -215,6 +215,9 @@ def test_near_duplicates_are_listed(
     words = ["data", "duplicates", str(street), str(street), "--out", str(tmp_path / "o")]
     assert main(words) == 1
     assert len(json.loads((tmp_path / "o/duplicates.json").read_text())) == 16
+    unlike = ["data", "duplicates", str(street), str(tmp_path / "other"), "--at-least", "-1"]
+    assert main(unlike) == 1
+    assert "4 pairs of likeness -1 or more" in capsys.readouterr().out
     assert main([*words, "--at-least", "2"]) == 2
     assert "a likeness is -1 .. 1" in capsys.readouterr().err
 

@@ -71,7 +71,7 @@ def duplicates(
         raise InputError(f"--at-least {threshold:g}: a likeness is -1 .. 1; take 0.3")
     first, second = open_dataset(train), open_dataset(evaluation)
     ranked = find_duplicates(
-        first, second, progress=lambda frames: tqdm(frames, unit=" frames", disable=None)
+        first, second, threshold, lambda frames: tqdm(frames, unit=" frames", disable=None)
     )
     rows = [asdict(pair) for pair in ranked if pair.likeness >= threshold]
     if rows:
