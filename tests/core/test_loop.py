@@ -29,7 +29,7 @@ PROGRAM = Path(__file__).with_name("loop_task.py")
 
 def loop(**changes: object) -> LoopConfig:
     knobs = {"steps": 12, "batch_size": 4, "save_every_steps": 4, "device": "cpu", **changes}
-    return LoopConfig(**knobs)  # pyright: ignore[reportArgumentType]
+    return LoopConfig(**knobs)
 
 
 def trained(folder: Path, config: LoopConfig, **words: object) -> ToyTask:

@@ -11,6 +11,7 @@ from depthpose.core.report import (
     Section,
     csv_table,
     markdown_table,
+    write_markdown,
     write_page,
     write_table,
 )
@@ -47,3 +48,11 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert "a &lt;picture&gt;" in html
     assert "http" not in html
     assert 'src="p.png' not in html
+
+
+def test_the_words_and_tables_of_a_page_are_markdown_too(tmp_path: Path) -> None:
+    sections = [Section(title="One", text="Words.", rows=ROWS), Section(title="Two")]
+    write_markdown(tmp_path / "r.md", "Title", sections, {"torch": "2", "date": "today"})
+    text = (tmp_path / "r.md").read_text()
+    assert text.startswith("# Title\n\n## One\n\nWords.\n\n| name | x |")
+    assert text.endswith("## Two\n\ntorch 2 · date today\n")

@@ -3,7 +3,15 @@ from pathlib import Path
 import pytest
 
 from depthpose.core.errors import InputError
-from depthpose.core.run import claim_folder, environment, read_settings
+from depthpose.core.run import (
+    Shard,
+    claim_folder,
+    environment,
+    find_shard,
+    own_device,
+    read_settings,
+    wait_for,
+)
 
 
 def test_a_folder_remembers_its_settings(tmp_path: Path) -> None:
@@ -40,3 +48,47 @@ def test_a_foreign_record_is_refused(tmp_path: Path) -> None:
 def test_the_environment_names_versions_and_date() -> None:
     facts = environment()
     assert {"date", "python", "depthpose", "torch", "numpy", "machine"} <= facts.keys()
+
+
+def test_shards_share_everything_once() -> None:
+    shares = [list(Shard(rank=rank, world=3).share(10)) for rank in range(3)]
+    assert sorted(k for share in shares for k in share) == list(range(10))
+    assert list(Shard().share(4)) == [0, 1, 2, 3]
+
+
+def test_the_shard_is_read_from_the_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+    assert find_shard() == Shard(rank=0, world=1)
+    assert own_device("cuda") == "cuda"
+    monkeypatch.setenv("RANK", "2")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert find_shard() == Shard(rank=2, world=4)
+    assert [own_device(name) for name in ("cuda", "cuda:3", "cpu")] == ["cuda:1", "cuda:3", "cpu"]
+
+
+@pytest.mark.parametrize(("rank", "world"), [("4", "4"), ("-1", "2"), ("x", "2"), ("0", "")])
+def test_a_rank_that_cannot_be_is_refused(
+    monkeypatch: pytest.MonkeyPatch, rank: str, world: str
+) -> None:
+    monkeypatch.setenv("RANK", rank)
+    monkeypatch.setenv("WORLD_SIZE", world)
+    with pytest.raises(InputError, match="let torchrun or accelerate launch set them"):
+        find_shard()
+
+
+def test_waiting_ends_when_all_is_there() -> None:
+    asked: list[str] = []
+
+    def is_there(name: str) -> bool:
+        asked.append(name)
+        return len(asked) > 3
+
+    wait_for(["a", "b"], is_there)
+    assert asked[:2] == ["a", "b"]
+
+
+def test_waiting_in_vain_names_what_is_missing() -> None:
+    with pytest.raises(InputError, match="1 of 2 are missing, first 'b': another process may have"):
+        wait_for(["a", "b"], lambda name: name == "a", patience_s=0.1)

@@ -16,6 +16,7 @@ from depthpose.depth.predictions import (
     is_finished,
     predict,
     read_disparity,
+    read_estimate,
     write_estimate,
     write_estimate_cloud,
 )
@@ -117,7 +118,14 @@ def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", spoil)
     for name in "abc":
         write_map(folder / f"{name}.confidence.npy", 1 - torch.arange(W).expand(H, W) / W)
-    good = evaluate(pairs, folder, "kitti-2015").rows[0]["ause"]
+    result = evaluate(pairs, folder, "kitti-2015")
+    good = result.rows[0]["ause"]
+    assert result.rows[0]["ause_share"] < 0.01
+    errors = [row["epe_px"] for row in result.deciles]
+    assert len(errors) == 10
+    assert errors == sorted(errors, reverse=True)
+    assert result.deciles[0]["confidence_decile"] == 1
+    assert len(evaluate(pairs, folder, "eigen-improved").deciles) == 20
     for name in "abc":
         write_map(folder / f"{name}.confidence.npy", torch.arange(W).expand(H, W) / W)
     assert good < 0.01 < evaluate(pairs, folder, "kitti-2015").rows[0]["ause"]
@@ -182,6 +190,18 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
         list(predict(net, readers, names, tmp_path / "p", {"method": "another"}))
 
 
+def test_disparity_that_is_no_depth_stays_so(tmp_path: Path) -> None:
+    found_px = torch.tensor([[0.0, -1.0, torch.nan, 8.0]])
+    pair = StereoInput(name="x", left=torch.rand(3, 1, 4), right=None, camera=rig())
+    depth_m = torch.tensor([[torch.nan, torch.nan, torch.nan, 10.0]])
+    shown = DepthEstimate(depth_m=depth_m, disparity_px=found_px, right=torch.rand(3, 1, 4))
+    write_estimate(tmp_path, pair, shown)
+    expected_px = torch.tensor([[0.0, -1.0, torch.nan, 4.0]])  # f B / depth = 80 * 0.5 / 10
+    assert torch.equal(
+        read_disparity(tmp_path, "x", rig()).nan_to_num(9), expected_px.nan_to_num(9)
+    )
+
+
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     estimate = DepthEstimate(depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W))
@@ -191,3 +211,29 @@ def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     assert is_finished(tmp_path, "x")
     with pytest.raises(InputError, match="a cloud needs metres"):
         write_estimate_cloud(tmp_path, pair, estimate)
+
+
+def test_an_estimate_is_read_back(tmp_path: Path) -> None:
+    pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=rig())
+    depth_m = depth_from_disparity(truth_px(0), rig())
+    right = torch.ones(3, H, W) / 255
+    found_px = 2 * truth_px(0)  # in the view of a rig that is twice as wide
+    estimate = DepthEstimate(
+        depth_m=depth_m, disparity_px=found_px, confidence=torch.rand(H, W), right=right
+    )
+    write_estimate(tmp_path, pair, estimate)
+    again = read_estimate(tmp_path, "x", None)
+    for one, other in (
+        (again.depth_m, depth_m),
+        (again.disparity_px, truth_px(0)),
+        (again.confidence, estimate.confidence),
+        (again.right, right),
+    ):
+        assert one is not None
+        assert other is not None
+        assert torch.allclose(one, other)
+    (tmp_path / "x.depth_m.npy").unlink()
+    from_rig = read_estimate(tmp_path, "x", rig()).depth_m
+    assert from_rig is not None
+    assert torch.allclose(from_rig, depth_m)
+    assert read_estimate(tmp_path, "x", None).depth_m is None

@@ -8,7 +8,9 @@ from depthpose.depth.metrics import (
     DepthErrors,
     depth_errors,
     disparity_errors,
+    error_by_decile,
     garg_crop,
+    score_confidence,
     sparsification_area,
 )
 
@@ -125,3 +127,38 @@ def test_no_error_has_no_area() -> None:
 def test_sparsification_without_pixels_is_refused() -> None:
     with pytest.raises(InputError, match="no pixel to compare"):
         sparsification_area(torch.zeros(0), torch.zeros(0))
+
+
+def test_a_confidence_stands_between_oracle_and_chance() -> None:
+    error = torch.rand(2000)
+    oracle, chance = score_confidence(error, -error), score_confidence(error, torch.ones(2000))
+    assert (oracle.ause, oracle.ause_share) == (0.0, 0.0)
+    assert chance.ause_share == 1.0
+    assert score_confidence(error, error).ause_share > 1
+    assert 0 < score_confidence(error, torch.rand(2000) - error).ause_share < 1
+    assert oracle.ause_random == chance.ause
+
+
+def test_equal_errors_leave_nothing_to_order() -> None:
+    assert score_confidence(torch.ones(50), torch.rand(50)).ause_share == 0.0
+
+
+def test_deciles_of_a_worked_example() -> None:
+    error = torch.arange(20.0).flip(0)
+    expected = [18.5 - 2 * k for k in range(10)]
+    assert error_by_decile(error, torch.arange(20.0)).tolist() == expected
+
+
+def test_deciles_of_an_ignorant_confidence_are_equal() -> None:
+    assert error_by_decile(torch.arange(20.0), torch.zeros(20)).tolist() == [9.5] * 10
+
+
+def test_deciles_without_pixels_are_nan() -> None:
+    deciles = error_by_decile(torch.ones(3), torch.rand(3))
+    assert int(torch.isnan(deciles).sum()) == 7
+
+
+def test_the_mean_of_full_deciles_is_the_mean_error() -> None:
+    error = torch.rand(500)
+    mean = float(error_by_decile(error, torch.rand(500)).mean())
+    assert mean == pytest.approx(float(error.double().mean()))

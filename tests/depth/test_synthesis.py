@@ -20,7 +20,7 @@ def parameters(module: nn.Module) -> int:
 def small(levels: int = 4, **changes: object) -> UNetGenerator:
     torch.manual_seed(0)
     knobs = {"width": 4, "levels": levels, **changes}
-    return UNetGenerator(GeneratorConfig(**knobs))  # pyright: ignore[reportArgumentType]
+    return UNetGenerator(GeneratorConfig(**knobs))
 
 
 def test_parameters_are_the_published_ones() -> None:

@@ -18,12 +18,15 @@ COMMANDS = {
         "run everything on a made street and open the books: out/demo/report.html",
     ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
+    "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "reproduce": ("reproduce:reproduce", "a table of the thesis: published rows, ours, difference"),
+    "figure": ("reproduce:figure", "a figure of the thesis from your frames and weights"),
 }
 _EXIT_CODES = """exit codes:
   0    done

@@ -6,7 +6,7 @@ from typing import Literal
 import tyro
 
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.config import FloorName, MatcherConfig
 
 MatcherName = Literal["psmnet", "sgbm"]
 Precision = Literal["fp32", "bf16"]
@@ -73,7 +73,7 @@ def match(
     if weights is None:
         method = methods.sgbm_method(with_filled_holes=False)
     else:
-        method = methods.psmnet_method(weights, config)
+        method = methods.weights_method(weights, config, with_right=True)
     if tile is not None:
         matching.say_tile_change(pairs, method)
     return matching.match_all(pairs, method, out, with_cloud=cloud)
@@ -85,6 +85,9 @@ def evaluate(
     weights: str | None = None,
     matcher: MatcherName | None = None,
     predictions: Path | None = None,
+    floor: tuple[FloorName, ...] = (),
+    train: tuple[Path, ...] = (),
+    train_without: tuple[str, ...] = (),
     protocol: str = "eigen-raw",
     cap: tuple[float, ...] = (80.0, 50.0),
     split: str | None = None,
@@ -97,7 +100,8 @@ def evaluate(
 
     Predictions are made once, as files in OUT/predictions/METHOD, and measured from there; a second
     run measures without predicting anew. --predictions measures the files of any other method.
-    Several methods may be named at once: their rows share the table.
+    Several methods may be named at once: their rows share the table. Under torchrun or accelerate
+    launch the processes share the frames, and the first one measures.
 
     Protocols: eigen-raw (one LiDAR scan, depth = LiDAR x, Garg crop: the published one),
     eigen-raw-camera (depth = camera z), eigen-improved (annotated maps, no crop),
@@ -109,6 +113,10 @@ def evaluate(
         weights: PSMNet weights, a .safetensors file.
         matcher: sgbm measures OpenCV's StereoSGBM.
         predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy.
+        floor: what every method must beat: rows (the best constant depth of each image row) or
+            nearest (the depth of the training image that looks most alike), or both.
+        train: folders with the frames that a floor is fitted to.
+        train_without: names of frames to keep out of them.
         protocol: how prediction and truth are compared.
         cap: metres beyond which truth does not count; a row each.
         split: eigen-test, eigen-val, eigen-train, eigen-benchmark, or a file of frames.
@@ -121,8 +129,10 @@ def evaluate(
     from depthpose.cli import evaluating, methods
     from depthpose.depth.evaluate import find_protocol
 
-    if weights is None and matcher is None and predictions is None:
-        raise InputError("measure --weights FILE, --matcher sgbm or --predictions DIR, or several.")
+    if weights is None and matcher is None and predictions is None and not floor:
+        raise InputError(
+            "measure --weights FILE, --matcher sgbm, --predictions DIR or --floor rows, or several."
+        )
     rule = find_protocol(protocol)
     dataset = evaluating.open_frames(data, split)
     chosen: list[methods.Method] = []
@@ -134,7 +144,10 @@ def evaluate(
             precision=precision,
             max_memory_bytes=methods.parse_bytes(max_memory),
         )
-        chosen.append(methods.psmnet_method(weights, config))
+        chosen.append(methods.weights_method(weights, config))
+    if floor:
+        training = evaluating.open_training(train, train_without)
+        chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
     home = out / "predictions"
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
     folders += [] if predictions is None else [predictions]

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli.methods import Method
+from depthpose.core.errors import InputError
 from depthpose.core.report import Section, markdown_table, write_page, write_table
-from depthpose.core.run import environment, read_settings
-from depthpose.depth.evaluate import PROTOCOLS, Protocol, evaluate, has_truth
-from depthpose.depth.kitti import Dataset, open_dataset
-from depthpose.depth.predictions import predict
+from depthpose.core.run import environment, find_shard, read_settings, wait_for
+from depthpose.depth.evaluate import PROTOCOLS, Evaluation, Protocol, evaluate, has_truth
+from depthpose.depth.kitti import Dataset, join_datasets, open_dataset
+from depthpose.depth.predictions import is_finished, predict
+from depthpose.depth.types import StereoInput
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
@@ -24,41 +27,118 @@ def open_frames(data: Path, split: str | None) -> Dataset:
 
 
 def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
-    """Predict every frame that has a right view and truth to compare with; give the folder."""
+    """Predict every frame that has truth to compare with, and a right view if it is needed.
+
+    Where several processes run the command (``torchrun``, ``accelerate launch``), each predicts
+    its share, and the first goes on when the files of all are there.
+
+    Returns:
+        The folder of the predictions.
+    """
     frames = list(enumerate(dataset.frames))
-    usable = [i for i, frame in frames if frame.right is not None and has_truth(frame, rule)]
-    names = [dataset.frames[i].name for i in usable]
-    readers = [partial(dataset.read_input, i) for i in usable]
+    usable = [
+        i
+        for i, frame in frames
+        if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
+    ]
+    shard = find_shard()
+    mine = [usable[k] for k in shard.share(len(usable))]
+    names = [dataset.frames[i].name for i in mine]
+    readers = [partial(_read, dataset, i, method.with_right) for i in mine]
     home = folder / method.name
     written = predict(method.net, readers, names, home, method.settings)
     for _ in tqdm(written, method.name, total=len(names), disable=None, unit=" frames"):
         pass
+    if shard.rank == 0:
+        wait_for([dataset.frames[i].name for i in usable], partial(is_finished, home))
     return home
+
+
+def open_training(folders: Sequence[Path], without: Sequence[str]) -> Dataset:
+    """Open the frames that a floor is fitted to."""
+    if not folders:
+        raise InputError("a floor is fitted to training frames: give --train FOLDER, or several.")
+    return join_datasets([open_dataset(folder) for folder in folders], without)
+
+
+def _read(dataset: Dataset, index: int, with_right: bool) -> StereoInput:
+    """Read an input; what a method must not see is not in it."""
+    pair = dataset.read_input(index)
+    return pair if with_right else replace(pair, right=None)
 
 
 def measure(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float], out: Path
 ) -> int:
     """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print."""
+    if find_shard().rank > 0:
+        return 0
+    measured = measure_all(dataset, folders, protocol, caps_m)
+    write_table(out, measured.rows)
+    write_details(measured, out)
+    page = out / "report.html"
+    sections = [
+        Section(title="Mean over frames", text=describe_protocol(protocol), rows=measured.rows),
+        *detail_sections(measured),
+    ]
+    write_page(page, f"{protocol} on {dataset.name}", sections, environment())
+    print(markdown_table(measured.rows))
+    say_skipped(measured)
+    print(f"the page: {page}")
+    return 0
+
+
+def measure_all(
+    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
+) -> Evaluation:
+    """Measure several folders of predictions; each row says whose it is."""
     rows: list[dict[str, Any]] = []
     frames: list[dict[str, Any]] = []
+    deciles: list[dict[str, Any]] = []
     skipped: dict[str, str] = {}
     for folder in folders:
         result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
-        rows += [_describe(folder) | row for row in result.rows]
-        frames += [{"method": _describe(folder)["method"]} | row for row in result.per_frame]
+        who = _describe(folder)
+        name = {"method": who["method"], "weights": who["weights"]}
+        rows += [who | row for row in result.rows]
+        frames += [name | row for row in result.per_frame]
+        deciles += [name | row for row in result.deciles]
         skipped |= result.skipped
-    write_table(out, rows)
-    write_table(out, frames, name="frames")
-    page = out / "report.html"
-    write_page(
-        page, f"{protocol} on {dataset.name}", _sections(rows, frames, skipped), environment()
-    )
-    print(markdown_table(rows))
-    for name, why in skipped.items():
+    return Evaluation(rows=rows, per_frame=frames, deciles=deciles, skipped=skipped)
+
+
+def write_details(measured: Evaluation, out: Path) -> None:
+    """Write each frame's numbers, and the error by confidence where there is any."""
+    write_table(out, measured.per_frame, name="frames")
+    if measured.deciles:
+        write_table(out, measured.deciles, name="confidence")
+
+
+def detail_sections(measured: Evaluation) -> list[Section]:
+    """Make the parts of a page below its table."""
+    without_truth = [{"frame": name, "why": why} for name, why in measured.skipped.items()]
+    sections = [
+        Section(
+            title="Error by confidence",
+            text="Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)",
+            rows=measured.deciles,
+        ),
+        Section(title="Each frame", rows=measured.per_frame),
+        Section(title="Skipped frames", rows=without_truth),
+    ]
+    return [section for section in sections if section.rows]
+
+
+def describe_protocol(protocol: str) -> str:
+    """Say in a line how the numbers were measured."""
+    return f"{protocol}: {PROTOCOLS[protocol].summary}."
+
+
+def say_skipped(measured: Evaluation) -> None:
+    """Name the frames that do not count."""
+    for name, why in measured.skipped.items():
         print(f"skipped: {name}: {why}", file=sys.stderr)
-    print(f"{len(skipped)} frames skipped; the page: {page}")
-    return 0
+    print(f"{len(measured.skipped)} frames skipped")
 
 
 def _show_progress(frames: Sequence[int]) -> Iterable[int]:
@@ -77,17 +157,3 @@ def _describe(predictions: Path) -> dict[str, Any]:
         "weights": settings.get("weights", ""),
         "weights_sha256": settings.get("weights_sha256", "")[:12],
     }
-
-
-def _sections(
-    rows: list[dict[str, Any]], frames: list[dict[str, Any]], skipped: dict[str, str]
-) -> list[Section]:
-    protocol = rows[0]["protocol"]
-    summary = f"{protocol}: {PROTOCOLS[protocol].summary}."
-    without_truth = [{"frame": name, "why": why} for name, why in skipped.items()]
-    sections = [
-        Section(title="Mean over frames", text=summary, rows=rows),
-        Section(title="Each frame", rows=frames),
-        Section(title="Skipped frames", rows=without_truth),
-    ]
-    return [section for section in sections if section.rows]

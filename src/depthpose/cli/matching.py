@@ -10,8 +10,8 @@ from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import list_images, read_image
-from depthpose.core.run import claim_folder
-from depthpose.depth.estimator import refuse_unrectified
+from depthpose.core.run import claim_folder, find_shard
+from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
 from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
 from depthpose.depth.types import StereoInput
@@ -63,6 +63,7 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
     """Print how far tiles move the disparity of the first pair from that of the whole image."""
     pair = pairs.read(0)
     assert pair.right is not None
+    assert isinstance(method.net, FakestereoNet)
     assert isinstance(method.net.matcher, PSMNetMatcher)
     change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
     print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
@@ -73,7 +74,8 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
     claim_folder(out, {**method.settings, "camera": rig})
     failures: list[str] = []
-    for index in tqdm(range(len(pairs.left)), unit=" pairs", disable=None):
+    mine = find_shard().share(len(pairs.left))
+    for index in tqdm(mine, unit=" pairs", disable=None):
         name = pairs.left[index].stem
         if is_finished(out, name) and (not with_cloud or (out / f"{name}.ply").is_file()):
             continue
@@ -90,6 +92,5 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
         write_estimate(out, pair, estimate)
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    done = len(pairs.left) - len(failures)
-    print(f"{done} of {len(pairs.left)} pairs are in {out}")
+    print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
     return 1 if failures else 0

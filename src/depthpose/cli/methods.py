@@ -1,31 +1,64 @@
 """Methods by their words on the command line, with what decides their results."""
 
+import hashlib
 import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-from depthpose.core.checkpoint import file_sha256, find_weights
+from tqdm import tqdm
+
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, SGBMConfig
+from depthpose.core.run import own_device
+from depthpose.depth.config import FloorName, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.floors import NearestImageFloor, RowDepthFloor
+from depthpose.depth.kitti import Dataset
+from depthpose.depth.predictions import Estimator
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
 
 class Method(NamedTuple):
-    """An estimator, what to call it, and the JSON values that decide its results."""
+    """An estimator, what to call it, and the JSON values that decide its results.
+
+    ``with_right`` says whether it is shown the real right view.
+    """
 
     name: str
-    net: FakestereoNet
+    net: Estimator
     settings: dict[str, Any]
+    with_right: bool = True
 
 
-def psmnet_method(weights: str, config: MatcherConfig) -> Method:
-    """PSMNet with weights from a file or by name."""
+def weights_method(
+    weights: str, config: MatcherConfig, *, with_right: bool | None = None
+) -> Method:
+    """Build the network of a weights file, given by its path or by name.
+
+    Args:
+        weights: the file; what it holds decides what is built.
+        config: how the matcher runs.
+        with_right: show it the real right view; by default only to a matcher, which needs it.
+
+    Raises:
+        InputError: a matcher alone is asked to do without the right view.
+    """
     path = find_weights(weights)
-    facts = {"matcher": "psmnet", "weights": path.stem, "weights_sha256": file_sha256(path)}
-    net = FakestereoNet.load(path, config=config)
-    return Method(path.stem, net, {**facts, **config_to_dict(config)})
+    kind = read_checkpoint(path).kind
+    is_shown = kind == "psmnet" if with_right is None else with_right
+    if kind == "psmnet" and not is_shown:
+        raise InputError(
+            f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
+            "synthesise the right view."
+        )
+    facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
+    if kind != "psmnet":
+        facts["sees"] = "both views" if is_shown else "left view"
+    net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
+    return Method(path.stem, net, {**facts, **config_to_dict(config)}, is_shown)
 
 
 def sgbm_method(*, with_filled_holes: bool) -> Method:
@@ -34,6 +67,23 @@ def sgbm_method(*, with_filled_holes: bool) -> Method:
     net = FakestereoNet.load(matcher="sgbm", config=config)
     name = "sgbm-filled" if with_filled_holes else "sgbm"
     return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
+
+
+def floor_method(name: FloorName, training: Dataset) -> Method:
+    """Fit a floor to the truth of training frames."""
+    kinds = {"rows": RowDepthFloor, "nearest": NearestImageFloor}
+    names = "\n".join(frame.name for frame in training.frames)
+    settings = {
+        "matcher": f"floor: {name}",
+        "train": training.name,
+        "train_frames": len(training),
+        "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
+    }
+
+    def show(frames: Sequence[int]) -> Iterable[int]:
+        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
+
+    return Method(f"floor-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 
 def parse_bytes(text: str | None) -> int | None:

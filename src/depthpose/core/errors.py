@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from importlib import import_module
+from typing import Any
 
 
 class InputError(ValueError):
@@ -19,6 +21,18 @@ class MissingExtraError(ImportError):
         super().__init__(
             f"{purpose} needs {package}, which is not installed: pip install 'depthpose[{extra}]'"
         )
+
+
+def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
+    """Import OpenCV where it is used; its absence says which extra brings it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module("cv2")
+    except ImportError as error:
+        raise MissingExtraError("opencv-python-headless", "opencv", purpose) from error
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

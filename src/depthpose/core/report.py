@@ -65,6 +65,19 @@ def csv_table(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
+def write_markdown(
+    path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
+) -> None:
+    """Write the words and tables of :func:`write_page` as Markdown, without its pictures."""
+    parts = [f"# {title}\n"]
+    for section in sections:
+        parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
+        parts += [markdown_table(section.rows)] if section.rows else []
+    parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
+    with atomic_write(path) as temporary:
+        temporary.write_text("\n".join(parts), encoding="utf-8")
+
+
 def column_names(rows: Sequence[Row]) -> list[str]:
     """Give the union of the rows' names, in order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row))

@@ -1,8 +1,11 @@
 """One folder per run, which says what made it: settings, versions, machine, commit."""
 
+import os
 import platform
 import subprocess
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,6 +18,72 @@ from depthpose.core.files import read_json, write_json
 
 _RECORD = "run.json"
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shard:
+    """Which of several processes this one is; they share the work and meet in the files.
+
+    Attributes:
+        rank: 0 .. world - 1.
+        world: how many processes there are.
+    """
+
+    rank: int = 0
+    world: int = 1
+
+    def share(self, total: int) -> range:
+        """Give the indices of 0 .. total - 1 that are this process's."""
+        return range(self.rank, total, self.world)
+
+
+def find_shard() -> Shard:
+    """Read RANK and WORLD_SIZE, as ``torchrun`` and ``accelerate launch`` set them.
+
+    Raises:
+        InputError: they are no numbers that go together.
+    """
+    said = (os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1"))
+    if not all(word.isdecimal() for word in said) or not int(said[0]) < int(said[1]):
+        raise InputError(
+            f"RANK is {said[0]!r} and WORLD_SIZE {said[1]!r}, but a rank is 0 .. WORLD_SIZE - 1; "
+            "let torchrun or accelerate launch set them, or unset both"
+        )
+    return Shard(rank=int(said[0]), world=int(said[1]))
+
+
+def own_device(device: str) -> str:
+    """Give each process of a machine a GPU of its own: ``cuda`` is ``cuda:LOCAL_RANK``."""
+    local_rank = os.environ.get("LOCAL_RANK", "")
+    return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
+
+
+def wait_for(
+    names: Sequence[str], is_there: Callable[[str], bool], patience_s: float = 3600.0
+) -> None:
+    """Wait until other processes have finished all of these.
+
+    Args:
+        names: what is waited for.
+        is_there: whether one is finished.
+        patience_s: how long nothing new may appear: a process that died finishes nothing.
+
+    Raises:
+        InputError: patience is at its end; what is missing is named.
+    """
+    missing = [name for name in names if not is_there(name)]
+    last_news = time.monotonic()
+    while missing:
+        if time.monotonic() - last_news > patience_s:
+            raise InputError(
+                f"nothing new for {patience_s:.0f} s and {len(missing)} of {len(names)} are "
+                f"missing, first {missing[0]!r}: another process may have failed. Start again; "
+                "what is finished is kept."
+            )
+        time.sleep(min(0.2, patience_s))
+        still = [name for name in missing if not is_there(name)]
+        last_news = time.monotonic() if len(still) < len(missing) else last_news
+        missing = still
 
 
 def environment() -> dict[str, str]:

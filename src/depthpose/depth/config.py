@@ -5,6 +5,9 @@ from typing import Literal
 
 from depthpose.core.errors import InputError
 
+FloorName = Literal["rows", "nearest"]
+"""The best constant depth of each image row; the depth of the training image most alike."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PSMNetConfig:

@@ -21,8 +21,9 @@ from depthpose.depth.kitti import read_disparity as read_truth_disparity
 from depthpose.depth.metrics import (
     depth_errors,
     disparity_errors,
+    error_by_decile,
     garg_crop,
-    sparsification_area,
+    score_confidence,
 )
 from depthpose.depth.predictions import has_prediction, read_confidence, read_disparity
 
@@ -79,11 +80,14 @@ class Evaluation:
     Attributes:
         rows: one a cap (or a set of pixels), names to values, ready for a report.
         per_frame: the same for each frame.
+        deciles: mean error of the least sure tenth of each frame's pixels (1) to the surest (10),
+            for predictions with a confidence.
         skipped: frames that do not count, each with the reason.
     """
 
     rows: list[dict[str, Any]]
     per_frame: list[dict[str, Any]]
+    deciles: list[dict[str, Any]]
     skipped: dict[str, str]
 
 
@@ -96,6 +100,14 @@ class _Prepared:
     disparity_px: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None
     camera: Camera | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Measured:
+    """One frame's row of numbers, and its error by decile of confidence."""
+
+    row: dict[str, Any]
+    deciles: Float[Tensor, "10"] | None
 
 
 def evaluate(
@@ -118,23 +130,26 @@ def evaluate(
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
     rule = find_protocol(protocol)
-    per_frame: list[dict[str, Any]] = []
+    measured: list[_Measured] = []
     skipped: dict[str, str] = {}
     for index in progress(range(len(dataset))):
         prepared = _prepare(dataset, index, predictions, rule)
         if isinstance(prepared, str):
             skipped[dataset.frames[index].name] = prepared
             continue
-        per_frame += _measure(prepared, rule, caps_m)
-    if not per_frame:
+        measured += _measure(prepared, rule, caps_m)
+    if not measured:
         raise InputError(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
             f"{protocol!r} needs ({rule.truth}). Choose another protocol or folder."
         )
     stamp = {"protocol": protocol, "dataset": dataset.name}
+    per_frame = [item.row for item in measured]
+    error_name = "epe_px" if rule.truth == "disparity" else "abs_rel"
     return Evaluation(
         rows=[stamp | row for row in _mean_rows(per_frame)],
         per_frame=[stamp | row for row in per_frame],
+        deciles=[stamp | row for row in _decile_rows(measured, error_name)],
         skipped=skipped,
     )
 
@@ -195,13 +210,13 @@ def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]
     return truth
 
 
-def _measure(prepared: _Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[dict[str, Any]]:
+def _measure(prepared: _Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[_Measured]:
     if rule.truth == "disparity":
         return [_measure_disparity(prepared)]
     return [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
 
 
-def _measure_depth(prepared: _Prepared, rule: Protocol, cap_m: float) -> dict[str, Any]:
+def _measure_depth(prepared: _Prepared, rule: Protocol, cap_m: float) -> _Measured:
     assert isinstance(prepared.camera, StereoRig)
     predicted_m = clamped_depth(prepared.disparity_px, prepared.camera, cap_m)
     counts = prepared.truth > (SMALLEST_DEPTH_M if rule.with_crop_and_cap else 0.0)
@@ -213,7 +228,7 @@ def _measure_depth(prepared: _Prepared, rule: Protocol, cap_m: float) -> dict[st
     row["coverage"] = float(mask.sum() / counts.sum())
     row |= asdict(depth_errors(predicted_m, true_m))
     relative = (predicted_m - true_m).abs() / true_m
-    return row | _confidence_score(relative, prepared.confidence, mask)
+    return _score(row, relative, prepared.confidence, mask)
 
 
 def clamped_depth(
@@ -228,7 +243,7 @@ def clamped_depth(
     return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
 
 
-def _measure_disparity(prepared: _Prepared) -> dict[str, Any]:
+def _measure_disparity(prepared: _Prepared) -> _Measured:
     counts = torch.isfinite(prepared.truth)
     mask = counts & torch.isfinite(prepared.disparity_px)
     predicted_px, true_px = prepared.disparity_px[mask], prepared.truth[mask]
@@ -240,24 +255,26 @@ def _measure_disparity(prepared: _Prepared) -> dict[str, Any]:
         seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
         errors = disparity_errors(prepared.disparity_px[seen], seen_px[seen])
         row |= {"epe_noc_px": errors.epe_px, "d1_noc": errors.d1_all}
-    return row | _confidence_score((predicted_px - true_px).abs(), prepared.confidence, mask)
+    return _score(row, (predicted_px - true_px).abs(), prepared.confidence, mask)
 
 
-def _confidence_score(
+def _score(
+    row: dict[str, Any],
     error: Float[Tensor, " n"],
     confidence: Float[Tensor, "h w"] | None,
     mask: Bool[Tensor, "h w"],
-) -> dict[str, float]:
+) -> _Measured:
+    """Add what the confidence is worth, where there is one."""
     if confidence is None:
-        return {}
-    return {"ause": sparsification_area(error, confidence[mask])}
+        return _Measured(row=row, deciles=None)
+    score = asdict(score_confidence(error, confidence[mask]))
+    return _Measured(row=row | score, deciles=error_by_decile(error, confidence[mask]))
 
 
 def _mean_rows(per_frame: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One row a cap; each frame counts the same."""
-    caps = list(dict.fromkeys(row.get("cap_m") for row in per_frame))
     rows: list[dict[str, Any]] = []
-    for cap in caps:
+    for cap in _caps(per_frame):
         of_cap = [row for row in per_frame if row.get("cap_m") == cap]
         row: dict[str, Any] = {} if cap is None else {"cap_m": cap}
         row |= {"frames": len(of_cap), "pixels": sum(item["pixels"] for item in of_cap)}
@@ -265,3 +282,24 @@ def _mean_rows(per_frame: list[dict[str, Any]]) -> list[dict[str, Any]]:
         names = [n for n in names if all(n in item for item in of_cap)]
         rows.append(row | {n: sum(item[n] for item in of_cap) / len(of_cap) for n in names})
     return rows
+
+
+def _decile_rows(measured: list[_Measured], error_name: str) -> list[dict[str, Any]]:
+    """Ten rows a cap; each frame counts the same."""
+    rows: list[dict[str, Any]] = []
+    for cap in _caps([item.row for item in measured]):
+        of_cap = [item.deciles for item in measured
+                  if item.row.get("cap_m") == cap and item.deciles is not None]  # fmt: skip
+        if not of_cap:
+            continue
+        first = {} if cap is None else {"cap_m": cap}
+        errors = torch.stack(of_cap).nanmean(0).tolist()
+        rows += [
+            first | {"frames": len(of_cap), "confidence_decile": k, error_name: error}
+            for k, error in enumerate(errors, 1)
+        ]
+    return rows
+
+
+def _caps(rows: list[dict[str, Any]]) -> list[float | None]:
+    return list(dict.fromkeys(row.get("cap_m") for row in rows))

@@ -48,6 +48,21 @@ class DisparityErrors:
     d1_all: float
 
 
+@dataclass(frozen=True)
+class ConfidenceScore:
+    """How well a confidence orders the pixels of one image by their error.
+
+    Attributes:
+        ause: area between the sparsification curves of the confidence and of an oracle.
+        ause_random: the same of a confidence that knows nothing.
+        ause_share: their ratio: 0 an oracle, 1 no better than chance, above 1 misleading.
+    """
+
+    ause: float
+    ause_random: float
+    ause_share: float
+
+
 def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
     """Measure predicted against true depth, pixel by pixel.
 
@@ -111,6 +126,30 @@ def sparsification_area(
     return float(((by_confidence - by_oracle) / error.double().mean()).mean())
 
 
+def score_confidence(
+    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
+) -> ConfidenceScore:
+    """Hold a confidence against an oracle and against chance; see :func:`sparsification_area`.
+
+    Where all errors are equal every order is as good as the oracle's, and the share is 0.
+    """
+    ause = sparsification_area(error, confidence)
+    ause_random = sparsification_area(error, torch.zeros_like(error))
+    return ConfidenceScore(ause, ause_random, ause / ause_random if ause_random > 0 else 0.0)
+
+
+def error_by_decile(
+    error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
+) -> Float[Tensor, "10"]:
+    """Mean error of the least sure tenth of the pixels, of the next, ..., of the surest.
+
+    Pixels of equal confidence share their mean error. NaN for a tenth without a pixel.
+    """
+    ascending = torch.argsort(confidence)
+    tenths = _shared_error(error.double(), confidence)[ascending].tensor_split(10)
+    return torch.stack([tenth.mean() for tenth in tenths])
+
+
 def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
     """Mask of Garg et al. (2016), its corners truncated as in the published script."""
     mask = torch.zeros(height, width, dtype=torch.bool)
@@ -123,17 +162,21 @@ def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
 def _remaining_error(
     error: Float[Tensor, " n"], keep_first: Float[Tensor, " n"], steps: int
 ) -> Float[Tensor, " steps"]:
-    """Mean error of what is left, the pixels of low ``keep_first`` removed first.
-
-    Ties share their mean error: the answer does not depend on how equal pixels are ordered.
-    """
-    values, group = keep_first.unique(return_inverse=True)
-    count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))
-    mean = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, error) / count
+    """Mean error of what is left, the pixels of low ``keep_first`` removed first."""
     descending = torch.argsort(keep_first, descending=True)
-    running = mean[group[descending]].cumsum(0) / torch.arange(1, len(error) + 1)
+    running = _shared_error(error, keep_first)[descending].cumsum(0) / torch.arange(
+        1, len(error) + 1
+    )
     kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
     return running[kept.ceil().long().clamp(min=1) - 1]
+
+
+def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Give pixels of an equal key their mean error: no answer may depend on the order of ties."""
+    values, group = key.unique(return_inverse=True)
+    count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))
+    mean = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, error) / count
+    return mean[group]
 
 
 def _refuse_unusable(depth_m: Float[Tensor, " n"], role: str) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     Cloud,
+    read_image,
     read_map,
     write_cloud,
     write_depth_png,
@@ -20,9 +21,18 @@ from depthpose.core.files import (
     write_map,
 )
 from depthpose.core.run import claim_folder
-from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.types import DepthEstimate, StereoInput
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """What predicts: :class:`FakestereoNet`, a floor, or anybody's."""
+
+    def estimate_pair(self, pair: StereoInput, /) -> DepthEstimate:
+        """Estimate depth of one input whose images are read already."""
+        ...
+
 
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
@@ -32,7 +42,7 @@ def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> 
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
     ``NAME.color.png``, ``NAME.right.png`` (synthesised) and ``NAME.disparity_px.npy``, each where
-    the estimate has it.
+    the estimate has it. The disparity is that of the frame's own rig.
     """
     base = folder / pair.name
     if estimate.depth_m is not None:
@@ -106,8 +116,28 @@ def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
     return read_map(path) if path.is_file() else None
 
 
+def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
+    """Read back what :func:`write_estimate` wrote.
+
+    Raises:
+        InputError: there is no prediction of that name, or a file of it is damaged.
+    """
+    disparity_px = read_disparity(folder, name, camera)
+    base = folder / name
+    depth_m, right = _file(base, "depth_m.npy"), _file(base, "right.png")
+    metres = read_map(depth_m) if depth_m.is_file() else None
+    if metres is None and isinstance(camera, StereoRig):
+        metres = depth_from_disparity(disparity_px, camera)
+    return DepthEstimate(
+        depth_m=metres,
+        disparity_px=disparity_px,
+        confidence=read_confidence(folder, name),
+        right=read_image(right) if right.is_file() else None,
+    )
+
+
 def predict(
-    net: FakestereoNet,
+    net: Estimator,
     inputs: Iterable[Callable[[], StereoInput]],
     names: list[str],
     folder: Path,

@@ -5,7 +5,14 @@ from depthpose.depth.kitti.check import CheckReport as CheckReport
 from depthpose.depth.kitti.check import Problem as Problem
 from depthpose.depth.kitti.check import check_dataset as check_dataset
 from depthpose.depth.kitti.dataset import Dataset as Dataset
+from depthpose.depth.kitti.dataset import join_datasets as join_datasets
 from depthpose.depth.kitti.dataset import open_dataset as open_dataset
+from depthpose.depth.kitti.dataset import read_known_depth as read_known_depth
+from depthpose.depth.kitti.duplicates import DUPLICATE_LIKENESS as DUPLICATE_LIKENESS
+from depthpose.depth.kitti.duplicates import Duplicate as Duplicate
+from depthpose.depth.kitti.duplicates import find_duplicates as find_duplicates
+from depthpose.depth.kitti.duplicates import likeness_matrix as likeness_matrix
+from depthpose.depth.kitti.duplicates import shrink as shrink
 from depthpose.depth.kitti.frames import Frame as Frame
 from depthpose.depth.kitti.frames import has_lidar as has_lidar
 from depthpose.depth.kitti.frames import kitti_calibration as kitti_calibration

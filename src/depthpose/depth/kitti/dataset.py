@@ -1,12 +1,24 @@
 """A folder of stereo frames, opened."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from jaxtyping import Float
+from torch import Tensor
+
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError
-from depthpose.depth.kitti.frames import Frame, frame_input, frame_rig, frame_truth
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.depth.disparity import depth_from_disparity
+from depthpose.depth.kitti.frames import (
+    Frame,
+    frame_input,
+    frame_rig,
+    frame_truth,
+    has_lidar,
+    lidar_truth,
+)
 from depthpose.depth.kitti.layouts import find_frames
 from depthpose.depth.kitti.splits import Split, read_split
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
@@ -71,6 +83,41 @@ def open_dataset(folder: Path, split: str | Path | None = None) -> Dataset:
     )
 
 
+def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> Dataset:
+    """Make one dataset of several, less the frames of some names.
+
+    Raises:
+        InputError: a name that no frame has, which would leave in what was to be kept out.
+    """
+    frames = [frame for dataset in datasets for frame in dataset.frames]
+    unknown = sorted(set(without) - {frame.name for frame in frames})
+    if unknown:
+        raise InputError(
+            f"no frame of {', '.join(d.name for d in datasets)} is called {unknown[0]!r}; "
+            f"{nearest_name(unknown[0], {frame.name for frame in frames})[:300]}"
+        )
+    return Dataset(
+        name=" + ".join(dataset.name for dataset in datasets),
+        layout=" + ".join(dict.fromkeys(dataset.layout for dataset in datasets)),
+        frames=[frame for frame in frames if frame.name not in without],
+    )
+
+
+def read_known_depth(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | None:
+    """Read what is known of the left image's depth [m]: LiDAR, depth map or disparity, in order.
+
+    None where the frame has no truth at all.
+    """
+    frame = dataset.frames[index]
+    if has_lidar(frame, "camera_z"):
+        return lidar_truth(frame, "camera_z")
+    truth = dataset.read_truth(index)
+    if truth.depth_m is not None or truth.disparity_px is None:
+        return truth.depth_m
+    rig = dataset.read_rig(index)
+    return None if rig is None else depth_from_disparity(truth.disparity_px, rig)
+
+
 def _select(folder: Path, frames: list[Frame], split: Split) -> list[Frame]:
     by_name = {frame.name: frame for frame in frames}
     missing = [name for name in split.names if name not in by_name]
@@ -78,6 +125,6 @@ def _select(folder: Path, frames: list[Frame], split: Split) -> list[Frame]:
         raise InputError(
             f"{folder}: {len(missing)} of the {len(split.names)} frames of {split.name} are "
             f"missing, first {', '.join(missing[:3])}. 'depthpose data check' lists them all; "
-            "leave --split away to use what is there."
+            "without a split what is there is used."
         )
     return [by_name[name] for name in split.names]

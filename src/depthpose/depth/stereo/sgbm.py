@@ -1,13 +1,12 @@
 """Semi-global block matching: OpenCV's StereoSGBM as a matcher."""
 
-import importlib
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, import_opencv
 from depthpose.depth.config import SGBMConfig
 from depthpose.depth.stereo.matcher import check_pair
 from depthpose.depth.types import Match
@@ -31,7 +30,7 @@ class SGBMMatcher:
 
     def __init__(self, config: SGBMConfig | None = None) -> None:
         self.config = config or SGBMConfig()
-        self._cv2 = _import_opencv()
+        self._cv2 = import_opencv("matching with StereoSGBM")
 
     def match(self, left: Tensor, right: Tensor) -> Match:
         """Match one pair. The confidence, 1 or 0, only says which pixels were filled.
@@ -108,12 +107,3 @@ def _opencv_image(image: Tensor) -> np.ndarray:
     """Convert to the 8-bit BGR that OpenCV reads from a file."""
     bytes_ = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
     return np.ascontiguousarray(bytes_.flip(0).permute(1, 2, 0).numpy())
-
-
-def _import_opencv() -> Any:  # noqa: ANN401  OpenCV's classes carry no types
-    try:
-        return importlib.import_module("cv2")
-    except ImportError as error:
-        raise MissingExtraError(
-            "opencv-python-headless", "opencv", "matching with StereoSGBM"
-        ) from error

@@ -1,0 +1,143 @@
+"""Videos, frame by frame; OpenCV (the extra ``opencv``) decodes and encodes."""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError, import_opencv
+from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+"""Files that are taken for a video."""
+
+_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video:
+    """A video on disk. Iterating decodes it anew from its first frame, one frame at a time.
+
+    Attributes:
+        path: the file.
+        fps: frames a second.
+        frames: how many the file says it has; 0 where it does not say.
+    """
+
+    path: Path
+    fps: float
+    frames: int
+
+    def __iter__(self) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:
+        """Yield the name (``STEM_000000``, ``STEM_000001``, ...) and RGB in [0, 1] of each frame.
+
+        Raises:
+            InputError: not one frame can be decoded.
+        """
+        capture = _open(self.path)
+        index = 0
+        try:
+            while True:
+                is_read, blue_green_red = capture.read()
+                if not is_read:
+                    break
+                red_green_blue = np.ascontiguousarray(blue_green_red[..., ::-1])
+                image = torch.from_numpy(red_green_blue).permute(2, 0, 1).float() / 255
+                yield f"{self.path.stem}_{index:06d}", image
+                index += 1
+        finally:
+            capture.release()
+        if index == 0:
+            raise _unreadable(self.path)
+
+
+def read_video(path: AnyPath) -> Video:
+    """Open a video and look at its first frame.
+
+    Raises:
+        InputError: no such file, no video, or not one frame can be decoded.
+        MissingExtraError: OpenCV is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise refused_suffix(path, "video", VIDEO_SUFFIXES)
+    cv2 = import_opencv("reading a video")
+    if not path.is_file():  # OpenCV would take a pattern, an address or a camera's number too
+        raise InputError(f"{path}: no such file; check the path")
+    capture = _open(path)
+    fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    is_read = capture.read()[0]
+    capture.release()
+    if not is_read or not 0 < fps < math.inf:
+        raise _unreadable(path)
+    return Video(path=path, fps=float(fps), frames=max(0, int(frames)))
+
+
+def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: float) -> int:
+    """Write RGB images in [0, 1] as a video, whole or not at all; give how many there were.
+
+    Args:
+        path: ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG).
+        images: the frames, all of one size; taken one at a time.
+        fps: frames a second.
+
+    Raises:
+        InputError: another suffix, no frame, frames of two sizes, or the encoder refuses.
+        MissingExtraError: OpenCV is not installed.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _CODECS:
+        raise refused_suffix(path, "writable video", tuple(_CODECS))
+    if not 0 < fps < math.inf:
+        raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
+    cv2 = import_opencv("writing a video")
+    with atomic_write(path) as part:
+        return _encode(cv2, (Path(path), part), images, fps)
+
+
+def _encode(
+    cv2: Any,  # noqa: ANN401  OpenCV's classes carry no types
+    paths: tuple[Path, Path],
+    images: Iterable[Float[Tensor, "3 _ _"]],
+    fps: float,
+) -> int:
+    path, part = paths
+    writer, size, count = None, (0, 0), 0
+    try:
+        for image in images:
+            width_height = (image.shape[2], image.shape[1])
+            if writer is None:
+                size = width_height
+                codec = cv2.VideoWriter_fourcc(*_CODECS[path.suffix.lower()])
+                writer = cv2.VideoWriter(str(part), codec, float(fps), size)
+            if width_height != size:
+                raise InputError(
+                    f"{path}: frame {count} is {width_height[0]}x{width_height[1]}, but the first "
+                    f"one is {size[0]}x{size[1]}; a video has one size"
+                )
+            pixels = image.detach().cpu().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
+            writer.write(np.ascontiguousarray(pixels.numpy()[..., ::-1]))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.release()
+    if count == 0 or not part.is_file() or part.stat().st_size == 0:
+        raise InputError(f"{path}: the encoder wrote nothing of {count} frames; try .avi, or PNGs")
+    return count
+
+
+def _open(path: Path) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
+    capture = import_opencv("reading a video").VideoCapture(str(path))
+    if not capture.isOpened():
+        raise _unreadable(path)
+    return capture
+
+
+def _unreadable(path: Path) -> InputError:
+    return InputError(f"{path}: not a video that OpenCV can decode; convert it to MP4 (H.264)")

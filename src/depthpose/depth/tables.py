@@ -1,0 +1,184 @@
+"""Tables 2.1, 2.2 and 2.3 of the thesis as data, and our rows joined to them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.depth.metrics import DepthErrors
+
+Row = dict[str, Any]
+
+_METRICS = tuple(DepthErrors.__dataclass_fields__)
+_DENSE = "post-processed truth"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedRow:
+    """One printed row.
+
+    Attributes:
+        method: who, as the thesis prints it.
+        cap_m: truth beyond it does not count.
+        errors: the seven numbers.
+        protocol: what the numbers were measured by; the thesis says ``eigen-raw`` of all but one.
+        note: the row's footnote.
+    """
+
+    method: str
+    cap_m: float
+    errors: DepthErrors
+    protocol: str = "eigen-raw"
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedTable:
+    """One printed table, and what it takes to make it again.
+
+    Attributes:
+        number: in the thesis.
+        title: what it compares.
+        rows: every author's row, in the order of print.
+        own: names of the thesis's own methods, in the order in which weights are given.
+        with_right: whether the methods see the real right view.
+    """
+
+    number: str
+    title: str
+    rows: tuple[PublishedRow, ...]
+    own: tuple[str, ...]
+    with_right: bool
+
+
+def find_table(number: str) -> PublishedTable:
+    """Give a table by its number in the thesis.
+
+    Raises:
+        InputError: there is none of that number.
+    """
+    if number not in TABLES:
+        raise InputError(f"table {number!r}: {nearest_name(number, TABLES)}")
+    return TABLES[number]
+
+
+def join_published(
+    table: PublishedTable, ours: Sequence[tuple[str, Mapping[str, Any]]]
+) -> list[Row]:
+    """Set our rows beside the printed ones, cap by cap: published, ours, difference.
+
+    Args:
+        table: the printed table.
+        ours: for each of our rows the name of the thesis's own method that it stands for (one of
+            ``table.own``, or empty where it stands for none, as a floor), and the row as
+            ``depth.evaluate`` gives it, with ``method``.
+
+    Returns:
+        Rows with ``source``: ``published``, ``ours``, or ``difference`` (ours minus the thesis's).
+        Every row names its protocol; a difference across two protocols names both.
+    """
+    printed_caps = [row.cap_m for row in table.rows]
+    caps = sorted({*printed_caps, *(row["cap_m"] for _, row in ours)}, reverse=True)
+    rows: list[Row] = []
+    for cap_m in caps:
+        rows += [_published(row) for row in table.rows if row.cap_m == cap_m]
+        for own, row in ours:
+            if row["cap_m"] == cap_m:
+                rows.append(_ordered("ours", row))
+                rows += [_difference(row, printed) for printed in table.rows
+                         if printed.method == own and printed.cap_m == cap_m]  # fmt: skip
+    return rows
+
+
+def _published(row: PublishedRow) -> Row:
+    facts = {"method": row.method, "cap_m": row.cap_m, "protocol": row.protocol, "note": row.note}
+    return _ordered("published", facts | asdict(row.errors))
+
+
+def _difference(ours: Mapping[str, Any], printed: PublishedRow) -> Row:
+    errors = asdict(printed.errors)
+    protocol = ours["protocol"]
+    if protocol != printed.protocol:
+        protocol = f"{protocol} against {printed.protocol}"
+    facts = {
+        "method": f"{ours['method']} - {printed.method}",
+        "cap_m": printed.cap_m,
+        "protocol": protocol,
+    }
+    return _ordered("difference", facts | {name: ours[name] - errors[name] for name in _METRICS})
+
+
+def _ordered(source: str, row: Mapping[str, Any]) -> Row:
+    """Columns in one order: what, the seven numbers, how they were measured, the rest."""
+    first = ("method", "cap_m", *_METRICS, "protocol")
+    rest = [name for name in row if name not in first]
+    return {"source": source} | {name: row[name] for name in (*first, *rest)}
+
+
+def _row(
+    method: str, cap_m: int, numbers: str, protocol: str = "eigen-raw", note: str = ""
+) -> PublishedRow:
+    """Read the seven numbers as they are printed."""
+    errors = DepthErrors(*map(float, numbers.split()))
+    return PublishedRow(
+        method=method, cap_m=float(cap_m), errors=errors, protocol=protocol, note=note
+    )
+
+
+_TUNED = "with end-to-end fine-tuning"
+_APART = "without fine-tuning"
+_FINETUNED = "fine-tune cGANs"
+_OURS_80 = "0.141 1.057 5.20 0.233 0.810 0.932 0.972"
+_OURS_50 = "0.136 0.837 4.11 0.222 0.822 0.938 0.975"
+
+_ALL = (
+    PublishedTable(
+        number="2.1",
+        title="Table 2.1: monocular depth on the Eigen test split",
+        rows=(
+            _row("Eigen et al. [21]", 80, "0.215 1.515 7.156 0.270 0.692 0.899 0.967"),
+            _row("Zhou et al. [137]", 80, "0.183 1.595 6.709 0.270 0.734 0.902 0.959"),
+            _row("Godard et al. [28]", 80, "0.114 0.898 4.935 0.206 0.861 0.949 0.976"),
+            _row("Kuznietsov et al. [59]", 80, "0.113 0.741 4.621 0.189 0.862 0.960 0.986"),
+            _row("Luo et al. [73]", 80, "0.102 0.700 4.681 0.200 0.872 0.954 0.978"),
+            _row("Luo et al. [73] a", 80, "0.094 0.626 4.252 0.177 0.891 0.965 0.984", note=_TUNED),
+            _row("Fu et al. [24] (ResNet)", 80, "0.072 0.307 2.727 0.120 0.932 0.984 0.994",
+                 _DENSE, "with dense depth map as ground truth"),
+            _row("thesis, Ours", 80, _OURS_80),
+            _row("Luo et al. [73]", 50, "0.097 0.539 3.503 0.187 0.885 0.960 0.981"),
+            _row("Luo et al. [73] a", 50, "0.090 0.499 3.266 0.167 0.902 0.968 0.986", note=_TUNED),
+            _row("Fu et al. [24] (ResNet)", 50, "0.071 0.268 2.271 0.116 0.936 0.985 0.995",
+                 _DENSE, "with dense depth map as ground truth"),
+            _row("thesis, Ours", 50, _OURS_50),
+        ),
+        own=("thesis, Ours",),
+        with_right=False,
+    ),
+    PublishedTable(
+        number="2.2",
+        title="Table 2.2: depth from the real stereo pair on the Eigen test split",
+        rows=(
+            _row("Luo et al. [73]", 80, "0.062 0.424 3.677 0.164 0.939 0.968 0.981"),
+            _row("thesis, Ours", 80, "0.076 0.531 3.585 0.176 0.937 0.964 0.978"),
+            _row("Luo et al. [73]", 50, "0.058 0.316 2.675 0.152 0.947 0.971 0.983"),
+            _row("thesis, Ours", 50, "0.074 0.423 2.862 0.168 0.940 0.966 0.980"),
+        ),
+        own=("thesis, Ours",),
+        with_right=True,
+    ),
+    PublishedTable(
+        number="2.3",
+        title="Table 2.3: monocular depth with and without fine-tuning",
+        rows=(
+            _row(_APART, 80, _OURS_80),
+            _row(_FINETUNED, 80, "0.126 0.851 4.865 0.217 0.837 0.945 0.976"),
+            _row(_APART, 50, _OURS_50),
+            _row(_FINETUNED, 50, "0.121 0.674 3.817 0.207 0.849 0.950 0.978"),
+        ),
+        own=(_APART, _FINETUNED),
+        with_right=False,
+    ),
+)  # fmt: skip
+
+TABLES = {table.number: table for table in _ALL}
+"""By the thesis's numbers; every figure as printed."""

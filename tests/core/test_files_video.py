@@ -1,0 +1,76 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core import errors
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.files import read_video, write_image, write_video
+
+pytest.importorskip("cv2")
+
+
+def moving_square(count: int, width: int = 64) -> list[torch.Tensor]:
+    frames = torch.zeros(count, 3, 48, width)
+    for k in range(count):
+        frames[k, 0, 8:40, 4 * k : 4 * k + 24] = 1.0  # red, so that swapped channels show
+    return list(frames)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+def test_a_video_keeps_its_frames_rate_and_colours(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"drive{suffix}"
+    images = moving_square(7)
+    assert write_video(path, iter(images), fps=12.5) == 7
+    video = read_video(path)
+    assert (video.fps, video.frames) == (12.5, 7)
+    read = list(video)
+    assert [name for name, _ in read] == [f"drive_{k:06d}" for k in range(7)]
+    for (_, image), written in zip(read, images, strict=True):
+        assert image.shape == written.shape
+        assert float((image - written).abs().mean()) < 0.03
+    assert [path.name for path in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_video_is_read_again_from_its_start(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.avi", moving_square(3), fps=10.0)
+    video = read_video(tmp_path / "v.avi")
+    next(iter(video))
+    assert len(list(video)) == len(list(video)) == 3
+
+
+def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"\0" * 4096)
+    write_image(tmp_path / "a.png", torch.rand(3, 8, 8))
+    with pytest.raises(InputError, match=r"a\.mp4: not a video that OpenCV can decode"):
+        read_video(tmp_path / "a.mp4")
+    with pytest.raises(InputError, match=r"b\.mp4: no such file"):
+        read_video(tmp_path / "b.mp4")
+    with pytest.raises(InputError, match=r"\.png is no video format; use \.mp4"):
+        read_video(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "images", "fps", "message"),
+    [
+        ("v.mov", moving_square(1), 10.0, r"\.mov is no writable video format; use \.mp4, \.avi"),
+        ("v.mp4", moving_square(1), 0.0, "fps is 0, but a video has a positive rate"),
+        ("v.mp4", [], 10.0, "wrote nothing of 0 frames"),
+        ("v.mp4", moving_square(1) + moving_square(1, 80), 10.0, "frame 1 is 80x48, but the first"),
+    ],
+)
+def test_what_cannot_be_written_leaves_nothing(
+    tmp_path: Path, name: str, images: list[torch.Tensor], fps: float, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        write_video(tmp_path / name, images, fps)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str) -> object:
+        raise ImportError(name)
+
+    monkeypatch.setattr(errors, "import_module", refuse)
+    with pytest.raises(MissingExtraError, match=r"reading a video.*pip install 'depthpose\[opencv"):
+        read_video("v.mp4")

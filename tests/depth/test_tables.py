@@ -1,0 +1,90 @@
+import pytest
+
+from depthpose.core.errors import InputError
+from depthpose.depth.tables import TABLES, find_table, join_published
+
+OURS = {
+    "method": "net", "weights": "w", "protocol": "eigen-raw", "cap_m": 80.0, "frames": 697,
+    "abs_rel": 0.15, "sq_rel": 1.0, "rmse": 5.0, "rmse_log": 0.2, "d1": 0.8, "d2": 0.9, "d3": 0.95,
+}  # fmt: skip
+
+
+def test_every_printed_row_is_there() -> None:
+    counts = {number: len(table.rows) for number, table in TABLES.items()}
+    assert counts == {"2.1": 12, "2.2": 4, "2.3": 4}
+    for table in TABLES.values():
+        for own in table.own:
+            assert [row.cap_m for row in table.rows if row.method == own] == [80, 50]
+
+
+def test_printed_numbers_are_possible() -> None:
+    for table in TABLES.values():
+        for row in table.rows:
+            e = row.errors
+            assert 0 < e.abs_rel < e.sq_rel < e.rmse < 10
+            assert e.abs_rel / 2 < e.rmse_log
+            assert 0.6 < e.d1 < e.d2 < e.d3 < 1
+
+
+def test_a_smaller_cap_has_smaller_errors() -> None:
+    for table in TABLES.values():
+        by_cap = {(row.method, row.cap_m): row.errors for row in table.rows}
+        for (method, cap_m), near in by_cap.items():
+            if cap_m == 50:
+                far = by_cap[method, 80]
+                assert near.abs_rel < far.abs_rel
+                assert near.rmse < far.rmse
+
+
+def test_tables_2_1_and_2_3_share_the_row_without_fine_tuning() -> None:
+    for cap_m in (80, 50):
+        rows = [
+            next(r for r in TABLES[n].rows if r.method == TABLES[n].own[0] and r.cap_m == cap_m)
+            for n in ("2.1", "2.3")
+        ]
+        assert rows[0].errors == rows[1].errors
+
+
+def test_our_row_follows_the_printed_ones_and_then_the_difference() -> None:
+    rows = join_published(find_table("2.1"), [("thesis, Ours", OURS)])
+    assert [row["source"] for row in rows] == ["published"] * 8 + ["ours", "difference"] + [
+        "published"
+    ] * 4
+    difference = rows[9]
+    assert difference["abs_rel"] == pytest.approx(0.15 - 0.141)
+    assert difference["rmse"] == pytest.approx(5.0 - 5.20)
+    assert difference["protocol"] == "eigen-raw"
+    assert rows[8] == {"source": "ours"} | OURS
+    assert list(rows[0])[:10] == list(rows[8])[:10] == list(difference)[:10]
+
+
+def test_each_weights_of_table_2_3_has_its_own_row() -> None:
+    table = find_table("2.3")
+    rows = join_published(table, [(own, OURS) for own in table.own])
+    differences = [row["abs_rel"] for row in rows if row["source"] == "difference"]
+    assert differences == pytest.approx([0.15 - 0.141, 0.15 - 0.126])
+
+
+def test_another_protocol_is_said_in_the_difference() -> None:
+    other = OURS | {"protocol": "eigen-raw-camera"}
+    rows = join_published(find_table("2.2"), [("thesis, Ours", other)])
+    assert {row["protocol"] for row in rows} == {
+        "eigen-raw", "eigen-raw-camera", "eigen-raw-camera against eigen-raw",
+    }  # fmt: skip
+
+
+def test_floors_and_other_caps_have_no_difference() -> None:
+    rows = join_published(find_table("2.2"), [("", OURS), ("thesis, Ours", OURS | {"cap_m": 30.0})])
+    assert [row["source"] for row in rows].count("ours") == 2
+    assert "difference" not in {row["source"] for row in rows}
+
+
+def test_the_row_of_other_truth_is_marked() -> None:
+    protocols = {row.method: row.protocol for row in TABLES["2.1"].rows}
+    assert protocols.pop("Fu et al. [24] (ResNet)") == "post-processed truth"
+    assert set(protocols.values()) == {"eigen-raw"}
+
+
+def test_an_unknown_table_is_refused() -> None:
+    with pytest.raises(InputError, match=r"table '2\.4': .*Known: '2\.1', '2\.2', '2\.3'"):
+        find_table("2.4")

@@ -1,0 +1,259 @@
+"""Whole commands on a made street: tables, figures, floors, near-duplicates, several processes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.cli import main
+from depthpose.cli.methods import Method
+from depthpose.cli.reproducing import Order, reproduce_table, write_figure
+from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.files import read_image, write_depth_png, write_image
+from depthpose.demo.scene import make_street
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.kitti import open_dataset
+from depthpose.depth.tables import find_table
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+CAMERA_Z = ("--protocol", "eigen-raw-camera")
+
+
+class FlatMono:
+    """Sees the left view and says one depth everywhere; with the real right view, another."""
+
+    def __init__(self, depth_m: float) -> None:
+        self.depth_m = depth_m
+        self.seen: list[str] = []
+
+    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+        assert isinstance(pair.camera, StereoRig)
+        is_mono = pair.right is None
+        self.seen.append("left" if is_mono else "both")
+        depth_m = torch.full(pair.left.shape[1:], self.depth_m if is_mono else 2 * self.depth_m)
+        disparity_px = disparity_from_depth(depth_m, pair.camera)
+        right = pair.left if is_mono else None
+        return DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, right=right)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four pairs of the made street with depth, 621 x 188."""
+    folder = tmp_path_factory.mktemp("street")
+    sample = make_street(0.5)
+    assert sample.input.right is not None
+    assert sample.input.camera is not None
+    assert sample.truth.depth_m is not None
+    for k, name in enumerate("abcd"):
+        light = 1 - 0.1 * k
+        write_image(folder / "left" / f"{name}.png", light * sample.input.left)
+        write_image(folder / "right" / f"{name}.png", light * sample.input.right)
+        write_depth_png(folder / "lidar_depth" / f"{name}.png", sample.truth.depth_m)
+    write_camera(folder / "camera.json", sample.input.camera)
+    return folder
+
+
+def rows_of(folder: Path) -> list[dict[str, object]]:
+    return json.loads((folder / "rows.json").read_text())
+
+
+def reproduce(table: str, street: Path, out: Path, *more: str) -> int:
+    given = ["reproduce", table, "--kitti", str(street), "--split", "all", "--out", str(out)]
+    return main([*given, *CAMERA_Z, *more])
+
+
+def order_of(table: str, street: Path, caps_m: tuple[float, ...] = (80.0, 50.0)) -> Order:
+    return Order(
+        table=find_table(table),
+        dataset=open_dataset(street),
+        protocol="eigen-raw-camera",
+        caps_m=caps_m,
+        pictures=1,
+    )
+
+
+def mono(name: str, depth_m: float) -> Method:
+    settings = {"matcher": "fakestereo", "weights": name, "weights_sha256": name * 8}
+    return Method(name, FlatMono(depth_m), settings, with_right=False)
+
+
+def test_table_2_2_is_made_by_one_command(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = ("--matcher", "sgbm", "--train", str(street), "--train-without", "a")
+    assert reproduce("2.2", street, tmp_path, *more) == 0
+    printed = capsys.readouterr().out
+    assert "| published | Luo et al. [73] | 80 | 0.0620 |" in printed
+    rows = rows_of(tmp_path)
+    sources = [row["source"] for row in rows if row["cap_m"] == 80]
+    assert sources == ["published", "published", "ours", "difference", "ours", "ours"]
+    sgbm, difference = rows[2], rows[3]
+    assert difference["abs_rel"] == pytest.approx(float(str(sgbm["abs_rel"])) - 0.076)
+    assert difference["protocol"] == "eigen-raw-camera against eigen-raw"
+    for name in ("table.md", "rows.csv", "frames.json", "confidence.json", "run.json"):
+        assert (tmp_path / name).is_file()
+    page, markdown = ((tmp_path / f"report.{end}").read_text() for end in ("html", "md"))
+    for text in (page, markdown):
+        assert "floor: nearest" in text
+        assert "num_disparities" in text
+        assert "torch" in text
+    assert "real right image" in page
+    assert "## Settings" in markdown
+
+
+def test_floors_know_the_street_they_were_fitted_to(street: Path, tmp_path: Path) -> None:
+    words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
+    assert main([*words, "--floor", "rows", "nearest", "--train", str(street)]) == 0
+    by_method = {row["method"]: row for row in rows_of(tmp_path) if row["cap_m"] == 80}
+    assert set(by_method) == {"floor: rows", "floor: nearest"}
+    nearest, rows = (float(str(by_method[f"floor: {n}"]["abs_rel"])) for n in ("nearest", "rows"))
+    assert nearest < 0.01 < rows < 0.5
+    assert "ause" not in by_method["floor: rows"]
+
+
+def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path) -> None:
+    order = order_of("2.3", street)
+    chosen = list(zip(order.table.own, (mono("apart", 20.0), mono("tuned", 10.0)), strict=True))
+    assert reproduce_table(order, chosen, tmp_path) == 0
+    rows = [row for row in rows_of(tmp_path) if row["cap_m"] == 80]
+    names = [(row["source"], row.get("weights") or row["method"]) for row in rows]
+    assert names == [
+        ("published", "without fine-tuning"),
+        ("published", "fine-tune cGANs"),
+        ("ours", "apart"),
+        ("difference", "fakestereo - without fine-tuning"),
+        ("ours", "tuned"),
+        ("difference", "fakestereo - fine-tune cGANs"),
+    ]
+    page = (tmp_path / "report.html").read_text()
+    assert "Figure 2-1: apart" in page
+    assert "predicted right image" in page
+    assert "(e) depth from left and real right" in page
+
+
+def test_a_method_of_one_image_is_never_shown_the_right_view(street: Path, tmp_path: Path) -> None:
+    method = mono("w", 15.0)
+    reproduce_table(order_of("2.1", street), [("thesis, Ours", method)], tmp_path)
+    assert isinstance(method.net, FlatMono)
+    assert method.net.seen == ["left"] * 4 + ["both"]  # the last one is figure 2-1's upper bound
+
+
+def test_a_rerun_measures_the_same_files_and_refuses_other_settings(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert reproduce("2.2", street, tmp_path, "--matcher", "sgbm", "--cap", "80") == 0
+    before = (tmp_path / "rows.json").read_bytes()
+    written = (tmp_path / "predictions/sgbm-filled/a.disparity_px.npy").stat().st_mtime_ns
+    assert reproduce("2.2", street, tmp_path, "--matcher", "sgbm", "--cap", "80") == 0
+    assert (tmp_path / "rows.json").read_bytes() == before
+    again = (tmp_path / "predictions/sgbm-filled/a.disparity_px.npy").stat().st_mtime_ns
+    assert again == written
+    assert reproduce("2.2", street, tmp_path, "--matcher", "sgbm", "--cap", "50") == 2
+    assert "made with caps_m = [80.0], but now it is [50.0]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["2.1", "--matcher", "sgbm"], "table 2.1 is of one image; table 2.2 takes it"),
+        (["2.2"], "nothing to measure; give --weights FILE or --matcher sgbm"),
+        (["2.3", "--weights", "w"], "but 1 weights were given; give one for each, in this order"),
+        (["2.1", "--weights", "nope"], "neither a file nor the name of weights"),
+        (["2.2", "--matcher", "sgbm", "--protocol", "kitti-2015"], "the tables hold depth"),
+    ],
+)
+def test_an_order_that_cannot_be_filled_is_refused_before_work(
+    street: Path, tmp_path: Path, words: list[str], message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    rest = ["--kitti", str(street), "--split", "all", "--out", str(tmp_path / "o")]
+    assert main(["reproduce", *words, *rest]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_frames_of_the_split_must_be_there(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["reproduce", "2.2", "--kitti", str(street), "--matcher", "sgbm"]
+    assert main([*words, "--out", str(tmp_path / "o")]) == 2
+    assert "697 of the 697 frames of eigen-test are missing" in capsys.readouterr().err
+
+
+def test_figures_are_drawn_and_explained(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, method = open_dataset(street), mono("w", 15.0)
+    assert write_figure("2-5", data, [0, 2], method, tmp_path / "five") == 0
+    assert "predicted depth; predicted right image; LiDAR" in capsys.readouterr().out
+    picture = read_image(tmp_path / "five/figure-2-5.png")
+    assert picture.shape == (3, 5 * 188 + 5 * 8 + 18, 2 * 621 + 8)
+    assert write_figure("2-1", data, [1], method, tmp_path / "one") == 0
+    page = (tmp_path / "one/report.html").read_text()
+    assert page.count("<figure>") == 6
+    assert "(c) synthesised right image" in page
+
+
+def test_an_unknown_frame_has_no_figure(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["figure", "2-5", "--kitti", str(street), "--weights", "w", "--out", str(tmp_path)]
+    assert main([*words, "--frames", "e"]) == 2
+    assert "no frame 'e'; Known: 'a', 'b', 'c', 'd'" in capsys.readouterr().err
+
+
+def test_near_duplicates_are_listed(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "other/left/x.png", torch.rand(3, 188, 621))
+    assert main(["data", "duplicates", str(street), str(tmp_path / "other")]) == 0
+    assert "4 x 1 images: 0 pairs of likeness 0.3 or more; the likest:" in capsys.readouterr().out
+    words = ["data", "duplicates", str(street), str(street), "--out", str(tmp_path / "o")]
+    assert main(words) == 1
+    assert len(json.loads((tmp_path / "o/duplicates.json").read_text())) == 16
+    unlike = ["data", "duplicates", str(street), str(tmp_path / "other"), "--at-least", "-1"]
+    assert main(unlike) == 1
+    assert "4 pairs of likeness -1 or more" in capsys.readouterr().out
+    assert main([*words, "--at-least", "2"]) == 2
+    assert "a likeness is -1 .. 1" in capsys.readouterr().err
+
+
+def test_two_processes_share_the_frames_and_the_first_measures(
+    street: Path, tmp_path: Path
+) -> None:
+    words = ["depth", "evaluate", "--data", str(street), "--matcher", "sgbm", *CAMERA_Z]
+    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    command = [sys.executable, "-m", "depthpose", *words, "--out", str(tmp_path / "both")]
+    both = [
+        subprocess.Popen(command, env=os.environ | {"RANK": rank, "WORLD_SIZE": "2"}, text=True,
+                         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for rank in "01"
+    ]  # fmt: skip
+    said = [process.communicate(timeout=120) for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    assert rows_of(tmp_path / "both") == rows_of(tmp_path / "alone")
+    assert "the page:" in said[0][0]
+    assert "the page:" not in said[1][0]
+
+
+@pytest.mark.data
+def test_published_weights_make_table_2_2(real: Path, tmp_path: Path) -> None:
+    weights, published = tmp_path / "w.safetensors", "reference/psmnet/published_kitti2015.tar"
+    imported = ["weights", "import", "psmnet", str(real / published), "--align-corners", "true"]
+    assert main([*imported, "--out", str(weights)]) == 0
+    for name in ("image_02", "image_03", "velodyne_points"):
+        drive = Path("2011_09_26/2011_09_26_drive_9001_sync") / name
+        (tmp_path / "raw" / drive.parent).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "raw" / drive).symlink_to(real / "depth/kitti_raw" / drive)
+    for source in (real / "depth/kitti_raw/2011_09_26").glob("*.txt"):
+        (tmp_path / "raw/2011_09_26" / source.name).symlink_to(source)
+    words = ["reproduce", "2.2", "--kitti", str(tmp_path / "raw"), "--split", "all", "--cap", "80"]
+    assert main([*words, "--weights", str(weights), "--out", str(tmp_path / "o")]) == 0
+    ours = next(row for row in rows_of(tmp_path / "o") if row["source"] == "ours")
+    assert ours["protocol"] == "eigen-raw"
+    assert float(str(ours["abs_rel"])) < 0.1
+    assert float(str(ours["ause_share"])) < 1
