@@ -8,6 +8,7 @@ from depthpose.depth.disparity import (
     disparity_from_depth,
     left_right_difference_px,
     resize_disparity,
+    right_disparity_from_left,
     warp_right_to_left,
 )
 
@@ -75,3 +76,30 @@ def test_both_views_of_one_surface_agree() -> None:
     difference = left_right_difference_px(left_px, right_px)
     assert bool(torch.isnan(difference[:, :2]).all())
     assert difference[0, 2:].tolist() == [0, 0, 0, 0, 0, 2, 0]
+
+
+def test_disparity_is_carried_to_the_right_view_and_back() -> None:
+    """Mirrored, the disparity of the right view is that of a left one: carried again, it is ours."""
+    left_px = torch.full((4, 40), 3.0)
+    left_px[:, 20:26] = 8.0
+    right_px = right_disparity_from_left(left_px)
+    assert right_px[0, 12:18].tolist() == [8.0] * 6
+    assert right_px[0, 18:23].isnan().tolist() == [True] * 5, "seen by the right view alone"
+    back = right_disparity_from_left(right_px.flip(-1)).flip(-1)
+    is_known = torch.isfinite(back)
+    assert torch.equal(back[is_known], left_px[is_known])
+    assert bool(is_known[0, 20:26].all())
+
+
+def test_the_nearest_point_hides_those_behind_it() -> None:
+    left_px = torch.full((1, 10), torch.nan)
+    left_px[0, 5], left_px[0, 7] = 2.0, 4.0
+    assert right_disparity_from_left(left_px)[0, 3] == 4.0
+    assert int(torch.isfinite(right_disparity_from_left(left_px)).sum()) == 1
+
+
+def test_points_outside_the_right_view_are_dropped() -> None:
+    left_px = torch.tensor([[5.0, torch.nan, 1.0]])
+    right_px = right_disparity_from_left(left_px)
+    assert right_px[0, 1] == 1.0
+    assert right_px[0, [0, 2]].isnan().all()

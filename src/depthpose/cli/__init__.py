@@ -22,6 +22,7 @@ COMMANDS = {
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
+    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),

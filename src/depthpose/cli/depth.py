@@ -12,6 +12,58 @@ MatcherName = Literal["psmnet", "sgbm"]
 Precision = Literal["fp32", "bf16"]
 
 
+def predict(
+    images: tyro.conf.Positional[list[str]],
+    out: Path,
+    camera: Path | None = None,
+    focal_px: float | None = None,
+    weights: str = "default",
+    matcher: Literal["psmnet", "sgbm"] = "psmnet",
+    color_range: tuple[float, float] = (3.0, 80.0),
+    device: str = "cpu",
+    precision: Precision = "fp32",
+    max_memory: str | None = None,
+    cloud: bool = False,
+) -> int:
+    """Depth in metres from single images, by a synthesised right view.
+
+    For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png (16 bit, metres
+    x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the drawn view),
+    NAME.color.png, and NAME.ply with --cloud. A video gives the files of each frame and
+    NAME.color.mp4. A rerun skips what is finished; other settings need another --out.
+
+        depthpose depth predict street.png --camera cam.json --out out
+        depthpose depth predict drive.mp4 --focal-px 1100 --out out
+
+    Args:
+        images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
+        out: folder for the results.
+        camera: JSON file: {"width", "height", "K": 3x3}. A baseline in it is not looked at: one
+            image has none.
+        focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
+        weights: weights with a generator, by name or file ('depthpose weights list').
+        matcher: psmnet (that of the weights), or sgbm, OpenCV's.
+        color_range: metres of the brightest and the darkest colour, the same for all pictures.
+        device: cpu, cuda, cuda:1, ...
+        precision: fp32, or bf16: faster, at some hundredths of a pixel.
+        max_memory: bound on the memory of the matcher, such as 1GB; exact.
+        cloud: write a coloured point cloud, NAME.ply.
+    """
+    from depthpose.cli import methods, predicting
+
+    config = MatcherConfig(
+        device=device, precision=precision, max_memory_bytes=methods.parse_bytes(max_memory)
+    )
+    if not 0 < color_range[0] < color_range[1]:
+        raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
+    sources = predicting.find_sources(images)
+    lens = predicting.read_lens(camera, focal_px)
+    method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
+    return predicting.predict_all(
+        sources, lens, method, out, predicting.Look(range_m=color_range, with_cloud=cloud)
+    )
+
+
 def match(
     left: tyro.conf.Positional[str],
     right: tyro.conf.Positional[str],

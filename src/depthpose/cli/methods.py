@@ -34,7 +34,11 @@ class Method(NamedTuple):
 
 
 def weights_method(
-    weights: str, config: MatcherConfig, *, with_right: bool | None = None
+    weights: str,
+    config: MatcherConfig,
+    *,
+    with_right: bool | None = None,
+    with_sgbm: bool = False,
 ) -> Method:
     """Build the network of a weights file, given by its path or by name.
 
@@ -42,6 +46,7 @@ def weights_method(
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
         with_right: show it the real right view; by default only to a matcher, which needs it.
+        with_sgbm: let OpenCV match the drawn view in place of the weights' own matcher.
 
     Raises:
         InputError: a matcher alone is asked to do without the right view.
@@ -57,6 +62,10 @@ def weights_method(
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
     if kind != "psmnet":
         facts["sees"] = "both views" if is_shown else "left view"
+    if with_sgbm:
+        facts["matcher"] += " with sgbm"
+        net = FakestereoNet.load(path, matcher="sgbm", config=SGBMConfig(with_filled_holes=True))
+        return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(config)}, is_shown)
     net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
     return Method(path.stem, net, {**facts, **config_to_dict(config)}, is_shown)
 

@@ -17,8 +17,8 @@ _LUMA = (0.299, 0.587, 0.114)
 class TrainingPair(NamedTuple):
     """A pair on its way into a network: images in [0, 1], disparity [px] with NaN for unknown.
 
-    ``right_px`` is the disparity of the right view, counted positive as well; all NaN where the
-    dataset knows none.
+    ``right_px`` is the disparity of the right view, counted positive as well: what is truth after
+    a flip.
     """
 
     left: Float[Tensor, "*b 3 h w"]

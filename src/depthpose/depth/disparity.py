@@ -62,6 +62,23 @@ def warp_right_to_left(
     return torch.where(is_inside, looked_up[0], torch.nan)
 
 
+def right_disparity_from_left(left_px: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Carry the disparity of the left view over to the right one: pixel x goes to ``x - d``.
+
+    The nearest point wins where several fall on one pixel. NaN where none does: what the left view
+    does not see, or where its disparity is unknown. Points land on whole pixels, half a pixel from
+    their place at most.
+    """
+    height, width = left_px.shape
+    columns = (torch.arange(width, device=left_px.device) - left_px).round()
+    is_inside = (columns >= 0) & (columns < width)
+    rows = torch.arange(height, device=left_px.device)[:, None].expand(height, width)
+    places = (rows * width + columns.nan_to_num(0.0))[is_inside].long()
+    empty = left_px.new_full((height * width,), -torch.inf)
+    carried = empty.scatter_reduce(0, places, left_px[is_inside], "amax")
+    return torch.where(carried.isinf(), torch.nan, carried).reshape(height, width)
+
+
 def left_right_difference_px(
     left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w"]:

@@ -37,7 +37,16 @@ class Estimator(Protocol):
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
 
-def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> None:
+COLOR_RANGE_M = (3.0, 80.0)
+"""Near and far end of the colours of depth, one for all pictures, so that they compare."""
+
+
+def write_estimate(
+    folder: Path,
+    pair: StereoInput,
+    estimate: DepthEstimate,
+    range_m: tuple[float, float] = COLOR_RANGE_M,
+) -> None:
     """Write the files of one estimate; the disparity comes last and marks the frame as finished.
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
@@ -55,7 +64,7 @@ def write_estimate(folder: Path, pair: StereoInput, estimate: DepthEstimate) -> 
     picture = (
         draw_disparity(estimate.disparity_px)
         if estimate.depth_m is None
-        else draw_depth(estimate.depth_m)
+        else draw_depth(estimate.depth_m, *range_m)
     )
     write_image(_file(base, "color.png"), picture)
     write_map(_file(base, "disparity_px.npy"), estimate.disparity_px)

@@ -25,6 +25,7 @@ from depthpose.core.files.text import read_json as read_json
 from depthpose.core.files.text import read_key_values as read_key_values
 from depthpose.core.files.text import read_text as read_text
 from depthpose.core.files.text import write_json as write_json
+from depthpose.core.files.video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from depthpose.core.files.video import Video as Video
 from depthpose.core.files.video import read_video as read_video
 from depthpose.core.files.video import write_video as write_video

@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import shuffled_index, ticket_generator
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig
-from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.kitti.frames import Frame, lidar_truth
 
@@ -72,10 +72,10 @@ class TrainingPairs:
         assert right is not None, "frames without a right view were left out"
         self._check_baseline(dataset, place)
         left_px = truth_disparity(dataset, place)
-        unknown = torch.full_like(sample.input.left[0], torch.nan)
-        pair = TrainingPair(
-            sample.input.left, right, unknown if left_px is None else left_px, unknown
-        )
+        if left_px is None:
+            left_px = torch.full_like(sample.input.left[0], torch.nan)
+        right_px = right_disparity_from_left(left_px)
+        pair = TrainingPair(sample.input.left, right, left_px, right_px)
         if self.config.focal_px is None:
             return pair
         if rig is None:

@@ -1,0 +1,167 @@
+"""One image: the virtual rig gives the scale, whatever camera took the image."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from depthpose import FakestereoNet
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.estimator import LicenceNotice, resize_image
+from depthpose.depth.stereo import CallableMatcher, PSMNet
+from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.weights import write_depth_weights
+
+FOCAL_PX, BASELINE_M = 120.0, 0.5
+
+
+@pytest.fixture(scope="module")
+def generator() -> UNetGenerator:
+    torch.manual_seed(0)
+    config = GeneratorConfig(
+        width=2, levels=3, virtual_focal_px=FOCAL_PX, virtual_baseline_m=BASELINE_M
+    )
+    return UNetGenerator(config)
+
+
+def camera(width: int, height: int, focal_px: float, baseline_m: float | None = None) -> Camera:
+    K = torch.tensor(
+        [[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    if baseline_m is None:
+        return Camera(width=width, height=height, K=K)
+    return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
+
+
+def by_brightness(left: Tensor, _: Tensor) -> Tensor:
+    """A matcher that reads disparity off the image: 10 px a unit of brightness."""
+    return 10 * left.mean(0) + 1
+
+
+def test_depth_is_virtual_focal_times_baseline_over_disparity(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    image = torch.full((3, 40, 60), 0.5)
+    estimate = net.estimate(image, camera(60, 40, FOCAL_PX))
+    assert estimate.depth_m is not None
+    assert estimate.right is not None
+    torch.testing.assert_close(
+        estimate.depth_m, torch.full((40, 60), FOCAL_PX * BASELINE_M / 6), rtol=1e-5, atol=0
+    )
+    assert estimate.right.shape == image.shape
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0, 3.0])
+def test_another_size_of_the_same_view_gives_the_same_metres(
+    generator: UNetGenerator, scale: float
+) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    ramp = torch.linspace(0.2, 0.8, 120)[None, None].expand(3, 80, 120)
+    width, height = round(120 * scale), round(80 * scale)
+    whole = net.estimate(ramp, camera(120, 80, 2 * FOCAL_PX)).depth_m
+    scaled_camera = camera(width, height, 2 * FOCAL_PX * scale)
+    scaled = net.estimate(resize_image(ramp, height, width), scaled_camera).depth_m
+    assert whole is not None
+    assert scaled is not None
+    back = resize_image(scaled[None].expand(3, -1, -1) / 100, 80, 120)[0] * 100
+    assert float((back - whole).abs().div(whole)[2:-2, 2:-2].max()) < 0.01
+
+
+def test_the_users_baseline_changes_disparity_and_no_metre(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    image = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
+    rig = camera(60, 40, 90.0, baseline_m=0.1)
+    assert isinstance(rig, StereoRig)
+    with_rig, without = net.estimate(image, rig), net.estimate(image, camera(60, 40, 90.0))
+    assert with_rig.depth_m is not None
+    assert without.depth_m is not None
+    assert torch.equal(with_rig.depth_m, without.depth_m)
+    torch.testing.assert_close(
+        with_rig.disparity_px, disparity_from_depth(with_rig.depth_m, rig), rtol=1e-5, atol=1e-6
+    )
+    torch.testing.assert_close(without.disparity_px, with_rig.disparity_px * 5, rtol=1e-4, atol=0)
+
+
+def test_one_image_needs_a_focal_length(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    with pytest.raises(InputError, match="metres from one image need its focal length"):
+        net.estimate(torch.rand(3, 8, 8), None)
+
+
+def test_weights_of_pairs_alone_say_so() -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness))
+    with pytest.raises(InputError, match="these weights match pairs only"):
+        net.estimate(torch.rand(3, 8, 8), camera(8, 8, 10.0))
+
+
+def small_matcher(work_focal_px: float | None = None) -> PSMNet:
+    torch.manual_seed(1)
+    return PSMNet(
+        PSMNetConfig(
+            width=2,
+            max_disparity_px=16,
+            blocks=(1, 1, 1, 1),
+            pools=(2,),
+            work_focal_px=work_focal_px,
+        )
+    )
+
+
+def test_one_file_serves_one_image_and_pairs(generator: UNetGenerator, tmp_path: Path) -> None:
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
+    net = FakestereoNet.load(path)
+    image = torch.rand(3, 40, 60)
+    alone = net.estimate(image, camera(60, 40, 100.0))
+    pair = net.estimate(image, camera(60, 40, 100.0, 0.2), right=image, with_check=False)
+    for estimate in (alone, pair):
+        assert estimate.disparity_px.shape == (40, 60)
+        assert estimate.confidence is not None
+        assert estimate.confidence.shape == (40, 60)
+    assert pair.right is None
+
+
+def test_pairs_are_matched_at_the_focal_length_of_the_weights(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    sizes: list[torch.Size] = []
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
+    net = FakestereoNet.load(path)
+    match = net.matcher.match
+
+    def spy(left: Tensor, right: Tensor) -> object:
+        sizes.append(left.shape)
+        return match(left, right)
+
+    net.matcher.match = spy  # pyright: ignore[reportAttributeAccessIssue]
+    image = torch.rand(3, 40, 60)
+    net.estimate(image, camera(60, 40, 100.0, 0.2), right=image, with_check=False)
+    net.estimate(image, camera(60, 40, 100.0))
+    assert sizes == [(3, 20, 30), (3, 20, 30)]
+
+
+def test_a_generator_alone_takes_any_matcher(generator: UNetGenerator, tmp_path: Path) -> None:
+    path, other = tmp_path / "g.safetensors", tmp_path / "s.safetensors"
+    write_depth_weights(path, generator=generator, facts={})
+    write_depth_weights(other, matcher=small_matcher(), facts={})
+    image, lens = torch.rand(3, 40, 60), camera(60, 40, 100.0)
+    with pytest.raises(InputError, match="there is no matcher in that"):
+        FakestereoNet.load(path)
+    own = FakestereoNet.load(path, matcher=CallableMatcher(by_brightness)).estimate(image, lens)
+    file = FakestereoNet.load(path, matcher=other).estimate(image, lens)
+    narrow = SGBMConfig(num_disparities=32)
+    sgbm = FakestereoNet.load(path, matcher="sgbm", config=narrow).estimate(image, lens)
+    assert [e.disparity_px.shape for e in (own, file, sgbm)] == [(40, 60)] * 3
+
+
+def test_terms_of_the_weights_are_said(generator: UNetGenerator, tmp_path: Path) -> None:
+    path = tmp_path / "some-nc.safetensors"
+    facts = {"terms": "for research alone"}
+    write_depth_weights(path, generator=generator, matcher=small_matcher(), facts=facts)
+    with pytest.warns(LicenceNotice, match="for research alone"):
+        FakestereoNet.load(path)

@@ -1,0 +1,264 @@
+"""The three stages on small made pairs: what moves, what stays, what is refused."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from depthpose.core.camera import StereoRig
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_disparity_png, write_image
+from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
+from depthpose.demo.scene import make_street
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.config import AugmentConfig, GeneratorConfig, PairsConfig, PSMNetConfig
+from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.stereo import PSMNet
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.train import (
+    FinetuneTask,
+    Run,
+    StereoTask,
+    TrainingPairs,
+    ViewTask,
+    train_finetune,
+    train_stereo,
+    train_view,
+)
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+from depthpose.depth.weights import read_depth_weights
+
+GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
+MATCHER = PSMNetConfig(width=4, max_disparity_px=32, blocks=(1, 1, 1, 1), pools=(4, 2))
+LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plain folder of three made pairs with disparity."""
+    home = tmp_path_factory.mktemp("pairs")
+    lines = []
+    for number, scale in enumerate((0.2, 0.2, 0.25)):
+        street = make_street(scale)
+        rig, truth = street.input.camera, street.truth.disparity_px
+        assert isinstance(rig, StereoRig)
+        assert street.input.right is not None
+        assert truth is not None
+        name = f"{number:02d}"
+        write_image(home / "left" / f"{name}.png", street.input.left)
+        write_image(home / "right" / f"{name}.png", street.input.right)
+        write_disparity_png(home / "disp_occ" / f"{name}.png", truth)
+        numbers = [rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m]
+        values = " ".join(str(float(n)) for n in numbers)
+        lines.append(f"{name} {rig.width} {rig.height} {values}")
+    (home / "calib.txt").write_text("\n".join(lines) + "\n")
+    return home
+
+
+@pytest.fixture
+def pairs(folder: Path) -> PairsConfig:
+    return PairsConfig(
+        folders=(str(folder),), focal_px=130.0, augment=AugmentConfig(crop_px=(48, 96))
+    )
+
+
+def batch(pairs: PairsConfig, count: int = 2) -> TrainingPair:
+    samples = TrainingPairs(pairs, 0, needs_truth=True)
+    parts = zip(*(samples[ticket] for ticket in range(count)), strict=True)
+    return TrainingPair(*(torch.stack(part) for part in parts))
+
+
+def snapshot(module: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
+
+
+def take_step(task: ViewTask | StereoTask | FinetuneTask, given: TrainingPair) -> list[str]:
+    names = []
+    for turn in task.step(given):
+        names.append(turn.optimizer)
+        optimizer, _ = task.optimizers[turn.optimizer]
+        turn.loss.backward()
+        optimizer.step()
+        for module in task.modules.values():
+            module.zero_grad()
+    return names
+
+
+def test_a_view_step_moves_first_the_judge_then_the_generator(pairs: PairsConfig) -> None:
+    config = ViewTraining(generator=GENERATOR, discriminator_width=4)
+    task = ViewTask(UNetGenerator(GENERATOR), config, None)
+    before = {name: snapshot(module) for name, module in task.modules.items()}
+    names = []
+    for turn in task.step(batch(pairs)):
+        names.append(turn.optimizer)
+        moved = [n for n, m in task.modules.items()
+                 if not torch.equal(_weight(before[n]), _weight(snapshot(m)))]  # fmt: skip
+        assert moved == ([] if turn.optimizer == "discriminator" else ["discriminator"])
+        turn.loss.backward()
+        task.optimizers[turn.optimizer][0].step()
+    assert names == ["discriminator", "generator"]
+    assert not torch.equal(_weight(before["generator"]), _weight(snapshot(task.generator)))
+
+
+def _weight(state: dict[str, Tensor]) -> Tensor:
+    return next(tensor for name, tensor in state.items() if name.endswith("weight"))
+
+
+def test_l1_alone_has_no_judge(pairs: PairsConfig) -> None:
+    config = ViewTraining(generator=GENERATOR, discriminator="none")
+    task = ViewTask(UNetGenerator(GENERATOR), config, None)
+    assert take_step(task, batch(pairs)) == ["generator"]
+    assert list(task.modules) == ["generator"]
+
+
+def test_fine_tuning_moves_the_generator_alone(pairs: PairsConfig) -> None:
+    """Neither the matcher's weights move nor its batch norm statistics."""
+    torch.manual_seed(0)
+    generator, matcher = UNetGenerator(GENERATOR), PSMNet(MATCHER)
+    task = FinetuneTask(generator, matcher, FinetuneTraining(), None)
+    before, matcher_before = snapshot(generator), snapshot(matcher)
+    for _ in range(3):
+        assert take_step(task, batch(pairs)) == ["generator"]
+    after = snapshot(matcher)
+    assert all(torch.equal(tensor, after[name]) for name, tensor in matcher_before.items())
+    moved = {name for name, p in generator.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == {name for name, _ in generator.named_parameters()}
+
+
+def test_gradients_reach_the_whole_generator_through_the_matcher(pairs: PairsConfig) -> None:
+    torch.manual_seed(0)
+    generator, matcher = UNetGenerator(GENERATOR), PSMNet(MATCHER)
+    (turn,) = FinetuneTask(generator, matcher, FinetuneTraining(), None).step(batch(pairs))
+    turn.loss.backward()
+    assert all(p.grad is not None and float(p.grad.abs().sum()) > 0 for p in generator.parameters())
+    assert all(p.grad is None for p in matcher.parameters())
+
+
+def test_the_three_stages_run_and_their_weights_estimate(folder: Path, tmp_path: Path) -> None:
+    pairs = PairsConfig(
+        folders=(str(folder),),
+        focal_px=130.0,
+        with_cache=True,
+        augment=AugmentConfig(crop_px=(48, 96)),
+    )
+    held_out = dataclasses.replace(pairs, limit=1)
+    view = ViewTraining(
+        generator=GENERATOR, discriminator_width=4, pairs=pairs, held_out=held_out, loop=LOOP
+    )
+    generator = train_view(view, Run(folder=tmp_path / "view"))
+    stereo = StereoTraining(matcher=MATCHER, pairs=pairs, held_out=held_out, loop=LOOP)
+    matcher = train_stereo(stereo, Run(folder=tmp_path / "stereo"))
+    tune = FinetuneTraining(
+        generator=str(generator), matcher=str(matcher), pairs=pairs, held_out=held_out, loop=LOOP
+    )
+    both = train_finetune(tune, Run(folder=tmp_path / "tune"))
+    found = read_depth_weights(both)
+    assert found.generator is not None
+    assert found.matcher is not None
+    trained = read_depth_weights(matcher).matcher
+    assert trained is not None
+    for name, tensor in trained.state_dict().items():
+        assert torch.equal(tensor, found.matcher.state_dict()[name])
+    for stage, number in (("view", "l1"), ("stereo", "epe_px"), ("tune", "epe_px")):
+        last = read_metrics(tmp_path / stage)[-1]
+        assert last["step"] == 3
+        assert last[f"held_out/{number}"] > 0
+        assert list((tmp_path / stage / "pictures").glob("*.png"))
+    assert "FinetuneTraining" in (tmp_path / "tune" / "run.json").read_text()
+
+
+def test_the_generator_learns_the_held_out_view(folder: Path, tmp_path: Path) -> None:
+    pairs = PairsConfig(
+        folders=(str(folder),),
+        focal_px=130.0,
+        with_cache=True,
+        augment=AugmentConfig(crop_px=(64, 128), jitter=0.0),
+    )
+    config = ViewTraining(
+        generator=dataclasses.replace(GENERATOR, width=8),
+        discriminator="none",
+        generator_adam=AdamConfig(learning_rate=2e-3, beta1=0.5),
+        pairs=pairs,
+        loop=dataclasses.replace(LOOP, steps=60, log_every_steps=5),
+    )
+    train_view(config, Run(folder=tmp_path))
+    l1 = [row["generator/l1"] for row in read_metrics(tmp_path)]
+    assert l1[-1] < 0.4 * l1[0]
+
+
+def test_pairs_are_brought_to_the_focal_length(pairs: PairsConfig) -> None:
+    samples = TrainingPairs(dataclasses.replace(pairs, focal_px=100.0), 0, needs_truth=True)
+    pair = samples.read(0)
+    street = make_street(0.2)
+    assert isinstance(street.input.camera, StereoRig)
+    share = 100.0 / float(street.input.camera.K[0, 0])
+    assert pair.left.shape[-1] == round(street.input.camera.width * share)
+    error = (warp_right_to_left(pair.right, pair.left_px) - pair.left).abs()
+    assert float(error.nanmedian()) < 0.05
+
+
+def test_a_cached_pair_is_the_pair(pairs: PairsConfig) -> None:
+    plain = TrainingPairs(pairs, 0, needs_truth=True)
+    cached = TrainingPairs(dataclasses.replace(pairs, with_cache=True), 0, needs_truth=True)
+    for _ in range(2):
+        for one, other in zip(plain.read(1), cached.read(1), strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0.51 / 255, equal_nan=True)
+
+
+def test_a_limit_spreads_over_the_folder(folder: Path, pairs: PairsConfig) -> None:
+    limited = TrainingPairs(dataclasses.replace(pairs, limit=2), 0, needs_truth=True)
+    assert len(limited) == 2
+    whole = TrainingPairs(pairs, 0, needs_truth=True)
+    torch.testing.assert_close(limited.read(1).left, whole.read(2).left)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"folders": ()}, "nothing to train on: name a folder"),
+        ({"exclude": ("99",)}, r"exclude names \['99'\], which no folder holds"),
+        ({"exclude": ("00", "01", "02")}, "no frame has a right view and a truth"),
+        ({"limit": 0}, "limit must be 1 pair or more"),
+        ({"focal_px": -1.0}, "focal_px must be positive"),
+    ],
+)
+def test_pairs_that_cannot_train_are_refused(
+    pairs: PairsConfig, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        TrainingPairs(
+            dataclasses.replace(pairs, **changes),  # pyright: ignore[reportArgumentType]
+            0,
+            needs_truth=True,
+        )
+
+
+def test_another_rig_than_the_generators_is_refused(pairs: PairsConfig) -> None:
+    samples = TrainingPairs(pairs, 0, needs_truth=False, baseline_m=0.3)
+    with pytest.raises(InputError, match=r"imitates one rig of 0\.3 m"):
+        samples.read(0)
+
+
+def test_other_settings_do_not_share_a_run(
+    folder: Path, pairs: PairsConfig, tmp_path: Path
+) -> None:
+    config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
+    train_view(config, Run(folder=tmp_path))
+    other = dataclasses.replace(config, l1_weight=10.0)
+    with pytest.raises(InputError, match=r"l1_weight = 100\.0, but now it is 10\.0"):
+        train_view(other, Run(folder=tmp_path, resume=True))
+
+
+def test_a_warm_start_begins_with_the_given_weights(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
+    first = train_view(config, Run(folder=tmp_path / "first"))
+    frozen = AdamConfig(learning_rate=1e-30)
+    again = dataclasses.replace(config, start=str(first), generator_adam=frozen)
+    second = train_view(again, Run(folder=tmp_path / "second"))
+    one, other = (read_depth_weights(p).generator for p in (first, second))
+    assert one is not None
+    assert other is not None
+    for name, parameter in one.named_parameters():
+        torch.testing.assert_close(parameter, dict(other.named_parameters())[name])
