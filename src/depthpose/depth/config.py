@@ -139,3 +139,53 @@ class SGBMConfig:
             raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
         if self.mode not in ("sgbm", "hh", "sgbm_3way", "hh4"):
             raise InputError(f"mode must be 'sgbm', 'hh', 'sgbm_3way' or 'hh4', got {self.mode!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetsConfig:
+    """What made street scenes are like."""
+
+    seed: int = 0
+    """Another seed, other streets."""
+
+    frames: int = 100_000
+    """How many there are; each is made when it is asked for."""
+
+    rigs: Literal["kitti", "varied"] = "kitti"
+    """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
+
+    scale: float = 1.0
+    """Size of the pictures as a share of the rig's: 0.5 draws half as many rows and columns."""
+
+    crop: tuple[int, int] | None = None
+    """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
+
+    with_antialiasing: bool = True
+    """Four samples in pixels where edges show."""
+
+    with_lidar: bool = False
+    """Scan each scene with a LiDAR too."""
+
+    jpeg_share: float = 0.5
+    """Share of the pairs that went through JPEG."""
+
+    rectification_error_px: float = 0.1
+    """Deviation of the rows by which the right view is off, as after a real calibration."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        for name, value in (("seed", self.seed), ("frames", self.frames)):
+            if value < 0:
+                raise InputError(f"{name} must be 0 or more, got {value}")
+        if self.rigs not in ("kitti", "varied"):
+            raise InputError(f"rigs must be 'kitti' or 'varied', got {self.rigs!r}")
+        if not 0.02 <= self.scale <= 4:
+            raise InputError(f"scale must be from 0.02 to 4, got {self.scale}; 1 is full size")
+        if self.crop is not None and min(self.crop) < 1:
+            raise InputError(f"crop must be two positive sizes, got {self.crop}; None: no crop")
+        if not 0 <= self.jpeg_share <= 1:
+            raise InputError(f"jpeg_share must be from 0 to 1, got {self.jpeg_share}")
+        if not 0 <= self.rectification_error_px < 10:
+            raise InputError(
+                f"rectification_error_px must be from 0 to 10, got {self.rectification_error_px}"
+            )

@@ -1,0 +1,95 @@
+"""What is seen from one eye of a stage, at pixel centres and between them."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from depthpose.core.raster import Raster, edge_functions, rasterize
+from depthpose.depth.streets.stage import Stage
+
+NEAR_M = 0.3
+
+Seen = tuple[Int[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, " n"]]
+"""Triangles (-1 where none is met), barycentric shares and depths [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sight:
+    """Visibility from one eye.
+
+    Attributes:
+        raster: visibility at the pixel centres.
+        K: intrinsic matrix.
+        eye: where the camera stands, in the left camera's frame [m]; it looks along z.
+        edges: edge functions of all triangles; see ``core.raster``.
+        volume: what they are divided by.
+    """
+
+    raster: Raster
+    K: Float64[Tensor, "3 3"]
+    eye: Float[Tensor, "3"]
+    edges: Float64[Tensor, "n 3 3"]
+    volume: Float64[Tensor, " n"]
+
+    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+        """Directions of pixels, with z = 1."""
+        ones = torch.ones(len(pixels), 1, dtype=torch.float64)
+        return (torch.cat([pixels, ones], 1) @ self.K.inverse().T).float()
+
+
+def look(
+    stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
+) -> Sight:
+    """Find what each pixel sees.
+
+    Args:
+        stage: what to look at.
+        K: intrinsic matrix.
+        size: height and width of the picture [px].
+        eye: where the camera stands, in the left camera's frame [m].
+    """
+    corners = stage.corners - eye
+    raster = rasterize(corners, K, size[1], size[0], NEAR_M)
+    edges, volume = edge_functions(corners, K)
+    return Sight(raster=raster, K=K, eye=eye, edges=edges, volume=volume)
+
+
+def nearest_at(
+    sight: Sight, candidates: Int[Tensor, "n m"], pixels: Float64[Tensor, "n 2"]
+) -> Seen:
+    """Look between the pixel centres, at triangles that were seen near by.
+
+    Args:
+        sight: from where.
+        candidates: triangles that may be met; -1 none.
+        pixels: where (u, v) [px].
+
+    Returns:
+        The nearest of them on each pixel's ray.
+    """
+    which = candidates.clamp(min=0)
+    edges = sight.edges[which]
+    u, v = pixels[:, 0, None, None], pixels[:, 1, None, None]
+    weight = (edges[..., 0] * u + edges[..., 1] * v + edges[..., 2]) / sight.volume[which][
+        ..., None
+    ]
+    inverse = weight.sum(-1)
+    is_met = (weight >= -1e-9).all(-1) & (candidates >= 0) & (inverse > 0) & (inverse < 1 / NEAR_M)
+    inverse, first = torch.where(is_met, inverse, 0).max(1)
+    row = torch.arange(len(candidates))
+    primitive = torch.where(inverse > 0, candidates[row, first], -1)
+    shares = (weight[row, first] / inverse[:, None]).float()
+    return primitive, shares, (1 / inverse).float()
+
+
+def neighbours(primitive: Int[Tensor, "h w"], index: Int[Tensor, " n"]) -> Int[Tensor, "n 5"]:
+    """Triangles seen at some pixels and at the four beside each."""
+    height, width = primitive.shape
+    column, row = index % width, index // width
+    places = [
+        (row + y).clamp(0, height - 1) * width + (column + x).clamp(0, width - 1)
+        for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    return primitive.flatten()[torch.stack(places, 1)]

@@ -1,0 +1,123 @@
+"""Trees, bushes and hedges, as models that are made once and placed many times."""
+
+from functools import cache
+
+import numpy as np
+
+from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.mesh import Mesh, MeshBuilder
+from depthpose.depth.streets.solids import add_ball, add_leaves
+
+TREES = 18
+BUSHES = 8
+HEDGES = 4
+"""How many different models there are of each."""
+
+_GREENS: list[Color] = [
+    (0.11, 0.17, 0.045), (0.15, 0.2, 0.06), (0.08, 0.13, 0.05), (0.2, 0.2, 0.06), (0.24, 0.15, 0.05)
+]  # fmt: skip
+_TREE_LEAVES = ((1400, 0.33), (400, 0.52), (100, 0.85))
+_BUSH_LEAVES = ((110, 0.15), (40, 0.22))
+"""How many leaves a whole crown has, and how long one is [m]: more of them, smaller, when near."""
+
+_BARK: Color = (0.22, 0.18, 0.14)
+
+
+def leaf_color(rng: np.random.Generator) -> Color:
+    """Draw a colour of leaves: mostly greens, some of autumn."""
+    base = np.array(_GREENS[rng.choice(5, p=[0.36, 0.28, 0.2, 0.11, 0.05])])
+    r, g, b = base * rng.uniform(0.7, 1.35) * (1 + 0.06 * rng.normal(size=3))
+    return float(r), float(g), float(b)
+
+
+@cache
+def tree(number: int, coarseness: int = 0) -> Mesh:
+    """Give tree model ``number``, about 10 m high: round crowns, columns and conifers.
+
+    Args:
+        number: which model.
+        coarseness: 0 to be seen from near, 1 from some 30 m, 2 from far away.
+    """
+    rng = np.random.default_rng([11, number])
+    builder = MeshBuilder()
+    kind = number % 6
+    leaves = _TREE_LEAVES[coarseness]
+    if kind == 4:
+        _conifer(builder, rng, leaves)
+    else:
+        _broadleaf(builder, rng, leaves, is_slim=kind == 5)
+    return builder.finish()
+
+
+def _broadleaf(
+    builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, float], is_slim: bool
+) -> None:
+    bark = Surface("bark", _BARK, 1.0, int(rng.integers(2)))
+    trunk_m, radius_m = (
+        rng.uniform(2.2, 4.2),
+        rng.uniform(1.1, 1.5) if is_slim else rng.uniform(2, 3.2),
+    )
+    top = np.array([rng.normal(0, 0.2), -trunk_m, rng.normal(0, 0.2)])
+    thick_m = rng.uniform(0.13, 0.28)
+    builder.tube((0, 0.2, 0), top, (thick_m, thick_m * 0.65), bark, 10)
+    blobs = int(rng.integers(6, 11))
+    for blob in range(blobs):
+        # A ring of clumps around and above the trunk's top, the last one at the tip.
+        height = -(10 - trunk_m - 1.2) * (blob + 0.3) / blobs
+        turn, out = rng.uniform(0, 6.28), radius_m * rng.uniform(0.3, 0.75)
+        out *= 1 - 0.6 * (blob / blobs) ** 2
+        centre = top + np.array([out * np.cos(turn), height - 0.4, out * np.sin(turn)])
+        builder.tube(top, centre, (thick_m * 0.4, 0.03), bark, 5)
+        radii = radius_m * rng.uniform(0.42, 0.68) * np.array([1, rng.uniform(0.7, 0.95), 1])
+        _clump(builder, rng, (centre, radii), (leaves[0] // blobs, leaves[1]))
+
+
+def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, float]) -> None:
+    bark = Surface("bark", _BARK, 1.0, 1)
+    builder.tube((0, 0.2, 0), (0, -9, 0), (0.22, 0.05), bark, 8)
+    tiers = 9
+    for tier in range(tiers):
+        share = tier / tiers
+        radius_m = rng.uniform(1.8, 2.4) * (1 - share) + 0.25
+        radii = np.array([radius_m, 0.75, radius_m])
+        _clump(builder, rng, ((0, -1.2 - 8.6 * share, 0), radii), (leaves[0] // tiers, leaves[1]))
+
+
+def _clump(
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    where: tuple,
+    leaves: tuple[int, float],
+) -> None:
+    """A dark core that hides what is behind, and leaves about it."""
+    centre, radii = where
+    light = rng.uniform(0.8, 1.15)
+    core = Surface("leaf", (0.4 * light, 0.4 * light, 0.4 * light), 0.9, int(rng.integers(3)))
+    is_near = leaves[1] < 0.4
+    add_ball(builder, centre, np.asarray(radii) * 0.76, core, int(is_near), (rng, 0.25))
+    surface = Surface("leaf", (light * 0.75, light * 0.75, light * 0.75), 0.9, int(rng.integers(3)))
+    add_leaves(builder, rng, where, leaves, surface)
+
+
+@cache
+def bush(number: int, coarseness: int = 0) -> Mesh:
+    """Give bush model ``number``, about 1 m high and 1.4 m wide; coarseness 1 from far away."""
+    rng = np.random.default_rng([12, number])
+    builder = MeshBuilder()
+    for _ in range(int(rng.integers(1, 4))):
+        radii = np.array([0.55, 0.5, 0.55]) * rng.uniform(0.7, 1.1)
+        centre = (rng.normal(0, 0.25), -radii[1] * 0.85, rng.normal(0, 0.25))
+        _clump(builder, rng, (centre, radii), _BUSH_LEAVES[coarseness])
+    return builder.finish()
+
+
+@cache
+def hedge(number: int) -> Mesh:
+    """Give hedge model ``number``: 4 m along z, 1 m high, 0.7 m wide, clipped."""
+    rng = np.random.default_rng([13, number])
+    builder = MeshBuilder()
+    variant = int(rng.integers(3))
+    builder.box((0, -0.48, 0), (0.6, 0.96, 4.0), Surface("leaf", (0.42, 0.42, 0.42), 0.8, variant))
+    surface = Surface("leaf", (0.7, 0.7, 0.7), 0.9, variant)
+    add_leaves(builder, rng, ((0, -0.5, 0), (0.35, 0.5, 2.0)), (420, 0.13), surface, is_block=True)
+    return builder.finish()
