@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 
 _EMPTY = (1 << 63) - 1
 _MAX_ROWS = 1 << 20
-_MAX_PIXELS = 1 << 21
+_MAX_PIXELS = 1 << 18
 """How much is expanded at a time: some 200 MB at most, whatever the scene."""
 
 

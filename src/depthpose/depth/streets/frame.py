@@ -132,7 +132,7 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:
     # Most see the same triangle there, and nothing else need be asked.
     is_same = (candidates[:, :1] == primitive[index, None])[:, 0] & ~is_outside
     asked = (~is_same & ~is_outside).nonzero()[:, 0]
-    _, _, seen_m = nearest_at(right, candidates[asked], pixels[asked])
+    _, _, seen_m = nearest_at(right, candidates[asked], [pixels[asked]])[0]
     occluded[index[asked]] = seen_m < depth_m[index[asked]] * (1 - _OCCLUSION_SHARE)
     occluded[index[is_outside]] = True
     return occluded.reshape(height, width)

@@ -1,6 +1,7 @@
 """What stands along a street: lamps, signs, lights, posts, fences, walls, bins, wires."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -179,5 +180,5 @@ def add_wires(builder: MeshBuilder, start: np.ndarray, stop: np.ndarray) -> None
     share = np.linspace(0, 1, 7)[:, None]
     points = start * (1 - share) + stop * share
     points[:, 1] += (4 * share * (1 - share))[:, 0] * 0.02 * np.linalg.norm(stop - start)
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         builder.tube(a, b, (0.018, 0.018), _DARK, 3)

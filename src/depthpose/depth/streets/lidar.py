@@ -50,7 +50,7 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     column = pixels[:, 0].round().long().clamp(0, width - 1)
     row = pixels[:, 1].round().long().clamp(0, height - 1)
     candidates = neighbours(sight.raster.primitive, row * width + column)
-    primitive, _, depth_m = nearest_at(sight, candidates, pixels)
+    primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
     range_m = depth_m / towards[:, 2]
     returned = _returned(stage, rng, primitive, range_m)
     noise = torch.from_numpy(rng.normal(0, _NOISE_M, len(returned)))

@@ -191,8 +191,7 @@ class MeshBuilder:
         low, high = p + ring * radii_m[0], q + ring * radii_m[1]
         around = angle * max(radii_m)
         below, above = (np.stack([around, 0 * around + d], -1) for d in (0.0, length))
-        quad = lambda a, b: np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1)  # noqa: E731
-        self.quads(quad(low, high), quad(below, above), surface, quad(ring, ring))
+        self.quads(_between(low, high), _between(below, above), surface, _between(ring, ring))
 
     def disc(
         self, centre: ArrayLike, axis: ArrayLike, radius_m: float, surface: Surface, sides: int = 12
@@ -205,12 +204,9 @@ class MeshBuilder:
         rim_uv = np.stack([np.cos(angle), np.sin(angle)], -1)
         rim = middle + radius_m * (rim_uv[:, :1] * across + rim_uv[:, 1:] * other)
         uv = (0.5 + 0.5 * rim_uv) * surface.tile_m
-        fan = (
-            lambda hub, edge: np.stack(  # noqa: E731
-                [np.broadcast_to(hub, edge[1:].shape), edge[:-1], edge[1:]], 1
-            )
-        )
-        self.triangles(fan(middle, rim), fan(np.full(2, 0.5) * surface.tile_m, uv), surface)
+        hub, hub_uv = np.broadcast_to(middle, rim.shape), np.full_like(uv, 0.5 * surface.tile_m)
+        faces, places = (np.stack([c[1:], e[:-1], e[1:]], 1) for c, e in ((hub, rim), (hub_uv, uv)))
+        self.triangles(faces, places, surface)
 
     def finish(self) -> Mesh:
         """Give all that was added, as one mesh."""
@@ -228,6 +224,11 @@ def plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, 
 
 def _full(values: ArrayLike, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(values, np.float32), shape))
+
+
+def _between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Faces between two rows of points."""
+    return np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
 
 
 def _halves(faces: np.ndarray) -> np.ndarray:

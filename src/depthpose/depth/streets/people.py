@@ -1,6 +1,7 @@
 """People on foot and on bicycles, as models."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -48,8 +49,10 @@ def rider(number: int) -> Mesh:
     for side in (-1, 1):
         knee, pedal = (side * 0.1, -0.68, 0.15), (side * 0.1, -0.28 - 0.13 * side, 0.0)
         builder.tube(pedal, knee, (0.05, 0.065), trousers)
-        builder.tube(knee, hip + [side * 0.08, 0, 0], (0.065, 0.09), trousers)
-        builder.tube((side * 0.25, -1.08, 0.42), neck + [side * 0.18, 0, 0], (0.04, 0.055), coat)
+        builder.tube(knee, hip + np.array([side * 0.08, 0, 0]), (0.065, 0.09), trousers)
+        builder.tube(
+            (side * 0.25, -1.08, 0.42), neck + np.array([side * 0.18, 0, 0]), (0.04, 0.055), coat
+        )
     _trunk(builder, rng, tuple(hip), tuple(neck), coat)
     _head(builder, rng, (0, -1.7, 0.08))
     return builder.finish()
@@ -59,7 +62,7 @@ def _bicycle(builder: MeshBuilder, frame: Surface) -> None:
     for z in (-0.52, 0.52):
         angle = np.linspace(0, 2 * np.pi, 19)
         rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
-        for start, stop in zip(rim[:-1], rim[1:], strict=True):
+        for start, stop in pairwise(rim):
             builder.tube(start, stop, (0.02, 0.02), _BLACK, 4)
         builder.tube((-0.05, -0.34, z), (0.05, -0.34, z), (0.03, 0.03), frame, 5)
         for spoke in rim[:-1:3]:
@@ -91,7 +94,7 @@ def _head(builder: MeshBuilder, rng: np.random.Generator, centre: tuple) -> None
     middle = np.array(centre)
     skin = Surface("skin", _SKINS[rng.integers(len(_SKINS))])
     r, g, b = rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])
-    builder.tube(middle + [0, 0.2, 0], middle, (0.06, 0.06), skin, 6)
+    builder.tube(middle + np.array([0, 0.2, 0]), middle, (0.06, 0.06), skin, 6)
     add_ball(builder, middle, (0.085, 0.125, 0.1), skin, 2)
     add_ball(
         builder, middle - [0, 0.03, 0.02], (0.098, 0.11, 0.105), Surface("cloth", (r, g, b)), 2

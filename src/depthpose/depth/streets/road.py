@@ -5,6 +5,7 @@ camera's car at x = s = 0, and then bent as a whole.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -73,11 +74,11 @@ class Road:
         return (self.right_m - self.left_m - sum(self.parking_m)) / self.lanes
 
     def edge_m(self, side: int) -> float:
-        """x of the edge on one side."""
+        """Give x of the edge on one side."""
         return self.right_m if side > 0 else self.left_m
 
     def plot_m(self, side: int) -> float:
-        """x where the ground behind pavement and verge begins."""
+        """Give x where the ground behind pavement and verge begins."""
         return self.edge_m(side) + side * (self.verge_m + self.walk_m)
 
     def is_side_street(self, s_m: float, side: int, margin_m: float = 0.0) -> bool:
@@ -128,7 +129,7 @@ def _draw_side_streets(rng: np.random.Generator, place: Place) -> tuple[SideStre
 
 
 def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, "n 5"]:
-    """Integrate curvature and slope; straight and level where the car is, so that it stands on it."""
+    """Integrate curvature and slope; at the car the road is level and leads ahead."""
     s = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
     curvature = np.zeros_like(s)
     is_bent = rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65)
@@ -256,10 +257,7 @@ def _pieces(road: Road, side: int) -> list[tuple[Float64[np.ndarray, " n"], bool
     middle = (stations[1:] + stations[:-1]) / 2
     is_street = np.array([road.is_side_street(float(s), side) for s in middle])
     starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
-    return [
-        (stations[a : b + 1], bool(is_street[a]))
-        for a, b in zip(starts[:-1], starts[1:], strict=True)
-    ]
+    return [(stations[a : b + 1], bool(is_street[a])) for a, b in pairwise(starts)]
 
 
 def _strip(

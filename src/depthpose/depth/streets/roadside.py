@@ -1,5 +1,7 @@
 """What stands beside the road: houses, gardens, trees, lamps and signs."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from depthpose.depth.streets import furniture, vegetation
@@ -143,18 +145,14 @@ def _copse(
 
 def _kerb(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
     """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
-    x = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3)
-    y, yaw = -road.curb_m, 0.0 if side < 0 else np.pi
-    if rng.random() < {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
-        number, step = int(rng.integers(6)), rng.uniform(16, 34)
-        for s in np.arange(rng.uniform(2, 25), 110, step):
-            if not road.is_side_street(s, side):
-                builder.add(place(furniture.lamp(number), (x, y, s), yaw))
+    x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+    _lamps(builder, rng, road, side)
     s = rng.uniform(3, 12)
     is_town = road.place not in ("rural", "forest")
     while s < 70:
         if not road.is_side_street(s, side, 0.5):
-            _kerb_thing(builder, rng, (x + side * rng.uniform(0, 0.4), y, s), side, is_town=is_town)
+            where = (x + side * rng.uniform(0, 0.4), y, s)
+            _kerb_thing(builder, rng, where, side, is_town=is_town)
         s += rng.uniform(3, 14) * (1 if is_town else 1.8)
     for street in road.side_streets:
         if side in street.sides and rng.random() < 0.4:
@@ -162,6 +160,17 @@ def _kerb(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int)
             builder.add(place(light, (x, y, street.s_m - street.half_m - 1), 0, (-side, 1, 1)))
     if rng.random() < 0.25:
         _wires(builder, rng, x + side * rng.uniform(0.5, 3))
+
+
+def _lamps(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
+    if rng.random() > {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
+        return
+    x, y = road.edge_m(side) + side * (0.5 if road.walk_m else 1.3), -road.curb_m
+    yaw = 0.0 if side < 0 else np.pi
+    number, step = int(rng.integers(6)), rng.uniform(16, 34)
+    for s in np.arange(rng.uniform(2, 25), 110, step):
+        if not road.is_side_street(s, side):
+            builder.add(place(furniture.lamp(number), (x, y, s), yaw))
 
 
 def _kerb_thing(
@@ -191,7 +200,7 @@ def _wires(builder: MeshBuilder, rng: np.random.Generator, x: float) -> None:
     for s in places:
         builder.tube((x, 0.2, s), (x, -height, s), (0.12, 0.09), furniture.WOOD, 8)
         builder.box((x, -height + 0.3, s), (1.4, 0.1, 0.1), furniture.WOOD)
-    for start, stop in zip(places[:-1], places[1:], strict=True):
+    for start, stop in pairwise(places):
         for shift in (-0.6, 0.6):
             ends = [np.array([x + shift, -height + 0.22, s]) for s in (start, stop)]
             furniture.add_wires(builder, *ends)

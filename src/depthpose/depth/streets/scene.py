@@ -121,12 +121,13 @@ def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
         wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
     height = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
     x, z = _HILLS_M * np.sin(angle), _HILLS_M * np.cos(angle)
-    low = np.stack([x, 0 * x + 12, z], 1)
+    low = np.stack([x, 0 * x + 90, z], 1)
     high = np.stack([x, -height, z], 1)
-    faces = np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
     along = np.arange(len(angle)) * 12.0
-    uv = np.stack([np.stack([along[:-1], 0 * along[1:]], 1), np.stack([along[1:], 0 * along[1:]], 1),
-                   np.stack([along[1:], height[1:]], 1), np.stack([along[:-1], height[:-1]], 1)], 1)  # fmt: skip
+    under, over = np.stack([along, 0 * along], 1), np.stack([along, height], 1)
+    faces, uv = (
+        np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1) for a, b in ((low, high), (under, over))
+    )
     surface = Surface("hills", (0.06, 0.085, 0.04), 60.0, int(rng.integers(2)))
     builder.quads(faces, uv, surface)
 

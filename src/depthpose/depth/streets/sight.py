@@ -57,31 +57,34 @@ def look(
 
 
 def nearest_at(
-    sight: Sight, candidates: Int[Tensor, "n m"], pixels: Float64[Tensor, "n 2"]
-) -> Seen:
+    sight: Sight, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
+) -> list[Seen]:
     """Look between the pixel centres, at triangles that were seen near by.
 
     Args:
         sight: from where.
         candidates: triangles that may be met; -1 none.
-        pixels: where (u, v) [px].
+        places: one or more lists of pixels (u, v) [px], which share their candidates.
 
     Returns:
-        The nearest of them on each pixel's ray.
+        For each list, the nearest of the candidates on each pixel's ray.
     """
     which = candidates.clamp(min=0)
-    edges = sight.edges[which]
-    u, v = pixels[:, 0, None, None], pixels[:, 1, None, None]
-    weight = (edges[..., 0] * u + edges[..., 1] * v + edges[..., 2]) / sight.volume[which][
-        ..., None
-    ]
-    inverse = weight.sum(-1)
-    is_met = (weight >= -1e-9).all(-1) & (candidates >= 0) & (inverse > 0) & (inverse < 1 / NEAR_M)
-    inverse, first = torch.where(is_met, inverse, 0).max(1)
+    edges = sight.edges[which] / sight.volume[which][..., None, None]
+    across, down, constant = edges.unbind(-1)
+    missing = candidates < 0
     row = torch.arange(len(candidates))
-    primitive = torch.where(inverse > 0, candidates[row, first], -1)
-    shares = (weight[row, first] / inverse[:, None]).float()
-    return primitive, shares, (1 / inverse).float()
+    found = []
+    for pixels in places:
+        u, v = pixels[:, 0, None, None], pixels[:, 1, None, None]
+        weight = torch.addcmul(constant, across, u).addcmul_(down, v)
+        inverse = weight.sum(-1)
+        is_missed = (weight.amin(-1) < -1e-9) | missing | ~(inverse < 1 / NEAR_M)
+        inverse, first = inverse.masked_fill_(is_missed, 0).clamp_(min=0).max(1)
+        primitive = torch.where(inverse > 0, candidates[row, first], -1)
+        shares = (weight[row, first] / inverse[:, None]).float()
+        found.append((primitive, shares, (1 / inverse).float()))
+    return found
 
 
 def neighbours(primitive: Int[Tensor, "h w"], index: Int[Tensor, " n"]) -> Int[Tensor, "n 5"]:

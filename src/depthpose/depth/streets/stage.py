@@ -9,13 +9,16 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.raster import rasterize_orthographic
-from depthpose.depth.streets.materials import MATERIALS
+from depthpose.depth.streets.materials import MATERIALS, NUMBER
 from depthpose.depth.streets.scene import StreetScene
 from depthpose.depth.streets.textures import SIDE_PX
 
-_SUN_MAPS = ((18.0, (-5.0, 36.0), 1024), (70.0, (-8.0, 130.0), 1024))
-_SKY_MAP = (28.0, (-5.0, 64.0), 640)
+_SUN_MAPS = ((18.0, (-3.0, 36.0), 1024), (60.0, (-5.0, 115.0), 768))
+_SKY_MAP = (28.0, (-3.0, 64.0), 512)
 """Half width, reach [m] and side [px] of the maps that look along the light."""
+
+_GROUND = ("road", "pavement", "grass", "dirt", "curb", "hills")
+"""Nearly flat: it casts no shadow that is seen, and would cover these maps several times."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,9 +84,10 @@ def prepare(scene: StreetScene) -> Stage:
     to_sun = turn @ torch.from_numpy(scene.weather.sun).float()
     up = turn @ torch.tensor([0.0, -1, 0])
     material = torch.from_numpy(mesh.material.astype(np.int64))
-    sun_maps = (
-        [] if scene.weather.is_overcast else [_light_map(corners, to_sun, *m) for m in _SUN_MAPS]
-    )
+    hides = torch.ones(len(MATERIALS), dtype=torch.bool)
+    hides[[NUMBER[name] for name in _GROUND]] = False
+    casters = corners[hides[material]]
+    maps = () if scene.weather.is_overcast else _SUN_MAPS
     return Stage(
         scene=scene,
         corners=corners,
@@ -93,8 +97,8 @@ def prepare(scene: StreetScene) -> Stage:
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=sun_maps,
-        sky_map=_light_map(corners, up, *_SKY_MAP),
+        sun_maps=[_light_map(casters, to_sun, *one) for one in maps],
+        sky_map=_light_map(casters, up, *_SKY_MAP),
     )
 
 
@@ -106,9 +110,9 @@ def _attributes(scene: StreetScene, corners: Float[Tensor, "n 3 3"]) -> Float[Te
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     tiles = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
     texels_per_m = (tiles / area.clamp(min=1e-12)).sqrt().clamp(1e-4, 50) * SIDE_PX
-    parts = [uv.flatten(1), torch.from_numpy(scene.mesh.normals).flatten(1),
-             torch.from_numpy(scene.mesh.tint), F.normalize(across, dim=1), texels_per_m[:, None]]  # fmt: skip
-    return torch.cat(parts, 1)
+    normals, tint = torch.from_numpy(scene.mesh.normals), torch.from_numpy(scene.mesh.tint)
+    plane = F.normalize(across, dim=1)
+    return torch.cat([uv.flatten(1), normals.flatten(1), tint, plane, texels_per_m[:, None]], 1)
 
 
 def _light_map(
@@ -129,8 +133,7 @@ def _light_map(
     scale = (side_px - 1) / (high - low)
     turned = corners @ rotation.T
     placed = torch.cat([(turned[..., :2] - low) * scale, turned[..., 2:]], -1)
-    is_near = corners[..., 2].amin(1) < reach_m[1] * 3
-    drawn = rasterize_orthographic(placed[is_near], side_px, side_px, with_barycentric=False)
+    drawn = rasterize_orthographic(placed, side_px, side_px, with_barycentric=False)
     return LightMap(
         depth_m=drawn.depth_m.nan_to_num(nan=1e6),
         rotation=rotation,

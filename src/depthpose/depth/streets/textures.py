@@ -172,7 +172,7 @@ def _grass(noise: _Noise, variant: int) -> Picture:
     return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
 
 
-def _dirt(noise: _Noise, variant: int) -> Picture:
+def _dirt(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.2 * noise.rough() + 0.18 * noise.fine() + 0.12 * noise.broad())
 
 
@@ -197,7 +197,7 @@ def _stone(noise: _Noise, variant: int) -> Picture:
     )
 
 
-def _concrete(noise: _Noise, variant: int) -> Picture:
+def _concrete(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.07 * noise.fine() + 0.09 * noise.rough() + 0.08 * noise.broad())
 
 
@@ -206,11 +206,11 @@ def _roof(noise: _Noise, variant: int) -> Picture:
     return shade * _grey((0.55 + 0.65 * in_row) * (1 + 0.09 * noise.fine() + 0.1 * noise.broad()))
 
 
-def _bark(noise: _Noise, variant: int) -> Picture:
+def _bark(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.38 * noise.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * noise.fine())
 
 
-def _leaf(noise: _Noise, variant: int) -> Picture:
+def _leaf(noise: _Noise, _variant: int) -> Picture:
     """Light and dark clumps: a ball covered with it looks like foliage, not like a ball."""
     fine, rough = noise.fine(), noise.rough()
     clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
@@ -227,7 +227,7 @@ def _metal(noise: _Noise, variant: int) -> Picture:
     return _grey(1 + 0.06 * noise.fine() + (0.08 + 0.1 * variant) * noise.broad())
 
 
-def _paint(noise: _Noise, variant: int) -> Picture:
+def _paint(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.03 * noise.broad() + 0.012 * noise.fine())
 
 
@@ -247,7 +247,7 @@ def _side(noise: _Noise, variant: int) -> Picture:
     return _grey(picture * (1 - 0.35 * dirt))
 
 
-def _glass(noise: _Noise, variant: int) -> Picture:
+def _glass(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.15 * noise.broad())
 
 
@@ -259,18 +259,18 @@ def _pane(noise: _Noise, variant: int) -> Picture:
     return _grey(0.75 + 0.4 * y + 0.15 * noise.broad() + curtain * (variant != 1) + blind)
 
 
-def _tyre(noise: _Noise, variant: int) -> Picture:
+def _tyre(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.2 * noise.fine() + 0.15 * noise.rough())
 
 
-def _wheel(noise: _Noise, variant: int) -> Picture:
+def _wheel(_noise: _Noise, variant: int) -> Picture:
     y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX - 0.5
     turn, out = np.arctan2(y, x), np.hypot(x, y)
     spokes = np.cos(turn * (5, 7)[variant]) > -0.1
     return _grey(np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32))
 
 
-def _plate(noise: _Noise, variant: int) -> Picture:
+def _plate(noise: _Noise, _variant: int) -> Picture:
     picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
     for k in range(7):
         x = 22 + k * 31
@@ -279,7 +279,7 @@ def _plate(noise: _Noise, variant: int) -> Picture:
     return picture
 
 
-def _lamp(noise: _Noise, variant: int) -> Picture:
+def _lamp(noise: _Noise, _variant: int) -> Picture:
     x = np.arange(SIDE_PX, dtype=np.float32)[None] / SIDE_PX
     return _grey(1 + 0.15 * np.sign(np.sin(x * 40 * np.pi)) + 0 * noise.broad())
 
@@ -298,7 +298,7 @@ def _sign(noise: _Noise, variant: int) -> Picture:
     return picture
 
 
-def _poster(noise: _Noise, variant: int) -> Picture:
+def _poster(noise: _Noise, _variant: int) -> Picture:
     picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
     rng = noise.rng
     for _ in range(50):
@@ -315,11 +315,11 @@ def _cloth(noise: _Noise, variant: int) -> Picture:
     return _grey(1 + 0.16 * folds + 0.07 * noise.fine() + stripes)
 
 
-def _skin(noise: _Noise, variant: int) -> Picture:
+def _skin(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.06 * noise.broad())
 
 
-def _hills(noise: _Noise, variant: int) -> Picture:
+def _hills(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.3 * noise.smooth(1.0, (4, 128)) + 0.2 * noise.broad())
 
 

@@ -1,6 +1,7 @@
 """Cars, vans, lorries and buses, lofted from cross-sections; models made once, placed often."""
 
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -99,7 +100,7 @@ def _shell(
     shift[2:-2, 0] = rng.normal(0, 0.008, len(shift) - 4)
     stations = np.array(body.stations) + shift
     rings = [_ring(station, size) for station in stations]
-    for i, (rear, front) in enumerate(zip(rings[:-1], rings[1:], strict=True)):
+    for i, (rear, front) in enumerate(pairwise(rings)):
         is_glazed = body.glazed[0] <= i < body.glazed[1]
         is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
         for j in range(9):
@@ -172,8 +173,8 @@ def _wheels(builder: MeshBuilder, body: Body, size: Float[np.ndarray, "3"], numb
             arch = hub - [side * 0.004, 0.02, 0]
             builder.disc(arch, (side, 0, 0), radius * 1.18, _BLACK, 16)
             builder.tube(inside, hub, (radius, radius), _BLACK, 16)
-            builder.disc(hub + [side * 0.003, 0, 0], (side, 0, 0), radius, _BLACK, 16)
-            builder.disc(hub + [side * 0.012, 0, 0], (side, 0, 0), radius * 0.66, rim, 12)
+            builder.disc(hub + np.array([side * 0.003, 0, 0]), (side, 0, 0), radius, _BLACK, 16)
+            builder.disc(hub + np.array([side * 0.012, 0, 0]), (side, 0, 0), radius * 0.66, rim, 12)
 
 
 def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"], *, is_long: bool) -> None:

@@ -67,17 +67,15 @@ def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Flo
     candidates = neighbours(sight.raster.primitive, mixed)
     centre = _centres(mixed, sight.raster.primitive.shape[1])
     own = _seen_at(sight, mixed)
-    places, found = [], []
-    for offset in _OFFSETS:
-        place = centre + torch.tensor(offset, dtype=torch.float64)
-        seen = nearest_at(sight, candidates, place)
+    places = [centre + torch.tensor(offset, dtype=torch.float64) for offset in _OFFSETS]
+    found = []
+    for seen in nearest_at(sight, candidates, places):
         # A gap between all that was seen near by: take what the pixel's centre sees.
         is_lost = (seen[0] < 0) & (candidates >= 0).all(1)
         found.append([
             torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
             for one, instead in zip(seen, own, strict=True)
         ])  # fmt: skip
-        places.append(place)
     primitive, shares, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
     light = _light(stage, sight, torch.cat(places), (primitive, shares, depth))
     # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
