@@ -105,7 +105,7 @@ def rasterize(
     depth_m, primitive = _nearest(prepared, (width, height), near_m)
     barycentric = None
     if with_barycentric:
-        barycentric = _barycentric(edge_functions(triangles, K), primitive)
+        barycentric = barycentric_shares(*edge_functions(triangles, K), primitive)
     return Raster(depth_m=depth_m.to(triangles.dtype), primitive=primitive, barycentric=barycentric)
 
 
@@ -146,7 +146,7 @@ def rasterize_orthographic(
         is_inverse=False,
     )
     depth_m, primitive = _nearest(prepared, (width, height), 0.0)
-    barycentric = _barycentric(_edges(corners), primitive) if with_barycentric else None
+    barycentric = barycentric_shares(*_edges(corners), primitive) if with_barycentric else None
     depth_m = (depth_m + nearest_m).to(triangles_px.dtype)
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=barycentric)
 
@@ -163,6 +163,30 @@ def edge_functions(
         Edges and volumes; the volume is 0 where the plane goes through the camera.
     """
     return _edges(triangles.double() @ K.to(triangles.device).mT)
+
+
+def barycentric_shares(
+    edges: Float64[Tensor, "n 3 3"],
+    volume: Float64[Tensor, " n"],
+    primitive: Int64[Tensor, "h w"],
+) -> Float[Tensor, "h w 3"]:
+    """Give the shares of a triangle's corners at each pixel centre; 0 where nothing is seen.
+
+    Args:
+        edges: of all triangles; see :func:`edge_functions`.
+        volume: what they are divided by.
+        primitive: which triangle each pixel sees.
+    """
+    height, width = primitive.shape
+    shares = torch.zeros(height * width, 3, device=edges.device)
+    seen = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
+    which = primitive.reshape(-1)[seen]
+    u, v = (seen % width).double()[:, None], (seen // width).double()[:, None]
+    across, down, constant = edges[which].unbind(-1)
+    weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[which, None])
+    weight = weight.clamp_(min=0)  # beyond the edge by a rounding, where a pixel lies on it
+    shares[seen] = (weight / weight.sum(1, keepdim=True)).float()
+    return shares.reshape(height, width, 3)
 
 
 def _check(triangles: Tensor, width: int, height: int) -> None:
@@ -293,20 +317,3 @@ def _chunks(counts: Int64[Tensor, " n"], limit: int) -> Iterator[slice]:
         stop = max(int(np.searchsorted(ends, done + limit, side="right")), start + 1)
         yield slice(start, stop)
         start, done = stop, int(ends[stop - 1])
-
-
-def _barycentric(
-    functions: tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]],
-    primitive: Int64[Tensor, "h w"],
-) -> Float[Tensor, "h w 3"]:
-    edges, volume = functions
-    height, width = primitive.shape
-    shares = edges.new_zeros(height * width, 3)
-    seen = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
-    which = primitive.reshape(-1)[seen]
-    u, v = (seen % width).double()[:, None], (seen // width).double()[:, None]
-    line = edges[which]
-    weight = (line[..., 0] * u + line[..., 1] * v + line[..., 2]) / volume[which, None]
-    weight = weight.clamp(min=0)  # beyond the edge by a rounding, where a pixel lies on it
-    shares[seen] = weight / weight.sum(1, keepdim=True)
-    return shares.reshape(height, width, 3).float()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import MeshBuilder
 
 _PLASTERS: list[Color] = [
@@ -31,9 +31,9 @@ class Style(NamedTuple):
     """
 
     wall: Surface
-    storey_m: float
-    window_m: tuple[float, float]
-    gap_m: float
+    storey_m: Number
+    window_m: tuple[Number, Number]
+    gap_m: Number
     recess_m: float
     frame: Color
     with_details: bool
@@ -51,12 +51,12 @@ class Plot(NamedTuple):
         ground_m: y of the ground.
     """
 
-    x_m: float
-    z_m: tuple[float, float]
+    x_m: Number
+    z_m: tuple[Number, Number]
     side: int
-    depth_m: float
+    depth_m: Number
     height_m: float
-    ground_m: float
+    ground_m: Number
 
 
 class _Wall(NamedTuple):
@@ -65,10 +65,10 @@ class _Wall(NamedTuple):
     corner: Float[np.ndarray, "3"]
     along: Float[np.ndarray, "3"]
     outward: Float[np.ndarray, "3"]
-    length_m: float
+    length_m: Number
     height_m: float
 
-    def at(self, across_up: np.ndarray, out_m: float = 0.0) -> np.ndarray:
+    def at(self, across_up: np.ndarray, out_m: Number = 0.0) -> np.ndarray:
         """Points (..., 2) on the wall [m] to space."""
         up = np.array([0.0, -1, 0])
         points = self.corner + across_up[..., :1] * self.along + across_up[..., 1:] * up
@@ -143,7 +143,7 @@ def _add_wall(
     _add_windows(builder, rng, wall, style, windows)
 
 
-def _grid(style: Style, length: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+def _grid(style: Style, length: Number, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Lines across and up between which windows (odd places) and wall (even ones) lie."""
     width, tall = style.window_m
     count = max(1, int(length // (width + style.gap_m)))

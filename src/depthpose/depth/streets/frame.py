@@ -12,7 +12,7 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.streets.lidar import scan, sparse_depth
 from depthpose.depth.streets.materials import NUMBER
-from depthpose.depth.streets.rigs import draw_rig
+from depthpose.depth.streets.rigs import street_rig
 from depthpose.depth.streets.scene import StreetScene, make_scene
 from depthpose.depth.streets.sensor import draw_sensors, expose
 from depthpose.depth.streets.sight import Sight, look, nearest_at, neighbours
@@ -61,8 +61,7 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
         config: what frames are like.
         index: any whole number that is not negative.
     """
-    rng = np.random.default_rng([72, config.seed, index])
-    rig, mount_height_m = draw_rig(rng, config)
+    rig, mount_height_m = street_rig(config, index)
     scene = make_scene((config.seed, index), mount_height_m)
     return draw_scene(scene, rig, config, (config.seed, index))
 

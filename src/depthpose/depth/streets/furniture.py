@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 
 _GREY = Surface("metal", (0.25, 0.26, 0.27))
@@ -165,8 +165,8 @@ def fence(number: int) -> Mesh:
 def _bars(
     builder: MeshBuilder,
     surface: Surface,
-    bar_m: tuple[float, float, float],
-    step_m: float,
+    bar_m: tuple[Number, Number, Number],
+    step_m: Number,
     rails_m: tuple[float, ...],
 ) -> None:
     for z in np.arange(-FENCE_M / 2, FENCE_M / 2 - 0.01, step_m):

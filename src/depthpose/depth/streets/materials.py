@@ -1,8 +1,17 @@
 """What surfaces are made of: names, variants, and the few numbers that shading needs."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-Color = tuple[float, float, float]
+import numpy as np
+
+Number = float | int
+"""A length, an angle or a share, written as one likes."""
+
+Values = Sequence | np.ndarray | float | int
+"""What NumPy makes an array of."""
+
+Color = tuple[Number, Number, Number]
 """Linear RGB, 0 black to 1 white."""
 
 
@@ -74,7 +83,7 @@ class Surface(NamedTuple):
 
     material: str
     tint: Color = (1.0, 1.0, 1.0)
-    tile_m: float = 1.0
+    tile_m: Number = 1.0
     variant: int = 0
 
     @property

@@ -9,9 +9,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from numpy.typing import ArrayLike
 
-from depthpose.depth.streets.materials import NUMBER, Color, Surface
+from depthpose.depth.streets.materials import NUMBER, Color, Number, Surface, Values
 
 Rotation = Float[np.ndarray, "3 3"]
 
@@ -52,7 +51,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def turn_y(angle_rad: float) -> Rotation:
+def turn_y(angle_rad: Number) -> Rotation:
     """Rotate about the vertical; a positive angle turns z towards x, to the right."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -60,9 +59,9 @@ def turn_y(angle_rad: float) -> Rotation:
 
 def place(
     mesh: Mesh,
-    position: ArrayLike,
-    yaw_rad: float = 0.0,
-    scale: ArrayLike = 1.0,
+    position: Values,
+    yaw_rad: Number = 0.0,
+    scale: Values = 1.0,
     tints: Mapping[str, Color] | None = None,
 ) -> Mesh:
     """Copy a model to where it stands.
@@ -104,11 +103,11 @@ class MeshBuilder:
 
     def triangles(
         self,
-        corners: ArrayLike,
-        uv_m: ArrayLike,
+        corners: Values,
+        uv_m: Values,
         surface: Surface,
-        normals: ArrayLike | None = None,
-        tint: ArrayLike | None = None,
+        normals: Values | None = None,
+        tint: Values | None = None,
     ) -> None:
         """Add triangles (n, 3, 3).
 
@@ -137,11 +136,11 @@ class MeshBuilder:
 
     def quads(
         self,
-        corners: ArrayLike,
-        uv_m: ArrayLike,
+        corners: Values,
+        uv_m: Values,
         surface: Surface,
-        normals: ArrayLike | None = None,
-        tint: ArrayLike | None = None,
+        normals: Values | None = None,
+        tint: Values | None = None,
     ) -> None:
         """Add four-cornered faces (n, 4, 3), corners in turn; see :meth:`triangles`."""
         faces = np.asarray(corners, np.float32)
@@ -153,9 +152,7 @@ class MeshBuilder:
         uv = _halves(_full(uv_m, (n, 4, 2)))
         self.triangles(_halves(faces), uv, surface, normals, tint)
 
-    def rectangle(
-        self, corner: ArrayLike, along: ArrayLike, up: ArrayLike, surface: Surface
-    ) -> None:
+    def rectangle(self, corner: Values, along: Values, up: Values, surface: Surface) -> None:
         """Add one rectangle: a corner and its two sides [m]."""
         p, a, b = (np.asarray(v, np.float64) for v in (corner, along, up))
         width, height = np.linalg.norm(a), np.linalg.norm(b)
@@ -164,8 +161,8 @@ class MeshBuilder:
 
     def box(
         self,
-        centre: ArrayLike,
-        size: ArrayLike,
+        centre: Values,
+        size: Values,
         surface: Surface,
         rotation: Rotation | None = None,
         taper: float = 1.0,
@@ -176,9 +173,9 @@ class MeshBuilder:
 
     def tube(
         self,
-        start: ArrayLike,
-        stop: ArrayLike,
-        radii_m: tuple[float, float],
+        start: Values,
+        stop: Values,
+        radii_m: tuple[Number, Number],
         surface: Surface,
         sides: int = 8,
     ) -> None:
@@ -194,7 +191,7 @@ class MeshBuilder:
         self.quads(_between(low, high), _between(below, above), surface, _between(ring, ring))
 
     def disc(
-        self, centre: ArrayLike, axis: ArrayLike, radius_m: float, surface: Surface, sides: int = 12
+        self, centre: Values, axis: Values, radius_m: Number, surface: Surface, sides: int = 12
     ) -> None:
         """Add a flat polygon; its texture is one tile from side to side."""
         middle = np.asarray(centre, np.float64)
@@ -222,7 +219,7 @@ def plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, 
     return normal / (np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12)
 
 
-def _full(values: ArrayLike, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
+def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(values, np.float32), shape))
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 from depthpose.depth.streets.solids import add_ball
 
@@ -101,6 +101,6 @@ def _head(builder: MeshBuilder, rng: np.random.Generator, centre: tuple) -> None
     )
 
 
-def _cloth(rng: np.random.Generator, light: float) -> Surface:
+def _cloth(rng: np.random.Generator, light: Number) -> Surface:
     r, g, b = rng.uniform(0.1, 1, 3) * rng.uniform(0.15, 1) * light
     return Surface("cloth", (r, g, b), 0.6, int(rng.integers(4)))

@@ -6,7 +6,7 @@ import torch
 from depthpose.core.camera import StereoRig, crop_camera, resize_camera
 from depthpose.depth.config import StreetsConfig
 
-_KITTI = (
+KITTI_RIGS = (
     (1242, 375, 721.5377, 609.5593, 172.8540, 0.5327),
     (1224, 370, 707.0493, 604.0814, 180.5066, 0.5373),
     (1238, 374, 718.3351, 600.3891, 181.5122, 0.5301),
@@ -19,9 +19,14 @@ _KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
 """Nearly all benchmarks are of the first day."""
 
 
+def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
+    """Give the rig of a frame and the height of its mount [m], without drawing the frame."""
+    return draw_rig(np.random.default_rng([72, config.seed, index]), config)
+
+
 def kitti_rig(number: int = 0) -> StereoRig:
     """Give the rig of one of KITTI's five recording days, as published."""
-    width, height, focal_px, cx, cy, baseline_m = _KITTI[number]
+    width, height, focal_px, cx, cy, baseline_m = KITTI_RIGS[number]
     K = torch.tensor([[focal_px, 0, cx], [0, focal_px, cy], [0, 0, 1]], dtype=torch.float64)
     return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
 
@@ -30,7 +35,7 @@ def draw_rig(rng: np.random.Generator, config: StreetsConfig) -> tuple[StereoRig
     """Draw the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
     is_kitti = config.rigs == "kitti" or rng.random() < 0.5
     if is_kitti:
-        rig, mount_m = kitti_rig(int(rng.choice(len(_KITTI), p=_KITTI_SHARES))), 1.65
+        rig, mount_m = kitti_rig(int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))), 1.65
     else:
         rig, mount_m = _other_rig(rng), rng.uniform(1.1, 2.2)
     width, height = (max(1, round(side * config.scale)) for side in (rig.width, rig.height))

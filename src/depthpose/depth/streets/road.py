@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 
 Place = Literal["city", "suburb", "avenue", "rural", "forest"]
@@ -35,7 +35,7 @@ class SideStreet:
         sides: 1 right, -1 left.
     """
 
-    s_m: float
+    s_m: Number
     half_m: float
     sides: tuple[int, ...]
 
@@ -58,13 +58,13 @@ class Road:
     """
 
     place: Place
-    left_m: float
+    left_m: Number
     right_m: float
     lanes: int
-    parking_m: tuple[float, float]
-    walk_m: float
+    parking_m: tuple[Number, Number]
+    walk_m: Number
     curb_m: float
-    verge_m: float
+    verge_m: Number
     side_streets: tuple[SideStreet, ...]
     centre: Float64[np.ndarray, "n 5"]
 
@@ -81,7 +81,7 @@ class Road:
         """Give x where the ground behind pavement and verge begins."""
         return self.edge_m(side) + side * (self.verge_m + self.walk_m)
 
-    def is_side_street(self, s_m: float, side: int, margin_m: float = 0.0) -> bool:
+    def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
         """Whether a side street joins here."""
         return any(
             side in street.sides and abs(s_m - street.s_m) < street.half_m + margin_m
@@ -106,8 +106,8 @@ def draw_road(rng: np.random.Generator) -> Road:
     has_walk = place in ("city", "suburb") or (place == "avenue" and rng.random() < 0.7)
     return Road(
         place=place,
-        left_m=right_m - width_m,
-        right_m=right_m,
+        left_m=float(right_m - width_m),
+        right_m=float(right_m),
         lanes=lanes,
         parking_m=(float(parking[0]), float(parking[1])),
         walk_m=rng.uniform(1.4, 4.0) if has_walk else 0.0,
@@ -189,14 +189,14 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
     )
     grass = Surface("grass", (0.12 * green * warm, 0.15 * green, 0.045 * green), 3.0, variants[2])
     builder.begin_thing()
-    _strip(builder, (road.left_m, road.right_m), (0, 0), asphalt, _stations(road, 0))
+    _strip(builder, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
     for side in (-1, 1):
         for stations, is_street in _pieces(road, side):
             builder.begin_thing()
             if is_street:
                 far = road.edge_m(side) + side * 90
-                _strip(builder, (road.edge_m(side), far), (0, -0.3), asphalt, stations)
+                _strip(builder, (road.edge_m(side), far), (0.0, -0.3), asphalt, stations)
             else:
                 _side_strips(builder, rng, road, side, (walk, grass, land, stations))
 
@@ -222,11 +222,11 @@ def _side_strips(
         builder, (x, x + side * width), heights, surface, stations
     )
     if road.curb_m:
-        strip(0.0, (0, high), curb)
+        strip(0.0, (0.0, high), curb)
         strip(0.15, (high, high), curb)
         x += side * 0.15
     else:
-        strip(rng.uniform(0.3, 1.2), (0, 0.02), Surface("dirt", (0.2, 0.165, 0.12), 2.0))
+        strip(rng.uniform(0.3, 1.2), (0.0, 0.02), Surface("dirt", (0.2, 0.165, 0.12), 2.0))
         x += side * 0.3
     if road.verge_m:
         strip(road.verge_m, (high, high), grass)
@@ -235,9 +235,9 @@ def _side_strips(
         strip(road.walk_m, (high, high), walk)
         x += side * road.walk_m
     rise = rng.normal(0, 0.8) if road.place in ("rural", "forest") else rng.normal(0, 0.1)
-    strip(8, (high, high - 0.3 * rise), land)
+    strip(8.0, (high, high - 0.3 * rise), land)
     x += side * 8
-    strip(130, (high - 0.3 * rise, high - 3 * rise), land)
+    strip(130.0, (high - 0.3 * rise, high - 3 * rise), land)
 
 
 def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:
@@ -262,8 +262,8 @@ def _pieces(road: Road, side: int) -> list[tuple[Float64[np.ndarray, " n"], bool
 
 def _strip(
     builder: MeshBuilder,
-    x_m: tuple[float, float],
-    y_m: tuple[float, float],
+    x_m: tuple[Number, Number],
+    y_m: tuple[Number, Number],
     surface: Surface,
     stations: Float[np.ndarray, " n"],
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from depthpose.depth.streets import furniture, vegetation
 from depthpose.depth.streets.buildings import Plot, add_house, draw_style
+from depthpose.depth.streets.materials import Number
 from depthpose.depth.streets.mesh import MeshBuilder, place
 from depthpose.depth.streets.road import Road
 
@@ -130,7 +131,7 @@ def _copse(
     rng: np.random.Generator,
     road: Road,
     side: int,
-    where: tuple[float, float, float],
+    where: tuple[Number, Number, Number],
 ) -> None:
     s, length, depth = where
     for _ in range(int(rng.integers(1, 5))):
@@ -176,7 +177,7 @@ def _lamps(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int
 def _kerb_thing(
     builder: MeshBuilder,
     rng: np.random.Generator,
-    where: tuple[float, float, float],
+    where: tuple[Number, Number, Number],
     side: int,
     *,
     is_town: bool,
@@ -192,7 +193,7 @@ def _kerb_thing(
         _tree(builder, rng, where[0] + side * 0.4, where[2], rng.uniform(3.5, 7))
 
 
-def _wires(builder: MeshBuilder, rng: np.random.Generator, x: float) -> None:
+def _wires(builder: MeshBuilder, rng: np.random.Generator, x: Number) -> None:
     """Wooden poles with cables between them."""
     height, step = rng.uniform(6, 8), rng.uniform(22, 38)
     places = np.arange(rng.uniform(-15, 10), 120, step)
@@ -211,7 +212,7 @@ def _house(
     rng: np.random.Generator,
     road: Road,
     side: int,
-    where: tuple[float, float, float, float],
+    where: tuple[Number, Number, Number, Number],
 ) -> None:
     start, stop, back, height = where
     plot = Plot(
@@ -230,7 +231,7 @@ def _border(
     rng: np.random.Generator,
     road: Road,
     side: int,
-    where: tuple[float, float, int],
+    where: tuple[Number, Number, int],
 ) -> None:
     """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
     start, stop, kind = where
@@ -250,7 +251,7 @@ def _border(
 
 
 def _tree(
-    builder: MeshBuilder, rng: np.random.Generator, x: float, s: float, height: float | None
+    builder: MeshBuilder, rng: np.random.Generator, x: Number, s: float, height: Number | None
 ) -> None:
     tall = rng.uniform(5, 12) if height is None else height
     number = int(rng.integers(vegetation.TREES))
@@ -261,14 +262,16 @@ def _tree(
     builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
 
 
-def _bush(builder: MeshBuilder, rng: np.random.Generator, x: float, s: float, size: float) -> None:
+def _bush(
+    builder: MeshBuilder, rng: np.random.Generator, x: Number, s: float, size: Number
+) -> None:
     model = vegetation.bush(int(rng.integers(vegetation.BUSHES)), int(s > 20))
     scale = size * rng.uniform(0.7, 1.3, 3)
     tints = {"leaf": vegetation.leaf_color(rng)}
     builder.add(place(model, (x, 0, s), rng.uniform(0, 6.28), scale, tints))
 
 
-def _is_free(road: Road, side: int, s: float, length: float) -> bool:
+def _is_free(road: Road, side: int, s: Number, length: float) -> bool:
     return not road.is_side_street(s + length / 2, side, length / 2 + 1)
 
 

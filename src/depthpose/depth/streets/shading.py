@@ -108,7 +108,7 @@ def _surfaces(stage: Stage, hits: Hits, focal_px: float) -> _Surfaces:
 
 
 def _mix(
-    values: Float[Tensor, "n 3*m"], shares: Float[Tensor, "n 3"], width: int
+    values: Float[Tensor, "n triple"], shares: Float[Tensor, "n 3"], width: int
 ) -> Float[Tensor, "n m"]:
     a, b, c = values[:, :width], values[:, width : 2 * width], values[:, 2 * width :]
     return a * shares[:, :1] + b * shares[:, 1:2] + c * shares[:, 2:]

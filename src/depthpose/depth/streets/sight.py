@@ -1,12 +1,12 @@
 """What is seen from one eye of a stage, at pixel centres and between them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from depthpose.core.raster import Raster, edge_functions, rasterize
+from depthpose.core.raster import Raster, barycentric_shares, edge_functions, rasterize
 from depthpose.depth.streets.stage import Stage
 
 NEAR_M = 0.3
@@ -51,8 +51,10 @@ def look(
         eye: where the camera stands, in the left camera's frame [m].
     """
     corners = stage.corners - eye
-    raster = rasterize(corners, K, size[1], size[0], NEAR_M)
+    raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)
     edges, volume = edge_functions(corners, K)
+    shares = barycentric_shares(edges, volume, raster.primitive)
+    raster = replace(raster, barycentric=shares)
     return Sight(raster=raster, K=K, eye=eye, edges=edges, volume=volume)
 
 

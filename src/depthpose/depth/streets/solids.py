@@ -4,19 +4,18 @@ from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
-from depthpose.depth.streets.materials import Surface
+from depthpose.depth.streets.materials import Number, Surface, Values
 from depthpose.depth.streets.mesh import MeshBuilder
 
 
 def add_ball(
     builder: MeshBuilder,
-    centre: ArrayLike,
-    radii_m: ArrayLike,
+    centre: Values,
+    radii_m: Values,
     surface: Surface,
     level: int = 2,
-    dents: tuple[np.random.Generator, float] | None = None,
+    dents: tuple[np.random.Generator, Number] | None = None,
 ) -> None:
     """Add an ellipsoid.
 
@@ -47,8 +46,8 @@ def add_ball(
 def add_leaves(
     builder: MeshBuilder,
     rng: np.random.Generator,
-    where: tuple[ArrayLike, ArrayLike],
-    leaves: tuple[int, float],
+    where: tuple[Values, Values],
+    leaves: tuple[int, Number],
     surface: Surface,
     is_block: bool = False,
 ) -> None:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float16, Int
 from torch import Tensor
 
-from depthpose.depth.streets.materials import FIRST_LAYER, LAYERS, MATERIALS
+from depthpose.depth.streets.materials import FIRST_LAYER, LAYERS, MATERIALS, Number
 
 SIDE_PX = 256
 LEVELS = 9
@@ -104,7 +104,7 @@ class _Noise:
         self.rng = rng
 
     def smooth(
-        self, fall: float, band: tuple[float, float], stretch: tuple[float, float] = (1, 1)
+        self, fall: Number, band: tuple[Number, Number], stretch: tuple[Number, Number] = (1, 1)
     ) -> Plane:
         """Noise whose power falls with the frequency; ``stretch`` > 1 makes it finer in y, x."""
         fy = np.fft.fftfreq(SIDE_PX)[:, None] * SIDE_PX / stretch[0]
@@ -129,7 +129,7 @@ class _Noise:
         return self.smooth(2.4, (1, 20))
 
     def bricks(
-        self, rows: int, columns: int, joint: float, spread: float
+        self, rows: int, columns: int, joint: Number, spread: Number
     ) -> tuple[Plane, Picture, Plane]:
         """A bond: 1 on the bricks and 0 in the joints, a shade for each, the height in its row."""
         y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX

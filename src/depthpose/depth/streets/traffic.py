@@ -3,6 +3,7 @@
 import numpy as np
 
 from depthpose.depth.streets import people, vehicles
+from depthpose.depth.streets.materials import Number
 from depthpose.depth.streets.mesh import MeshBuilder, place
 from depthpose.depth.streets.road import Road
 
@@ -15,7 +16,7 @@ class _Places:
     def __init__(self) -> None:
         self._taken = [(0.0, 0.5, 1.5, 4.5)]  # the camera's own car, and sight before it
 
-    def claim(self, x: float, s: float, half_x: float, half_s: float) -> bool:
+    def claim(self, x: Number, s: float, half_x: Number, half_s: float) -> bool:
         """Take a place, if it is free."""
         for other in self._taken:
             if abs(x - other[0]) < half_x + other[2] and abs(s - other[1]) < half_s + other[3]:
@@ -78,7 +79,7 @@ def _vehicle(
     builder: MeshBuilder,
     rng: np.random.Generator,
     places: _Places,
-    where: tuple[float, float, float],
+    where: tuple[Number, Number, Number],
 ) -> None:
     x, s, yaw = where
     kind = vehicles.draw_kind(rng)
@@ -101,7 +102,9 @@ def _people(builder: MeshBuilder, rng: np.random.Generator, road: Road, places: 
         x = road.edge_m(side) + side * rng.uniform(0.3, max(0.6, strip - 0.2))
         if rng.random() < 0.12:
             x = rng.uniform(road.left_m, road.right_m)
-        _person(builder, rng, places, (x, s), on_road=road.left_m < x < road.right_m, road=road)
+        _person(
+            builder, rng, places, (x, s), on_road=bool(road.left_m < x < road.right_m), road=road
+        )
     for _ in range(int(rng.poisson(mean * 0.3))):
         side = int(rng.choice([-1, 1]))
         x = road.edge_m(side) - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
@@ -115,7 +118,7 @@ def _person(
     builder: MeshBuilder,
     rng: np.random.Generator,
     places: _Places,
-    where: tuple[float, float],
+    where: tuple[Number, Number],
     *,
     on_road: bool,
     road: Road,

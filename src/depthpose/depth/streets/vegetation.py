@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 from depthpose.depth.streets.solids import add_ball, add_leaves
 
@@ -50,7 +50,7 @@ def tree(number: int, coarseness: int = 0) -> Mesh:
 
 
 def _broadleaf(
-    builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, float], is_slim: bool
+    builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, Number], is_slim: bool
 ) -> None:
     bark = Surface("bark", _BARK, 1.0, int(rng.integers(2)))
     trunk_m, radius_m = (
@@ -72,7 +72,7 @@ def _broadleaf(
         _clump(builder, rng, (centre, radii), (leaves[0] // blobs, leaves[1]))
 
 
-def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, float]) -> None:
+def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, Number]) -> None:
     bark = Surface("bark", _BARK, 1.0, 1)
     builder.tube((0, 0.2, 0), (0, -9, 0), (0.22, 0.05), bark, 8)
     tiers = 9
@@ -87,7 +87,7 @@ def _clump(
     builder: MeshBuilder,
     rng: np.random.Generator,
     where: tuple,
-    leaves: tuple[int, float],
+    leaves: tuple[int, Number],
 ) -> None:
     """A dark core that hides what is behind, and leaves about it."""
     centre, radii = where

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from depthpose.depth.streets.materials import Color, Surface
+from depthpose.depth.streets.materials import Color, Number, Surface
 from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 
 Ring = Float[np.ndarray, "10 3"]
@@ -25,11 +25,11 @@ class Body(NamedTuple):
         share: how often it is met.
     """
 
-    size_m: tuple[float, float, float]
-    stations: tuple[tuple[float, float, float], ...]
+    size_m: tuple[Number, Number, Number]
+    stations: tuple[tuple[Number, Number, Number], ...]
     glazed: tuple[int, int]
     wheels: tuple[float, ...]
-    share: float
+    share: Number
 
 
 _HATCH = ((-0.5, 0.4, 0.45), (-0.49, 0.6, 0.62), (-0.45, 0.62, 0.66), (-0.35, 0.62, 0.96),
@@ -105,7 +105,7 @@ def _shell(
         is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
         for j in range(9):
             is_window = is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5)))
-            _panel(builder, (rear, front), j, size, is_window=is_window)
+            _panel(builder, (rear, front), j, size, is_window=bool(is_window))
     for ring in (rings[0], rings[-1]):
         hub = np.broadcast_to(ring.mean(0), ring.shape)
         faces = np.stack([hub, ring, np.roll(ring, -1, 0)], 1)
