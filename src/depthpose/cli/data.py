@@ -99,11 +99,10 @@ def _keep_settings(out: Path, settings: dict) -> None:
     if not path.exists():
         write_json(path, settings)
         return
-    there = read_json(path)
+    read = read_json(path)
+    there = read if isinstance(read, dict) else {}
     # Seeds have drives of their own, so they may share a folder.
-    differing = [
-        key for key in settings if key != "seed" and (there or {}).get(key) != settings[key]
-    ]
+    differing = [key for key in settings if key != "seed" and there.get(key) != settings[key]]
     if differing:
         raise InputError(
             f"{path}: the frames here were made with other settings ({', '.join(differing)}); "

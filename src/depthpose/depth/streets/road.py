@@ -185,9 +185,9 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
     grey, green = rng.uniform(0.6, 1.2), rng.uniform(0.75, 1.4)
     warm = 1 + 0.2 * rng.normal()
     walk = Surface(
-        "pavement", (0.27 * grey, 0.26 * grey, 0.25 * grey), rng.uniform(1.6, 3.2), variants[1]
+        "pavement", (0.2 * grey, 0.19 * grey, 0.18 * grey), rng.uniform(1.6, 3.2), variants[1]
     )
-    grass = Surface("grass", (0.12 * green * warm, 0.15 * green, 0.045 * green), 3.0, variants[2])
+    grass = Surface("grass", (0.1 * green * warm, 0.125 * green, 0.022 * green), 3.0, variants[2])
     builder.begin_thing()
     _strip(builder, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
@@ -202,8 +202,8 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
 
 
 def _asphalt(rng: np.random.Generator) -> Surface:
-    light = rng.uniform(0.75, 1.5)
-    color: Color = (0.125 * light, 0.125 * light, 0.13 * light)
+    light = rng.uniform(0.7, 1.45)
+    color: Color = (0.105 * light, 0.105 * light, 0.107 * light)
     return Surface("road", color, 3.0, int(rng.integers(4)))
 
 

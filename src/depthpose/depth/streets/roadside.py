@@ -76,7 +76,7 @@ def _avenue(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: in
     """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
     step, height = rng.uniform(6, 14), rng.uniform(6, 13)
     x = road.edge_m(side) + side * rng.uniform(1.2, max(1.5, road.verge_m))
-    has_row, has_border, has_houses = rng.random(3) < (0.65, 0.5, 0.45)
+    has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
     rail = int(rng.integers(4))
     if has_row:
         for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
@@ -134,7 +134,7 @@ def _copse(
     where: tuple[Number, Number, Number],
 ) -> None:
     s, length, depth = where
-    for _ in range(int(rng.integers(1, 5))):
+    for _ in range(int(rng.integers(1, 7))):
         x = road.plot_m(side) + side * (1.5 + depth * rng.uniform(0, 1))
         if not road.is_side_street(s + length / 2, side, length / 2):
             _tree(builder, rng, x, s + rng.uniform(0, length), rng.uniform(4, 13))
@@ -277,8 +277,8 @@ def _is_free(road: Road, side: int, s: Number, length: float) -> bool:
 
 def _horizon(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
     """Trees across the end of the road's straight part, so that the view is closed somewhere."""
-    if rng.random() < 0.75:
-        for _ in range(40):
+    if rng.random() < 0.85:
+        for _ in range(int(rng.integers(30, 90))):
             side = int(rng.choice([-1, 1]))
             x = road.plot_m(side) + side * rng.uniform(2, 90)
-            _tree(builder, rng, x, rng.uniform(110, 260), rng.uniform(6, 14))
+            _tree(builder, rng, x, rng.uniform(90, 230), rng.uniform(7, 16))

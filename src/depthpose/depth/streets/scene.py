@@ -124,11 +124,11 @@ def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
     low = np.stack([x, 0 * x + 90, z], 1)
     high = np.stack([x, -height, z], 1)
     along = np.arange(len(angle)) * 12.0
-    under, over = np.stack([along, 0 * along], 1), np.stack([along, height], 1)
+    under, over = np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1)
     faces, uv = (
         np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1) for a, b in ((low, high), (under, over))
     )
-    surface = Surface("hills", (0.06, 0.085, 0.04), 60.0, int(rng.integers(2)))
+    surface = Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2)))
     builder.quads(faces, uv, surface)
 
 

@@ -47,16 +47,16 @@ def draw_sensors(
         jpeg_share: how many pictures are compressed.
     """
     luminance = light.mean(-1)
-    metered = luminance[len(luminance) // 3 :].clamp(max=1.5).mean() + 1e-3
-    exposure = float(0.3 / metered) * float(np.exp(rng.normal(0, 0.25)))
+    metered = luminance[len(luminance) // 3 :].clamp(max=1.2).mean() + 1e-3
+    exposure = float(0.25 / metered) * float(np.exp(rng.normal(0, 0.28)))
     white = np.exp(rng.normal(0, 0.035, 3))
     is_jpeg = bool(rng.random() < jpeg_share)
     common = {
-        "blur": rng.uniform(0.05, 0.3),
+        "blur": rng.uniform(0.0, 0.22),
         "glare": rng.uniform(0, 0.05),
         "vignette": rng.uniform(0, 0.2),
         "noise": (rng.uniform(0.004, 0.025), rng.uniform(0.0005, 0.004)),
-        "gamma": rng.uniform(1.9, 2.4),
+        "gamma": rng.uniform(1.6, 2.1),
         "jpeg_quality": int(rng.integers(75, 98)) if is_jpeg else None,
     }
     gain = np.exp(rng.normal(0, 0.02) + rng.normal(0, 0.006, 3))

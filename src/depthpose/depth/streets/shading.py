@@ -74,9 +74,9 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     upward = 0.5 + 0.5 * (surfaces.normal @ stage.up)
     openness = open_share(stage, hits.points + 0.05 * surfaces.plane)
     sky = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
-    ambient = ((0.22 + 0.5 * upward) * openness)[:, None] * sky
+    ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky
     # Light that the ground throws back.
-    bounced = ((1 - upward) * openness * 0.055)[:, None] * sun_color
+    bounced = ((1 - upward) * openness * 0.045)[:, None] * sun_color
     color = surfaces.albedo * (sun[:, None] * sun_color + ambient + bounced)
     color += surfaces.albedo * (2 * _GLOW[surfaces.material])[:, None]
     _add_mirrored(stage, hits, surfaces, lit, color)

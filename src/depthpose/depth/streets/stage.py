@@ -186,4 +186,4 @@ def open_share(stage: Stage, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"
     for x, y in ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1)):
         above_m = placed[:, 2] - flat[start + (y * side + x)] - 0.08
         hidden += torch.where(above_m > 0, 1 / (1 + 0.25 * above_m.clamp(min=0)), 0)
-    return torch.where(is_inside, 1 - 0.16 * hidden, 1.0)
+    return torch.where(is_inside, 1 - 0.17 * hidden, 1.0)

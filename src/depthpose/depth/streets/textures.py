@@ -155,13 +155,13 @@ def _road(noise: _Noise, variant: int) -> Picture:
         noise.broad() - 0.4 * variant % 1, 0, 1
     )
     rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
-    return _grey(1 + (0.1 + 0.03 * variant) * fine + 0.08 * rough + 0.04 * broad - 0.4 * cracks)
+    return _grey(1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks)
 
 
 def _pavement(noise: _Noise, variant: int) -> Picture:
     rows, columns = ((4, 4), (12, 6), (8, 8))[variant]
     is_slab, shade, _ = noise.bricks(rows, columns, 0.05, 0.07)
-    return shade * _grey((1 + 0.06 * noise.rough() + 0.07 * noise.fine()) * (0.65 + 0.35 * is_slab))
+    return shade * _grey((1 + 0.08 * noise.rough() + 0.14 * noise.fine()) * (0.55 + 0.45 * is_slab))
 
 
 def _grass(noise: _Noise, variant: int) -> Picture:
@@ -320,7 +320,7 @@ def _skin(noise: _Noise, _variant: int) -> Picture:
 
 
 def _hills(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.3 * noise.smooth(1.0, (4, 128)) + 0.2 * noise.broad())
+    return _grey(1 + 0.4 * noise.smooth(1.0, (16, 128)) + 0.15 * noise.broad())
 
 
 _PAINTERS = {

@@ -14,7 +14,7 @@ HEDGES = 4
 """How many different models there are of each."""
 
 _GREENS: list[Color] = [
-    (0.11, 0.17, 0.045), (0.15, 0.2, 0.06), (0.08, 0.13, 0.05), (0.2, 0.2, 0.06), (0.24, 0.15, 0.05)
+    (0.1, 0.16, 0.03), (0.15, 0.2, 0.04), (0.07, 0.12, 0.035), (0.22, 0.2, 0.04), (0.26, 0.14, 0.03)
 ]  # fmt: skip
 _TREE_LEAVES = ((1400, 0.33), (400, 0.52), (100, 0.85))
 _BUSH_LEAVES = ((110, 0.15), (40, 0.22))
@@ -92,10 +92,10 @@ def _clump(
     """A dark core that hides what is behind, and leaves about it."""
     centre, radii = where
     light = rng.uniform(0.8, 1.15)
-    core = Surface("leaf", (0.4 * light, 0.4 * light, 0.4 * light), 0.9, int(rng.integers(3)))
+    core = Surface("leaf", (0.3 * light, 0.3 * light, 0.3 * light), 0.9, int(rng.integers(3)))
     is_near = leaves[1] < 0.4
     add_ball(builder, centre, np.asarray(radii) * 0.76, core, int(is_near), (rng, 0.25))
-    surface = Surface("leaf", (light * 0.75, light * 0.75, light * 0.75), 0.9, int(rng.integers(3)))
+    surface = Surface("leaf", (light * 0.7, light * 0.7, light * 0.7), 0.9, int(rng.integers(3)))
     add_leaves(builder, rng, where, leaves, surface)
 
 

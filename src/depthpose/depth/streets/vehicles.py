@@ -89,7 +89,7 @@ def vehicle(kind: str, number: int) -> Mesh:
     builder = MeshBuilder()
     _shell(builder, rng, body, size)
     _wheels(builder, body, size, number)
-    _trim(builder, size, is_long=kind in ("lorry", "bus"))
+    _trim(builder, size)
     return builder.finish()
 
 
@@ -177,7 +177,7 @@ def _wheels(builder: MeshBuilder, body: Body, size: Float[np.ndarray, "3"], numb
             builder.disc(hub + np.array([side * 0.012, 0, 0]), (side, 0, 0), radius * 0.66, rim, 12)
 
 
-def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"], *, is_long: bool) -> None:
+def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"]) -> None:
     length, width, height = size
     low = min(height, 1.6)
     white, red = Surface("lamp", (0.8, 0.81, 0.83)), Surface("lamp", (0.4, 0.02, 0.02))
@@ -194,6 +194,7 @@ def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"], *, is_long: bool) 
     builder.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
     builder.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
     builder.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
-    if not is_long:
-        rear_pane = Surface("glass", (0.03, 0.03, 0.035))
-        builder.box((0, -0.72 * height, -0.5 * length + 0.02), (0.01, 0.01, 0.01), rear_pane)
+    if height > 1.9:  # what is loft from glass elsewhere stands upright here
+        pane = Surface("glass", (0.03, 0.03, 0.035))
+        where = (0, -0.74 * height, -0.499 * length)
+        builder.box(where, (width * 0.72, height * 0.28, 0.02), pane)

@@ -35,24 +35,25 @@ class Weather:
 
 def draw_weather(rng: np.random.Generator) -> Weather:
     """Draw a day: mostly sun, as where KITTI was recorded, else overcast; sometimes hazy."""
-    is_overcast = bool(rng.random() < 0.3)
+    is_overcast = bool(rng.random() < 0.25)
     height = np.deg2rad(rng.uniform(12, 62))
     turn = rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(height) * np.sin(turn), -np.sin(height), np.cos(height) * np.cos(turn)])
     low = np.clip((height - 0.2) / 0.6, 0, 1)
-    strength = rng.uniform(0, 0.2) if is_overcast else rng.uniform(2.6, 4.6)
-    sky = rng.uniform(0.55, 0.95) * (1.35 if is_overcast else 1.0)
-    blue = np.array([0.85, 0.9, 1.0]) if is_overcast else np.array([0.32, 0.55, 1.0])
-    pale = np.array([0.95, 0.98, 1.0]) if is_overcast else np.array([0.95, 1.05, 1.15])
-    glare = 1.0 if is_overcast else rng.uniform(1.0, 2.6)
+    strength = rng.uniform(0, 0.2) if is_overcast else rng.uniform(3.2, 5.0)
+    sky = rng.uniform(0.8, 1.5) * (1.2 if is_overcast else 1.0)
+    blue = np.array([0.85, 0.9, 1.0]) if is_overcast else np.array([0.13, 0.33, 0.85])
+    pale = np.array([0.95, 0.98, 1.0]) if is_overcast else np.array([0.55, 0.8, 1.1])
+    glare = 1.0 if is_overcast else float(np.exp(rng.uniform(0.0, 1.4)))
     haze = rng.uniform(150, 500) if rng.random() < 0.2 else rng.uniform(500, 3000)
     return Weather(
         sun=sun,
         sun_color=np.array([1.0, 0.78 + 0.18 * low, 0.55 + 0.36 * low]) * strength,
-        zenith=blue * sky,
-        horizon=pale * sky * glare,
+        zenith=blue * sky * glare**0.5,
+        # The more it glares, the whiter it is.
+        horizon=(pale / glare + (1 - 1 / glare)) * sky * glare,
         is_overcast=is_overcast,
-        cloud=float(rng.uniform(0, 1)),
+        cloud=float(rng.uniform(0.3, 1)) if is_overcast else float(rng.uniform(0, 1)) ** 2,
         haze_m=float(haze),
         shift=(float(rng.random()), float(rng.random())),
     )
