@@ -7,7 +7,7 @@ device of the triangles, in memory that does not grow with the scene, and gives 
 every time.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,7 +92,7 @@ def rasterize(
         raise InputError(f"near_m is {near_m}, but a camera sees what is in front; take 0.01")
     corners = triangles.double() @ K.to(triangles.device).mT
     number, first, last = _pinhole_boxes(corners, (width, height), near_m)
-    raw, volume = _edges(corners[number])
+    raw, volume = _edges(corners.index_select(0, number))
     scale = torch.where(volume != 0, 1 / volume, 0)
     prepared = _Prepared(
         edges=raw * volume.sign()[:, None, None],
@@ -133,10 +133,10 @@ def rasterize_orthographic(
     nearest_m = flat[..., 2].amin() if len(flat) else flat.new_zeros(())
     corners = torch.cat([flat[..., :2], torch.ones_like(flat[..., 2:])], -1)
     number, first, last = _boxes(flat[..., :2], (width, height))
-    raw, volume = _edges(corners[number])
+    raw, volume = _edges(corners.index_select(0, number))
     scale = torch.where(volume != 0, 1 / volume, 0)[:, None, None]
     # Sorting keys are the bits of a float, which ascend for positive numbers alone.
-    above_m = (flat[number][..., 2] - nearest_m)[..., None]
+    above_m = (flat.index_select(0, number)[..., 2] - nearest_m)[..., None]
     prepared = _Prepared(
         edges=raw * volume.sign()[:, None, None],
         plane=(raw * scale * above_m).sum(1),
@@ -182,10 +182,10 @@ def barycentric_shares(
     seen = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
     which = primitive.reshape(-1)[seen]
     u, v = (seen % width).double()[:, None], (seen // width).double()[:, None]
-    across, down, constant = edges[which].unbind(-1)
+    across, down, constant = edges.index_select(0, which).unbind(-1)
     weight = torch.addcmul(constant, across, u).addcmul_(down, v).div_(volume[which, None])
     weight = weight.clamp_(min=0)  # beyond the edge by a rounding, where a pixel lies on it
-    shares[seen] = (weight / weight.sum(1, keepdim=True)).float()
+    shares[seen] = (weight / _most(torch.add, weight)[:, None]).float()
     return shares.reshape(height, width, 3)
 
 
@@ -262,22 +262,25 @@ def _draw(prepared: _Prepared, part: slice, buffer: Tensor, width: int, near_m: 
     which, row = _expand(prepared.first[part, 1], prepared.last[part, 1])
     which = which + part.start
     v = row.double()
-    slope = prepared.edges[which, :, 0]
-    offset = prepared.edges[which, :, 1] * v[:, None] + prepared.edges[which, :, 2]
+    across, down, constant = prepared.edges.index_select(0, which).unbind(-1)
+    slope, offset = across, torch.addcmul(constant, down, v[:, None])
     start, stop = _span(slope, offset, prepared.first[which, 0], prepared.last[which, 0])
     kept = (start <= stop).nonzero()[:, 0]
-    which, row, start, stop, v = (t[kept] for t in (which, row, start, stop, v))
-    plane = prepared.plane[which]
+    which, row, start, stop, v = (
+        values.index_select(0, kept) for values in (which, row, start, stop, v)
+    )
+    plane = prepared.plane.index_select(0, which)
     at_row = plane[:, 1] * v + plane[:, 2]
-    number = prepared.number[which]
+    number = prepared.number.index_select(0, which)
     for some in _chunks(stop - start + 1, _MAX_PIXELS):
         span, u = _expand(start[some], stop[some])
-        value = plane[some, 0][span] * u + at_row[some][span]
+        start_value = at_row[some].index_select(0, span)
+        value = torch.addcmul(start_value, plane[some, 0].index_select(0, span), u)
         depth = (1 / value if prepared.is_inverse else value.clamp(min=0)).float()
-        key = (depth.view(torch.int32).long() << 32) | number[some][span]
+        key = (depth.view(torch.int32).long() << 32) | number[some].index_select(0, span)
         # Where 1 / depth is not positive, the plane is met behind the camera.
         key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)
-        buffer.scatter_reduce_(0, (row * width)[some][span] + u, key, "amin")
+        buffer.scatter_reduce_(0, (row * width)[some].index_select(0, span) + u, key, "amin")
 
 
 def _span(
@@ -288,15 +291,21 @@ def _span(
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
     """Columns from which and up to which all three ``slope * u + offset`` are not negative."""
     cross = -offset / slope
-    left = torch.where(slope > 0, cross, -torch.inf).amax(1)
-    right = torch.where(slope < 0, cross, torch.inf).amin(1)
-    is_outside = ((slope == 0) & (offset < 0)).any(1)
+    left = _most(torch.maximum, torch.where(slope > 0, cross, -torch.inf))
+    right = _most(torch.minimum, torch.where(slope < 0, cross, torch.inf))
+    is_level = slope == 0
+    is_outside = _most(torch.logical_or, is_level & (offset < 0))
     # A triangle of no area has only lines of zeros and would cover everything.
-    is_flat = (slope == 0).all(1)
+    is_flat = _most(torch.logical_and, is_level)
     start = torch.maximum(left.ceil(), first.double())
     stop = torch.minimum(right.floor(), last.double())
     stop = torch.where(is_outside | is_flat, -1, stop)
     return start.long(), stop.clamp(min=-1).long()
+
+
+def _most(join: Callable[[Tensor, Tensor], Tensor], values: Tensor) -> Tensor:
+    """Join the three columns: ten times as fast as a reduction over so short an axis."""
+    return join(join(values[:, 0], values[:, 1]), values[:, 2])
 
 
 def _expand(
@@ -306,7 +315,7 @@ def _expand(
     count = last - first + 1
     owner = torch.repeat_interleave(torch.arange(len(count), device=first.device), count)
     begin = first - (count.cumsum(0) - count)
-    return owner, torch.arange(len(owner), device=first.device) + begin[owner]
+    return owner, torch.arange(len(owner), device=first.device) + begin.index_select(0, owner)
 
 
 def _chunks(counts: Int64[Tensor, " n"], limit: int) -> Iterator[slice]:

@@ -215,8 +215,12 @@ class MeshBuilder:
 
 def plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, "n 3"]:
     """Give the unit normals of triangles; 0 for those without area."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / (np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12)
+    (ax, ay, az), (bx, by, bz) = (
+        (corners[:, 1] - corners[:, 0]).T,
+        (corners[:, 2] - corners[:, 0]).T,
+    )
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+    return normal / (np.sqrt((normal**2).sum(1, keepdims=True)) + 1e-12)
 
 
 def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:

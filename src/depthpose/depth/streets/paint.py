@@ -85,4 +85,4 @@ def _wear(scene: StreetScene, x: Tensor, s: Tensor) -> Float[Tensor, " n"]:
 
 def _field(u: Tensor, v: Tensor) -> Tensor:
     column, row = (u * SIDE_PX).long() % SIDE_PX, (v * SIDE_PX).long() % SIDE_PX
-    return textures().stains.flatten()[row * SIDE_PX + column]
+    return textures().stains.flatten().index_select(0, row * SIDE_PX + column)

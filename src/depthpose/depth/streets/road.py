@@ -156,11 +156,15 @@ def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, 
 
 def bend(mesh: Mesh, road: Road) -> Mesh:
     """Carry what was laid out along the straight street to the real one."""
-    points = mesh.corners.reshape(-1, 3).astype(np.float64)
-    table = road.centre
-    s = points[:, 2]
-    x, y, z, heading = (np.interp(s, table[:, 0], table[:, i]) for i in range(1, 5))
-    curvature = np.interp(s, table[:, 0], np.gradient(table[:, 4], table[:, 0]))
+    points = mesh.corners.reshape(-1, 3)
+    curvature = np.gradient(road.centre[:, 4], road.centre[:, 0])
+    table = np.column_stack([road.centre, curvature]).astype(np.float32)
+    # The table has a row a metre.
+    place = np.clip(points[:, 2] - table[0, 0], 0, len(table) - 1.001)
+    row = place.astype(np.int64)
+    share = (place - row)[:, None]
+    here = table[row] * (1 - share) + table[row + 1] * share
+    x, y, z, heading, curvature = here[:, 1:].T
     # On the inside of a curve nothing may lie beyond its centre: the ground would fold.
     inward = np.clip(points[:, 0] * curvature, 0, None)
     across = points[:, 0] / (1 + inward**4) ** 0.25

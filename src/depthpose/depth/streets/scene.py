@@ -96,9 +96,9 @@ def _mount(
 def _seen_from(
     mesh: Mesh, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
 ) -> Mesh:
-    corners = ((mesh.corners - position) @ rotation.T).astype(np.float32)
-    normals = (mesh.normals @ rotation.T).astype(np.float32)
-    moved = replace(mesh, corners=corners, normals=normals)
+    turn = rotation.T.astype(np.float32)
+    corners = (mesh.corners - position.astype(np.float32)) @ turn
+    moved = replace(mesh, corners=corners, normals=mesh.normals @ turn)
     # What is far behind casts no shadow that is seen.
     kept = corners[:, :, 2].max(1) > -12
     return Mesh(**{name: getattr(moved, name)[kept] for name in Mesh.__dataclass_fields__})

@@ -168,7 +168,9 @@ def _share_before(
     start = top.long() * side + left.long()
     flat = light.depth_m.flatten()
     limit = placed[:, 2] - 0.8 * light.texel_m
-    a, b, c, d = ((flat[start + step] >= limit).float() for step in (0, 1, side, side + 1))
+    a, b, c, d = (
+        (flat.index_select(0, start + step) >= limit).float() for step in (0, 1, side, side + 1)
+    )
     upper, lower = torch.lerp(a, b, across), torch.lerp(c, d, across)
     return torch.lerp(upper, lower, down).clamp(0, 1), is_inside
 
@@ -184,6 +186,6 @@ def open_share(stage: Stage, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"
     flat = light.depth_m.flatten()
     hidden = torch.zeros(len(points))
     for x, y in ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1)):
-        above_m = placed[:, 2] - flat[start + (y * side + x)] - 0.08
+        above_m = placed[:, 2] - flat.index_select(0, start + (y * side + x)) - 0.08
         hidden += torch.where(above_m > 0, 1 / (1 + 0.25 * above_m.clamp(min=0)), 0)
     return torch.where(is_inside, 1 - 0.17 * hidden, 1.0)

@@ -88,7 +88,7 @@ def sample_texture(
     above, below = start + (row & mask) * side, start + ((row + 1) & mask) * side
     texels = textures.texels
     corners = (
-        texels[index].float()
+        texels.index_select(0, index).float()
         for index in (above + left, above + right, below + left, below + right)
     )
     a, b, c, d = corners

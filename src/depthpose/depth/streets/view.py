@@ -40,26 +40,34 @@ def _centres(index: Int[Tensor, " n"], width: int) -> Float64[Tensor, "n 2"]:
 def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Seen:
     raster = sight.raster
     assert raster.barycentric is not None
-    shares = raster.barycentric.reshape(-1, 3)[index]
-    return raster.primitive.flatten()[index], shares, raster.depth_m.flatten()[index]
+    shares, primitive, depth_m = (
+        values.flatten(0, 1).index_select(0, index)
+        for values in (raster.barycentric, raster.primitive, raster.depth_m)
+    )
+    return primitive, shares, depth_m
 
 
 def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
     """Pixels beside which something else is seen, or the same thing bent sharply."""
     seen = raster.primitive.clamp(min=0)
     kind = torch.where(raster.primitive >= 0, stage.kind[seen], -1)
-    normal = stage.attributes[:, 18:21][seen]
+    normal = stage.attributes[:, 18:21].index_select(0, seen.flatten()).unflatten(0, seen.shape)
     edge = torch.zeros_like(kind, dtype=torch.bool)
     for one, other in (
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
         ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
     ):
         is_other = raster.primitive[one] != raster.primitive[other]
-        is_bent = (normal[one] * normal[other]).sum(-1).abs() < 0.9
+        is_bent = _aligned(normal[one], normal[other]) < 0.9
         differs = is_other & ((kind[one] != kind[other]) | is_bent)
         edge[one] |= differs
         edge[other] |= differs
     return edge
+
+
+def _aligned(one: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    both = one * other
+    return (both[..., 0] + both[..., 1] + both[..., 2]).abs()
 
 
 def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
@@ -94,11 +102,11 @@ def _light(
     light[sky] = sky_light(stage, towards[sky])
     hit = (primitive >= 0).nonzero()[:, 0]
     hits = Hits(
-        primitive=primitive[hit],
-        barycentric=shares[hit],
-        points=rays[hit] * depth[hit, None] + sight.eye,
-        towards=towards[hit],
-        distance_m=(length * depth)[hit],
+        primitive=primitive.index_select(0, hit),
+        barycentric=shares.index_select(0, hit),
+        points=(rays * depth[:, None] + sight.eye).index_select(0, hit),
+        towards=towards.index_select(0, hit),
+        distance_m=(length * depth).index_select(0, hit),
     )
     light[hit] = shade(stage, hits, float(sight.K[0, 0]))
     return light
