@@ -82,6 +82,7 @@ def draw_curves(path: Path, name: str, curves: dict[str, np.ndarray]) -> None:
 
 
 def main() -> None:
+    """Draw, read, compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--number", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
@@ -104,16 +105,16 @@ def main() -> None:
     road = np.mean([float(f.is_road.float().mean()) for f in frames])
     occluded = np.mean([float(f.occluded.float().mean()) for f in frames])
     print(f"made: sky {sky:.3f}, road {road:.3f}, occluded {occluded:.3f} of the pixels")
-    print(
-        f"mean brightness: real {real['brightness by row'].mean():.3f}, made {made['brightness by row'].mean():.3f}"
-    )
-    write_json(
-        words.out / "statistics.json",
-        {
-            kind: {k: [None if np.isnan(x) else float(x) for x in v] for k, v in one.items()}
-            for kind, one in (("real", real), ("made", made))
-        },
-    )
+    bright = [float(one["brightness by row"].mean()) for one in (real, made)]
+    print(f"mean brightness: real {bright[0]:.3f}, made {bright[1]:.3f}")
+    # JSON knows no NaN: rows where nothing is known.
+    listed = {
+        kind: {
+            name: [x if np.isfinite(x) else None for x in map(float, v)] for name, v in one.items()
+        }
+        for kind, one in (("real", real), ("made", made))
+    }
+    write_json(words.out / "statistics.json", listed)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def draw_style(rng: np.random.Generator, *, with_details: bool) -> Style:
     base = {"brick": (0.3, 0.12, 0.08), "stone": (0.3, 0.26, 0.22)}.get(
         kind, _PLASTERS[rng.integers(len(_PLASTERS))]
     )
-    r, g, b = np.array(base) * rng.uniform(0.45, 1.1) * (1 + 0.08 * rng.normal(size=3))
+    r, g, b = np.array(base) * rng.uniform(0.4, 1.0) * (1 + 0.08 * rng.normal(size=3))
     tile_m = {"brick": 1.8, "stone": 2.6, "plaster": 3.4}[kind] * rng.uniform(0.85, 1.2)
     return Style(
         wall=Surface(kind, (r, g, b), tile_m, int(rng.integers(8))),

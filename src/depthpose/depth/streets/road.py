@@ -16,7 +16,7 @@ from depthpose.depth.streets.mesh import Mesh, MeshBuilder
 
 Place = Literal["city", "suburb", "avenue", "rural", "forest"]
 PLACES: dict[Place, float] = {
-    "city": 0.26, "suburb": 0.28, "avenue": 0.2, "rural": 0.14, "forest": 0.12
+    "city": 0.2, "suburb": 0.28, "avenue": 0.26, "rural": 0.14, "forest": 0.12
 }  # fmt: skip
 """Kinds of places, and how often each is met."""
 
@@ -191,7 +191,7 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
     walk = Surface(
         "pavement", (0.2 * grey, 0.19 * grey, 0.18 * grey), rng.uniform(1.6, 3.2), variants[1]
     )
-    grass = Surface("grass", (0.1 * green * warm, 0.125 * green, 0.022 * green), 3.0, variants[2])
+    grass = Surface("grass", (0.075 * green * warm, 0.088 * green, 0.02 * green), 3.0, variants[2])
     builder.begin_thing()
     _strip(builder, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
     land = walk if road.place == "city" and rng.random() < 0.7 else grass

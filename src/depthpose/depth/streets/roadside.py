@@ -27,10 +27,13 @@ def add_roadside(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> 
         else:
             _country(builder, rng, road, side)
         _kerb(builder, rng, road, side)
+        _woods(builder, rng, road, side)
     _horizon(builder, rng, road)
 
 
 def _houses(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
+    if road.walk_m > 2 and rng.random() < 0.55:
+        _tree_row(builder, rng, road, side, road.edge_m(side) + side * 0.9)
     s, set_back = rng.uniform(-12, -4), rng.uniform(0, 3) * (rng.random() < 0.4)
     tall = rng.uniform(6, 17)
     while s < _FAR_M:
@@ -74,20 +77,11 @@ def _gardens(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: i
 
 def _avenue(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
     """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
-    step, height = rng.uniform(6, 14), rng.uniform(6, 13)
-    x = road.edge_m(side) + side * rng.uniform(1.2, max(1.5, road.verge_m))
     has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
     rail = int(rng.integers(4))
     if has_row:
-        for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
-            if not road.is_side_street(s, side, 2) and rng.random() < 0.85:
-                _tree(
-                    builder,
-                    rng,
-                    x + rng.normal(0, 0.3),
-                    s + rng.normal(0, 0.8),
-                    height * rng.uniform(0.8, 1.2),
-                )
+        x = road.edge_m(side) + side * rng.uniform(1.2, max(1.5, road.verge_m))
+        _tree_row(builder, rng, road, side, x)
     if has_border:
         _border(builder, rng, road, side, (-8, 100, rail))
     s = rng.uniform(-10, 5)
@@ -100,6 +94,16 @@ def _avenue(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: in
         else:
             _copse(builder, rng, road, side, (s, length, rng.uniform(4, 14)))
         s += length + rng.uniform(0, 10)
+
+
+def _tree_row(
+    builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int, x: Number
+) -> None:
+    step, height = rng.uniform(6, 14), rng.uniform(5, 13)
+    for s in np.arange(rng.uniform(-8, 6), _FAR_M, step):
+        if not road.is_side_street(s, side, 2) and rng.random() < 0.85:
+            place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
+            _tree(builder, rng, *place_m, height * rng.uniform(0.8, 1.2))
 
 
 def _country(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
@@ -124,6 +128,20 @@ def _country(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: i
             s += rng.uniform(8, 18)
     if not is_forest and rng.random() < 0.45:
         _border(builder, rng, road, side, (-8, 90, int(rng.integers(4))))
+
+
+def _woods(builder: MeshBuilder, rng: np.random.Generator, road: Road, side: int) -> None:
+    """The front of a wood: right behind a forest's first trees, far behind elsewhere."""
+    is_forest = road.place == "forest"
+    chance = {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(road.place, 0.55)
+    if rng.random() > chance:
+        return
+    near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
+    start = rng.uniform(-10, 0) if is_forest else rng.uniform(-10, 60)
+    x = road.plot_m(side) + side * near
+    stop, other = start + rng.uniform(60, 200), x + side * rng.uniform(-2, 15)
+    height *= rng.uniform(0.7, 1.3)
+    vegetation.add_wood_edge(builder, rng, (x, start, other, stop), height)
 
 
 def _copse(
@@ -282,3 +300,7 @@ def _horizon(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None
             side = int(rng.choice([-1, 1]))
             x = road.plot_m(side) + side * rng.uniform(2, 90)
             _tree(builder, rng, x, rng.uniform(90, 230), rng.uniform(7, 16))
+    if rng.random() < 0.6:
+        s, half = rng.uniform(170, 300), rng.uniform(60, 160)
+        line = (-half, s, half, s + rng.uniform(-40, 40))
+        vegetation.add_wood_edge(builder, rng, line, rng.uniform(7, 14))

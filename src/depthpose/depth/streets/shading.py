@@ -80,7 +80,7 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
     color += surfaces.albedo * (2 * _GLOW[surfaces.material])[:, None]
     _add_mirrored(stage, hits, surfaces, lit, color)
     thick = 1 - torch.exp(-hits.distance_m / weather.haze_m)
-    haze = torch.from_numpy(weather.horizon).float() * 0.9
+    haze = torch.from_numpy(weather.horizon).float() * 0.7
     return torch.lerp(color, haze.expand_as(color), thick[:, None])
 
 
@@ -183,7 +183,7 @@ def sky_light(
     )
     height = towards @ stage.up
     color = torch.lerp(horizon.expand(len(height), 3), zenith.expand(len(height), 3),
-                       (height.clamp(0, 1) ** 0.5)[:, None])  # fmt: skip
+                       (height.clamp(0, 1) ** 0.33)[:, None])  # fmt: skip
     cover, is_sky = _clouds(stage, towards, height)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
     color = torch.lerp(color, lit, (0.8 * cover)[:, None])

@@ -166,7 +166,7 @@ def _pavement(noise: _Noise, variant: int) -> Picture:
 
 def _grass(noise: _Noise, variant: int) -> Picture:
     fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
-    dry = 0.1 + 0.08 * variant
+    dry = 0.14 + 0.1 * variant
     red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
     green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
     return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)

@@ -1,6 +1,7 @@
 """Trees, bushes and hedges, as models that are made once and placed many times."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -121,3 +122,48 @@ def hedge(number: int) -> Mesh:
     surface = Surface("leaf", (0.7, 0.7, 0.7), 0.9, variant)
     add_leaves(builder, rng, ((0, -0.5, 0), (0.35, 0.5, 2.0)), (420, 0.13), surface, is_block=True)
     return builder.finish()
+
+
+def add_wood_edge(
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    line: tuple[Number, Number, Number, Number],
+    height_m: Number,
+) -> None:
+    """Add the dark, uneven front of a dense wood, which closes the view behind single trees.
+
+    Args:
+        builder: what to add to.
+        rng: random numbers.
+        line: x and s of its start, x and s of its end [m].
+        height_m: of the wood, more or less.
+    """
+    x0, s0, x1, s1 = line
+    count = max(3, int(np.hypot(x1 - x0, s1 - s0) / 1.5))
+    share = np.linspace(0, 1, count)
+    x = x0 + (x1 - x0) * share + rng.normal(0, 0.6, count)
+    s = s0 + (s1 - s0) * share + rng.normal(0, 0.3, count)
+    rows = np.array([0.3, -0.35, -0.75, -1.0]) * height_m
+    out = rng.normal(0, 0.5, (len(rows), count))
+    up = rows[:, None] * np.clip(1 + 0.13 * rng.normal(size=count), 0.6, 1.4)
+    points = np.stack([x + out, up, s + 0.5 * out[::-1]], -1)
+    along = np.arange(count) * 1.5
+    r, g, b = leaf_color(rng)
+    builder.begin_thing()
+    surface = Surface("leaf", (0.3 * r, 0.3 * g, 0.3 * b), 3.0, int(rng.integers(3)))
+    for low, high in pairwise(range(len(rows))):
+        places = (np.stack([along, -up[row]], 1) for row in (low, high))
+        faces, uv = (
+            np.stack([a[:-1], a[1:], c[1:], c[:-1]], 1)
+            for a, c in ((points[low], points[high]), tuple(places))
+        )
+        shade = rng.uniform(0.4, 1.3, (count - 1, 1))
+        builder.quads(faces, uv, surface, tint=shade * np.asarray(surface.tint))
+    leaf = surface._replace(tint=(0.6 * r, 0.6 * g, 0.6 * b))
+    for start in range(0, count - 4, 4):
+        if s[start] < 80:  # farther away they would be less than a pixel
+            middle, reach = (
+                (x[start + 2], -0.52 * height_m, s[start + 2]),
+                (1.3, 0.55 * height_m, 3.6),
+            )
+            add_leaves(builder, rng, (middle, reach), (300, 0.5), leaf, is_block=True)

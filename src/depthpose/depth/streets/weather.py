@@ -43,9 +43,9 @@ def draw_weather(rng: np.random.Generator) -> Weather:
     strength = rng.uniform(0, 0.2) if is_overcast else rng.uniform(3.2, 5.0)
     sky = rng.uniform(0.8, 1.5) * (1.2 if is_overcast else 1.0)
     blue = np.array([0.85, 0.9, 1.0]) if is_overcast else np.array([0.13, 0.33, 0.85])
-    pale = np.array([0.95, 0.98, 1.0]) if is_overcast else np.array([0.55, 0.8, 1.1])
-    glare = 1.0 if is_overcast else float(np.exp(rng.uniform(0.0, 1.4)))
-    haze = rng.uniform(150, 500) if rng.random() < 0.2 else rng.uniform(500, 3000)
+    pale = np.array([0.95, 0.98, 1.0]) if is_overcast else np.array([0.42, 0.68, 1.05])
+    glare = 1.0 if is_overcast else max(1.0, float(np.exp(rng.uniform(-0.5, 1.3))))
+    haze = rng.uniform(220, 600) if rng.random() < 0.12 else rng.uniform(600, 4000)
     return Weather(
         sun=sun,
         sun_color=np.array([1.0, 0.78 + 0.18 * low, 0.55 + 0.36 * low]) * strength,
