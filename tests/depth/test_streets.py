@@ -137,6 +137,8 @@ def test_what_cannot_be_drawn_is_refused() -> None:
         StreetsConfig(jpeg_share=2.0)
     with pytest.raises(InputError, match="rectification_error_px"):
         StreetsConfig(rectification_error_px=-1.0)
+    with pytest.raises(InputError, match="index is -1"):
+        draw_street(PLAIN, -1)
     with pytest.raises(IndexError):
         Streets(StreetsConfig(frames=3))[3]
     assert len(Streets(StreetsConfig(frames=3))) == 3

@@ -6,8 +6,17 @@ import pytest
 import torch
 
 from depthpose.cli import main
+from depthpose.core.errors import InputError
+from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.kitti import lidar_truth, open_dataset
+from depthpose.depth.kitti import (
+    RawFrame,
+    has_raw_frame,
+    lidar_truth,
+    open_dataset,
+    write_raw_frame,
+)
+from depthpose.depth.streets import camera_from_velodyne, draw_street
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +67,28 @@ def test_what_is_read_is_metric(made: Path) -> None:
     assert len(known) > 3000
     assert float(known.median()) < 0.1
     assert int(torch.isnan(truth.disparity_px).sum()) > 0
+
+
+def test_one_date_has_one_calibration(tmp_path: Path) -> None:
+    drive = "2100_02_01_drive_0001_sync"
+    for scale in (0.1, 0.12):
+        frame = draw_street(StreetsConfig(scale=scale), 0)
+        raw = RawFrame(
+            left=frame.left,
+            right=frame.right,
+            rig=frame.rig,
+            disparity_px=frame.disparity_px,
+            occluded=frame.occluded,
+            points=None,
+            camera_from_velodyne=camera_from_velodyne(),
+        )
+        if scale == 0.1:
+            write_raw_frame(tmp_path, drive, 3, raw)
+        else:
+            with pytest.raises(InputError, match="another rig or scale"):
+                write_raw_frame(tmp_path, drive, 4, raw)
+    assert has_raw_frame(tmp_path, drive, 3)
+    assert not has_raw_frame(tmp_path, drive, 4)
+    rig = open_dataset(tmp_path).read_rig(0)
+    assert rig is not None
+    assert rig.baseline_m == pytest.approx(0.5327, abs=0.006)

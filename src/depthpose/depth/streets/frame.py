@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.streets.lidar import scan, sparse_depth
@@ -60,7 +61,12 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     Args:
         config: what frames are like.
         index: any whole number that is not negative.
+
+    Raises:
+        InputError: the index is negative.
     """
+    if index < 0:
+        raise InputError(f"index is {index}, but frames are counted from 0; take another")
     rig, mount_height_m = street_rig(config, index)
     scene = make_scene((config.seed, index), mount_height_m)
     return draw_scene(scene, rig, config, (config.seed, index))
@@ -79,7 +85,7 @@ def draw_scene(
         seed: of the sensors' noise, their small misalignment and the LiDAR's.
     """
     rng = np.random.default_rng([73, *seed])
-    stage = prepare(scene)
+    stage = prepare(scene, rig.width * rig.height)
     left = look(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
     right = _look_right(stage, rig, rng.normal(0, 1) * config.rectification_error_px)
     light, other_light = (

@@ -76,8 +76,14 @@ class Stage:
     sky_map: LightMap
 
 
-def prepare(scene: StreetScene) -> Stage:
-    """Make a scene ready for drawing."""
+def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
+    """Make a scene ready for drawing.
+
+    Args:
+        scene: what will be drawn.
+        pixels: how many the pictures will have: small ones need no fine shadows.
+    """
+    share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
     mesh = scene.mesh
     corners = torch.from_numpy(mesh.corners)
     turn = torch.from_numpy(scene.camera_from_world).float()
@@ -97,8 +103,8 @@ def prepare(scene: StreetScene) -> Stage:
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, *one) for one in maps],
-        sky_map=_light_map(casters, up, *_SKY_MAP),
+        sun_maps=[_light_map(casters, to_sun, one, share) for one in maps],
+        sky_map=_light_map(casters, up, _SKY_MAP, share),
     )
 
 
@@ -118,11 +124,12 @@ def _attributes(scene: StreetScene, corners: Float[Tensor, "n 3 3"]) -> Float[Te
 def _light_map(
     corners: Float[Tensor, "n 3 3"],
     to_light: Float[Tensor, "3"],
-    half_m: float,
-    reach_m: tuple[float, float],
-    side_px: int,
+    region: tuple[float, tuple[float, float], int],
+    share: float,
 ) -> LightMap:
     """Draw the depth along a light over a part of the scene before the camera."""
+    half_m, reach_m, full_px = region
+    side_px = round(full_px * share)
     away = F.normalize(-to_light, dim=0)
     aside = torch.tensor([1.0, 0, 0]) if abs(float(away[0])) < 0.9 else torch.tensor([0.0, 0, 1])
     x = F.normalize(torch.linalg.cross(aside, away), dim=0)
