@@ -24,6 +24,9 @@ BEHIND_M = 14.0
 AHEAD_M = 420.0
 """How far the ground reaches."""
 
+_WIDE_M = 400.0
+"""How far it reaches to the sides, so that nothing but hills is seen beyond."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreet:
@@ -199,8 +202,8 @@ def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> No
         for stations, is_street in _pieces(road, side):
             builder.begin_thing()
             if is_street:
-                far = road.edge_m(side) + side * 90
-                _strip(builder, (road.edge_m(side), far), (0.0, -0.3), asphalt, stations)
+                far = road.edge_m(side) + side * _WIDE_M
+                _strip(builder, (road.edge_m(side), far), (0.0, 0.0), asphalt, stations)
             else:
                 _side_strips(builder, rng, road, side, (walk, grass, land, stations))
 
@@ -241,7 +244,24 @@ def _side_strips(
     rise = rng.normal(0, 0.8) if road.place in ("rural", "forest") else rng.normal(0, 0.1)
     strip(8.0, (high, high - 0.3 * rise), land)
     x += side * 8
-    strip(130.0, (high - 0.3 * rise, high - 3 * rise), land)
+    strip(_WIDE_M, (high - 0.3 * rise, high - 3 * rise), land)
+    edge = road.edge_m(side)
+    profile = [(edge, high), (x - side * 8, high), (x, high - 0.3 * rise),
+               (x + side * _WIDE_M, high - 3 * rise)]  # fmt: skip
+    for s in (stations[0], stations[-1]):
+        _add_bank(builder, profile, float(s), curb if road.curb_m else land)
+
+
+def _add_bank(
+    builder: MeshBuilder, profile: list[tuple[Number, Number]], s: Number, surface: Surface
+) -> None:
+    """Close the step between the land and a side street at y = 0, which one would see through."""
+    faces = [
+        [(x, y, s), (other_x, other_y, s), (other_x, 0.0, s), (x, 0.0, s)]
+        for (x, y), (other_x, other_y) in pairwise(profile)
+    ]
+    corners = np.array(faces, np.float32)
+    builder.quads(corners, corners[..., :2], surface)
 
 
 def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:

@@ -19,6 +19,7 @@ class Sensor:
         exposure: factor of the light, by channel.
         blur: share of a pixel's light that falls on its neighbours, in each direction.
         glare: share of the light that the lens scatters widely.
+        black: light below which there is only black.
         vignette: loss in the corners.
         noise: deviation of full light's noise, and of darkness'.
         gamma: exponent of the tone curve.
@@ -29,6 +30,7 @@ class Sensor:
     exposure: tuple[float, float, float]
     blur: float
     glare: float
+    black: float
     vignette: float
     noise: tuple[float, float]
     gamma: float
@@ -49,12 +51,13 @@ def draw_sensors(
     luminance = light.mean(-1)
     metered = luminance[len(luminance) // 3 :].clamp(max=1.2).mean() + 1e-3
     # Rounded, for the last bits of a long mean depend on how many threads took part.
-    exposure = float(f"{float(0.235 / metered):.4g}") * float(np.exp(rng.normal(0, 0.28)))
+    exposure = float(f"{float(0.27 / metered):.4g}") * float(np.exp(rng.normal(0, 0.28)))
     white = np.exp(rng.normal(0, 0.035, 3))
     is_jpeg = bool(rng.random() < jpeg_share)
     common = {
         "blur": rng.uniform(0.0, 0.22),
-        "glare": rng.uniform(0, 0.05),
+        "glare": rng.uniform(0, 0.02),
+        "black": rng.uniform(0, 0.025),
         "vignette": rng.uniform(0, 0.2),
         "noise": (rng.uniform(0.004, 0.025), rng.uniform(0.0005, 0.004)),
         "gamma": rng.uniform(1.6, 2.1),
@@ -79,6 +82,7 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h 
     deviation = (signal * shot**2 + dark**2).sqrt()
     signal = signal + torch.randn(signal.shape, generator=generator) * deviation
     # A shoulder before white, as cameras have; the brightest is lost all the same.
+    signal = (signal - sensor.black) / (1 - sensor.black)
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
     return picture if sensor.jpeg_quality is None else _jpeg(picture, sensor.jpeg_quality)
