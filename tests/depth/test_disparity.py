@@ -79,7 +79,7 @@ def test_both_views_of_one_surface_agree() -> None:
 
 
 def test_disparity_is_carried_to_the_right_view_and_back() -> None:
-    """Mirrored, the disparity of the right view is that of a left one: carried again, it is ours."""
+    """Mirrored, the right view's disparity is a left one's: carried again, it is ours."""
     left_px = torch.full((4, 40), 3.0)
     left_px[:, 20:26] = 8.0
     right_px = right_disparity_from_left(left_px)

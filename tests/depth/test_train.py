@@ -229,7 +229,7 @@ def test_pairs_that_cannot_train_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         TrainingPairs(
-            dataclasses.replace(pairs, **changes),  # pyright: ignore[reportArgumentType]
+            dataclasses.replace(pairs, **changes),
             0,
             needs_truth=True,
         )

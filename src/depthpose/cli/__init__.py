@@ -17,6 +17,10 @@ COMMANDS = {
         "demo:demo",
         "run everything on a made street and open the books: out/demo/report.html",
     ),
+    "data make streets": (
+        "data:make_streets",
+        "made streets with exact disparity and LiDAR, in KITTI's raw layout",
+    ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
@@ -63,7 +67,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _split_command(given: list[str]) -> tuple[str | None, list[str]]:
-    for length in (2, 1):
+    for length in (3, 2, 1):
         name = " ".join(given[:length])
         if name in COMMANDS:
             return name, given[length:]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera
@@ -33,10 +33,14 @@ class StereoTruth:
     Attributes:
         disparity_px: disparity of the left image.
         depth_m: depth of the left image (camera z unless the dataset's protocol says otherwise).
+        occluded: left pixels whose point the right view does not show: hidden there, or outside.
+        right_disparity_px: disparity of the right image, positive like the left one's.
     """
 
     disparity_px: Float[Tensor, "h w"] | None = None
     depth_m: Float[Tensor, "h w"] | None = None
+    occluded: Bool[Tensor, "h w"] | None = None
+    right_disparity_px: Float[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,3 +21,6 @@ from depthpose.depth.kitti.frames import read_disparity as read_disparity
 from depthpose.depth.kitti.lidar import project_lidar as project_lidar
 from depthpose.depth.kitti.splits import Split as Split
 from depthpose.depth.kitti.splits import read_split as read_split
+from depthpose.depth.kitti.writer import RawFrame as RawFrame
+from depthpose.depth.kitti.writer import has_raw_frame as has_raw_frame
+from depthpose.depth.kitti.writer import write_raw_frame as write_raw_frame

@@ -56,6 +56,8 @@ def _raw(folder: Path) -> Iterable[Frame]:
                 style="raw",
                 velodyne=_existing(drive / "velodyne_points/data" / f"{left.stem}.bin"),
                 depth=_existing(annotated / f"{left.stem}.png"),
+                disparity=_existing(drive / "disp_occ" / f"{left.stem}.png"),
+                disparity_noc=_existing(drive / "disp_noc" / f"{left.stem}.png"),
             )
 
 

@@ -1,0 +1,117 @@
+"""Knobs of what a training sees: pairs on disk, their random changes, made streets."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from depthpose.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentConfig:
+    """Random changes of a training pair (thesis, 2.4.2)."""
+
+    crop_px: tuple[int, int] = (256, 512)
+    """Rows and columns of the crop."""
+
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Range of the size at which a pair is seen; images that are too small for the crop grow."""
+
+    jitter: float = 0.2
+    """Brightness, contrast and saturation are each scaled by 1 +- this."""
+
+    flip_share: float = 0.5
+    """Share of pairs that are mirrored and swapped."""
+
+    def __post_init__(self) -> None:
+        """Refuse changes that would break a pair."""
+        if min(self.crop_px) < 1:
+            raise InputError(f"crop_px must be two positive sizes, got {self.crop_px}")
+        if not 0 < self.scale[0] <= self.scale[1]:
+            raise InputError(f"scale must be a range of positive sizes, got {self.scale}")
+        if not 0 <= self.jitter < 1:
+            raise InputError(f"jitter must be in [0, 1), got {self.jitter}; the thesis takes 0.2")
+        if not 0 <= self.flip_share <= 1:
+            raise InputError(f"flip_share must be in [0, 1], got {self.flip_share}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Which pairs a training sees, and how."""
+
+    folders: tuple[str, ...] = ()
+    """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
+
+    split: str | None = None
+    """Name or file of a split, for the first folder."""
+
+    exclude: tuple[str, ...] = ()
+    """Names of frames to leave out."""
+
+    limit: int | None = None
+    """Take so many pairs of each folder, spread evenly; None: all."""
+
+    focal_px: float | None = None
+    """Bring every pair to this focal length [px]; None: leave sizes as they are."""
+
+    with_cache: bool = False
+    """Keep decoded pairs in memory (8 bit): for sets that fit."""
+
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    """Random changes."""
+
+    def __post_init__(self) -> None:
+        """Refuse what selects nothing."""
+        if self.limit is not None and self.limit < 1:
+            raise InputError(f"limit must be 1 pair or more, got {self.limit}")
+        if self.focal_px is not None and self.focal_px <= 0:
+            raise InputError(f"focal_px must be positive, got {self.focal_px}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetsConfig:
+    """What made street scenes are like."""
+
+    seed: int = 0
+    """Another seed, other streets."""
+
+    frames: int = 100_000
+    """How many there are; each is made when it is asked for."""
+
+    rigs: Literal["kitti", "varied"] = "kitti"
+    """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
+
+    scale: float = 1.0
+    """Size of the pictures as a share of the rig's: 0.5 draws half as many rows and columns."""
+
+    crop: tuple[int, int] | None = None
+    """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
+
+    with_antialiasing: bool = True
+    """Four samples in pixels where edges show."""
+
+    with_lidar: bool = False
+    """Scan each scene with a LiDAR too."""
+
+    jpeg_share: float = 0.5
+    """Share of the pairs that went through JPEG."""
+
+    rectification_error_px: float = 0.1
+    """Deviation of the rows by which the right view is off, as after a real calibration."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        for name, value in (("seed", self.seed), ("frames", self.frames)):
+            if value < 0:
+                raise InputError(f"{name} must be 0 or more, got {value}")
+        if self.rigs not in ("kitti", "varied"):
+            raise InputError(f"rigs must be 'kitti' or 'varied', got {self.rigs!r}")
+        if not 0.02 <= self.scale <= 4:
+            raise InputError(f"scale must be from 0.02 to 4, got {self.scale}; 1 is full size")
+        if self.crop is not None and min(self.crop) < 1:
+            raise InputError(f"crop must be two positive sizes, got {self.crop}; None: no crop")
+        if not 0 <= self.jpeg_share <= 1:
+            raise InputError(f"jpeg_share must be from 0 to 1, got {self.jpeg_share}")
+        if not 0 <= self.rectification_error_px < 10:
+            raise InputError(
+                f"rectification_error_px must be from 0 to 10, got {self.rectification_error_px}"
+            )

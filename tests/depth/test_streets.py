@@ -1,0 +1,144 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from depthpose.core.camera import StereoRig, resize_camera
+from depthpose.core.errors import InputError
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.streets import (
+    StreetFrame,
+    Streets,
+    draw_scene,
+    draw_street,
+    kitti_rig,
+    make_scene,
+)
+
+PLAIN = StreetsConfig(scale=0.25, jpeg_share=0.0, rectification_error_px=0.0)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[StreetFrame]:
+    return [draw_street(replace(PLAIN, with_lidar=True), index) for index in (0, 3, 8)]
+
+
+def test_a_frame_is_a_function_of_seed_and_index() -> None:
+    config = StreetsConfig(scale=0.1)
+    one = Streets(config)[5]
+    draw_street(config, 6)
+    other = Streets(config)[5]
+    assert torch.equal(one.input.left, other.input.left)
+    assert one.input.right is not None
+    assert other.input.right is not None
+    assert torch.equal(one.input.right, other.input.right)
+    for name in ("disparity_px", "depth_m", "right_disparity_px"):
+        a, b = getattr(one.truth, name), getattr(other.truth, name)
+        assert torch.equal(a.nan_to_num(-1), b.nan_to_num(-1))
+    assert one.truth.occluded is not None
+    assert other.truth.occluded is not None
+    assert torch.equal(one.truth.occluded, other.truth.occluded)
+    assert not torch.equal(one.input.left, Streets(replace(config, seed=1))[5].input.left)
+
+
+def photometric_error(frame: StreetFrame, shift_px: float) -> float:
+    warped = warp_right_to_left(frame.right, frame.disparity_px + shift_px)
+    seen = ~frame.occluded & ~frame.is_sky
+    return float((warped - frame.left).abs().mean(0)[seen].nanmean())
+
+
+def test_the_right_view_warped_by_the_disparity_is_the_left(frames: list[StreetFrame]) -> None:
+    for frame in frames:
+        exact = photometric_error(frame, 0.0)
+        assert exact < 0.04
+        assert exact < 0.6 * min(photometric_error(frame, 2.0), photometric_error(frame, -2.0))
+
+
+def test_disparity_and_depth_are_one(frames: list[StreetFrame]) -> None:
+    for frame in frames:
+        expected = float(frame.rig.K[0, 0]) * frame.rig.baseline_m / frame.depth_m
+        assert torch.equal(frame.is_sky, frame.disparity_px.isnan())
+        torch.testing.assert_close(frame.disparity_px, expected, equal_nan=True)
+        assert float(frame.depth_m.nan_to_num(9).min()) > 1
+
+
+def test_occlusion_agrees_with_the_right_disparity(frames: list[StreetFrame]) -> None:
+    for frame in frames:
+        height, width = frame.occluded.shape
+        columns = (torch.arange(width) - frame.disparity_px).round()
+        is_inside = (columns >= 0) & ~frame.is_sky
+        rows = torch.arange(height)[:, None].expand(height, width)
+        right = frame.right_disparity_px.nan_to_num(0.0)[
+            rows, columns.nan_to_num(0).clamp(min=0).long()
+        ]
+        difference = right - frame.disparity_px
+        seen = difference[is_inside & ~frame.occluded].abs()
+        assert float((seen < 1).float().mean()) > 0.96
+        # Where nothing is hidden by what is nearer, nothing is nearer there.
+        hidden = difference[is_inside & frame.occluded]
+        assert float((hidden > 0).float().mean()) > 0.85
+        assert bool(frame.occluded[~frame.is_sky & (columns < -0.5)].all())
+
+
+def test_the_lidar_agrees_with_the_depth(frames: list[StreetFrame]) -> None:
+    for frame in frames:
+        assert frame.lidar_depth_m is not None
+        assert frame.lidar_points is not None
+        assert len(frame.lidar_points) > 10_000
+        both = frame.lidar_depth_m.isfinite() & ~frame.is_sky
+        share = ((frame.lidar_depth_m - frame.depth_m).abs() / frame.depth_m)[both]
+        assert int(both.sum()) > 3000
+        assert float(share.median()) < 0.01
+        assert float((share < 0.06).float().mean()) > 0.85
+
+
+def test_one_scene_has_the_same_metres_at_two_focal_lengths() -> None:
+    scene = make_scene((4, 2))
+    rig = resize_camera(kitti_rig(), 240, 72)
+    K = torch.diag(torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64)) @ rig.K
+    large = StereoRig(width=470, height=140, K=K, baseline_m=0.3)
+    small_frame, large_frame = (draw_scene(scene, one, PLAIN) for one in (rig, large))
+    # Pixel (u, v) of the small picture looks along the ray of (2 u, 2 v) of the large one.
+    at_large = large_frame.depth_m[::2, ::2]
+    at_small = small_frame.depth_m[: at_large.shape[0], : at_large.shape[1]]
+    torch.testing.assert_close(at_large, at_small, rtol=1e-5, atol=0, equal_nan=True)
+    ratio = small_frame.disparity_px[:70, :235] / large_frame.disparity_px[::2, ::2]
+    assert float((ratio - rig.baseline_m / 0.6).nan_to_num(0.0).abs().max()) < 1e-4
+
+
+def test_only_the_window_is_drawn_and_rigs_vary() -> None:
+    config = StreetsConfig(crop=(48, 80), rigs="varied", scale=0.5, with_antialiasing=False)
+    drawn = [draw_street(config, index) for index in range(4)]
+    assert {tuple(frame.left.shape) for frame in drawn} == {(3, 48, 80)}
+    assert all((frame.rig.width, frame.rig.height) == (80, 48) for frame in drawn)
+    assert len({float(frame.rig.K[0, 0]) for frame in drawn}) > 1
+
+
+def test_frames_are_pictures(frames: list[StreetFrame]) -> None:
+    for frame in frames:
+        for image in (frame.left, frame.right):
+            assert image.dtype == torch.float32
+            assert 0 <= float(image.min()) < 0.3
+            assert 0.6 < float(image.max()) <= 1
+            assert 0.2 < float(image.mean()) < 0.75
+            assert float(image.std()) > 0.08
+        assert 0.1 < float(frame.is_road.float().mean()) < 0.6
+
+
+def test_what_cannot_be_drawn_is_refused() -> None:
+    with pytest.raises(InputError, match="scale must be"):
+        StreetsConfig(scale=0.0)
+    with pytest.raises(InputError, match="crop must be"):
+        StreetsConfig(crop=(0, 4))
+    with pytest.raises(InputError, match="seed must be"):
+        StreetsConfig(seed=-1)
+    with pytest.raises(InputError, match="jpeg_share"):
+        StreetsConfig(jpeg_share=2.0)
+    with pytest.raises(InputError, match="rectification_error_px"):
+        StreetsConfig(rectification_error_px=-1.0)
+    with pytest.raises(InputError, match="index is -1"):
+        draw_street(PLAIN, -1)
+    with pytest.raises(IndexError):
+        Streets(StreetsConfig(frames=3))[3]
+    assert len(Streets(StreetsConfig(frames=3))) == 3

@@ -1,0 +1,94 @@
+"""Made streets on disk: written, checked, resumed, and read as KITTI is read."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.cli import main
+from depthpose.core.errors import InputError
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.kitti import (
+    RawFrame,
+    has_raw_frame,
+    lidar_truth,
+    open_dataset,
+    write_raw_frame,
+)
+from depthpose.depth.streets import camera_from_velodyne, draw_street
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    assert main(make(folder, 3)) == 0
+    return folder
+
+
+def make(folder: Path, number: int, *more: str) -> list[str]:
+    return ["data", "make", "streets", "--out", str(folder), "--number", str(number),
+            "--scale", "0.25", "--seed", "7", *more]  # fmt: skip
+
+
+def test_the_check_finds_nothing_wrong(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "check", str(made)]) == 0
+    said = capsys.readouterr().out
+    assert "KITTI raw: 3 frames, 3 right views, 3 calibrations, 3 LiDAR scans" in said
+    assert "3 disparity maps; nothing is wrong" in said
+
+
+def test_finished_frames_are_kept(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in made.rglob("*.png")}
+    assert main(make(made, 3)) == 0
+    assert "0 frames made, 3 were there" in capsys.readouterr().out
+    assert before == {path: path.stat().st_mtime_ns for path in made.rglob("*.png")}
+
+
+def test_other_settings_are_refused(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = make(made, 3)
+    words[words.index("0.25")] = "0.5"
+    assert main(words) == 2
+    assert "other settings (scale)" in capsys.readouterr().err
+    assert main(make(made, 0)) == 2
+
+
+def test_what_is_read_is_metric(made: Path) -> None:
+    dataset = open_dataset(made)
+    frame = dataset.frames[0]
+    rig, truth = dataset.read_rig(0), dataset.read_truth(0)
+    assert rig is not None
+    assert truth.disparity_px is not None
+    scan_m = lidar_truth(frame, "camera_z")
+    # KITTI's own protocol draws a point one pixel up and to the left.
+    expected = disparity_from_depth(scan_m, rig).roll((1, 1), (0, 1))
+    difference = (expected - truth.disparity_px).abs()
+    known = difference[difference.isfinite()]
+    assert len(known) > 3000
+    assert float(known.median()) < 0.1
+    assert int(torch.isnan(truth.disparity_px).sum()) > 0
+
+
+def test_one_date_has_one_calibration(tmp_path: Path) -> None:
+    drive = "2100_02_01_drive_0001_sync"
+    for scale in (0.1, 0.12):
+        frame = draw_street(StreetsConfig(scale=scale), 0)
+        raw = RawFrame(
+            left=frame.left,
+            right=frame.right,
+            rig=frame.rig,
+            disparity_px=frame.disparity_px,
+            occluded=frame.occluded,
+            points=None,
+            camera_from_velodyne=camera_from_velodyne(),
+        )
+        if scale == 0.1:
+            write_raw_frame(tmp_path, drive, 3, raw)
+        else:
+            with pytest.raises(InputError, match="another rig or scale"):
+                write_raw_frame(tmp_path, drive, 4, raw)
+    assert has_raw_frame(tmp_path, drive, 3)
+    assert not has_raw_frame(tmp_path, drive, 4)
+    rig = open_dataset(tmp_path).read_rig(0)
+    assert rig is not None
+    assert rig.baseline_m == pytest.approx(0.5327, abs=0.006)
