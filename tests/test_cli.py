@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.made_street import make_street
 
 from depthpose.cli import COMMANDS, main
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
-from depthpose.demo.scene import make_street
 from depthpose.depth.types import StereoInput
 
 NAMES = [name.split() for name in COMMANDS]

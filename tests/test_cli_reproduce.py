@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.made_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.methods import Method
 from depthpose.cli.reproducing import Order, reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.files import read_image, write_depth_png, write_image
-from depthpose.demo.scene import make_street
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.kitti import open_dataset
 from depthpose.depth.tables import find_table

@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.made_street import make_street
 
 from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.files import read_image, read_map
 from depthpose.demo import make_demo
-from depthpose.demo.scene import make_street
 from depthpose.depth.disparity import warp_right_to_left
 
 

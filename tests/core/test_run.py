@@ -92,3 +92,10 @@ def test_waiting_ends_when_all_is_there() -> None:
 def test_waiting_in_vain_names_what_is_missing() -> None:
     with pytest.raises(InputError, match="1 of 2 are missing, first 'b': another process may have"):
         wait_for(["a", "b"], lambda name: name == "a", patience_s=0.1)
+
+
+def test_a_nested_setting_is_named_by_its_path_and_a_new_knob_may_be_none(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"pairs": {"limit": 3}})
+    claim_folder(tmp_path, {"pairs": {"limit": 3, "later": None}})
+    with pytest.raises(InputError, match=r"pairs\.limit = 3, but now it is 4"):
+        claim_folder(tmp_path, {"pairs": {"limit": 4}})

@@ -4,10 +4,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.made_street import make_street
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.demo.scene import make_street
 from depthpose.depth.augment import (
     TrainingPair,
     augment,

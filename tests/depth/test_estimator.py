@@ -3,12 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.made_street import make_street
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.demo.scene import make_street
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import StereoSample
 

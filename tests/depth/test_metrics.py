@@ -12,6 +12,7 @@ from depthpose.depth.metrics import (
     garg_crop,
     score_confidence,
     sparsification_area,
+    view_errors,
 )
 
 
@@ -162,3 +163,14 @@ def test_the_mean_of_full_deciles_is_the_mean_error() -> None:
     error = torch.rand(500)
     mean = float(error_by_decile(error, torch.rand(500)).mean())
     assert mean == pytest.approx(float(error.double().mean()))
+
+
+def test_a_drawn_view_is_compared_by_hand() -> None:
+    real = torch.zeros(3, 2, 3)
+    real[:, :, 1] = 1.0
+    drawn = real / 2
+    found = view_errors(drawn, real)
+    assert found.right_l1 == pytest.approx(0.5 / 3)
+    assert found.right_psnr_db == pytest.approx(-10 * math.log10(0.25 / 3))
+    assert found.right_sharpness == pytest.approx(0.5)
+    assert view_errors(real, real).right_psnr_db == pytest.approx(120)

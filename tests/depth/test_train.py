@@ -5,15 +5,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.made_street import make_street
 from torch import Tensor, nn
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_disparity_png, write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
-from depthpose.demo.scene import make_street
 from depthpose.depth.augment import TrainingPair
-from depthpose.depth.config import AugmentConfig, GeneratorConfig, PairsConfig, PSMNetConfig
+from depthpose.depth.config import (
+    AugmentConfig,
+    GeneratorConfig,
+    PairsConfig,
+    PSMNetConfig,
+    StreetsConfig,
+)
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
@@ -262,3 +268,16 @@ def test_a_warm_start_begins_with_the_given_weights(pairs: PairsConfig, tmp_path
     assert other is not None
     for name, parameter in one.named_parameters():
         torch.testing.assert_close(parameter, dict(other.named_parameters())[name])
+
+
+def test_streets_are_made_while_training() -> None:
+    made = StreetsConfig(frames=2, scale=0.2, jpeg_share=0.0)
+    config = PairsConfig(
+        streets=made, focal_px=130.0, augment=AugmentConfig(crop_px=(48, 96), jitter=0.0)
+    )
+    samples = TrainingPairs(config, 0, needs_truth=True, baseline_m=0.5327)
+    assert len(samples) == 2
+    for ticket in range(4):
+        pair = samples[ticket]
+        error = (warp_right_to_left(pair.right, pair.left_px) - pair.left).abs()
+        assert float(error.nanmedian()) < 0.06

@@ -25,6 +25,7 @@ COMMANDS = {
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
+    "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),

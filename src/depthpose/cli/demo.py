@@ -3,15 +3,16 @@
 from pathlib import Path
 
 
-def demo(out: Path = Path("out/demo"), weights: Path | None = None) -> int:
-    """Match a made street whose disparity is known exactly, and write a page about it.
+def demo(out: Path = Path("out/demo"), weights: str = "default") -> int:
+    """Estimate depth of a made street and of a real pair, and write a page about it.
 
-    Needs no network and no data. OpenCV's StereoSGBM matches the pair; PSMNet does too where its
-    weights are given.
+    Needs no network and no data. The street's depth is known exactly: it is estimated from one
+    image and from both, beside OpenCV's StereoSGBM. The real pair comes with scikit-image (the
+    extra 'demo'); without it the page shows the street alone.
 
     Args:
         out: folder for the pictures, the maps and report.html.
-        weights: PSMNet weights (.safetensors) to match with as well.
+        weights: weights of both networks, by name or file ('depthpose weights list').
     """
     from depthpose.core.report import markdown_table
     from depthpose.demo import make_demo

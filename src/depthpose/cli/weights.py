@@ -71,3 +71,39 @@ def import_weights(
     assert kind == "psmnet"
     import_psmnet(file, out, align_corners=align_corners == "true")
     return show_weights(str(out))
+
+
+def pack_weights(
+    weights: tyro.conf.Positional[Path],
+    out: Path,
+    trained_on: str,
+    licence: str,
+    matcher: Path | None = None,
+    terms: str = "",
+    half: bool = False,
+) -> int:
+    """Make one file of a generator and a matcher, with what its users must know.
+
+        depthpose weights pack runs/finetune/fakestereo.safetensors --out street.safetensors
+            --trained-on 'my drives of 2026' --licence MIT --half
+
+    Args:
+        weights: weights of the generator, of the matcher, or of both.
+        out: the .safetensors file to write.
+        trained_on: the data, for the card.
+        licence: under which terms the weights may be used.
+        matcher: take the matcher from this file.
+        terms: said whenever the weights are loaded; for licences that bind the user.
+        half: store 16-bit floats: half the size.
+    """
+    from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
+
+    found = read_depth_weights(weights)
+    write_depth_weights(
+        out,
+        generator=found.generator,
+        matcher=found.matcher if matcher is None else read_matcher(matcher),
+        facts={"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {}),
+        with_half=half,
+    )
+    return show_weights(str(out))

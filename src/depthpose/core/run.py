@@ -132,13 +132,24 @@ def _refuse_other_settings(folder: Path, record: object, settings: dict[str, Any
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
         raise InputError(f"{folder / _RECORD}: not a record of a run. Choose another folder.")
-    for name in sorted(earlier.keys() | settings.keys()):
-        if earlier.get(name) != settings.get(name):
+    # A knob that one of the two does not know counts as None: a later version may add knobs.
+    before, now = _flat(earlier), _flat(settings)
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
             raise InputError(
-                f"{folder}: holds results made with {name} = {earlier.get(name)!r}, but now it is "
-                f"{settings.get(name)!r}. Two settings never share a folder: choose another, or "
+                f"{folder}: holds results made with {name} = {before.get(name)!r}, but now it is "
+                f"{now.get(name)!r}. Two settings never share a folder: choose another, or "
                 "delete this one."
             )
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Name nested settings by their path: ``pairs.limit``."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        is_nested = isinstance(value, Mapping)
+        found |= _flat(value, f"{prefix}{name}.") if is_nested else {f"{prefix}{name}": value}
+    return found
 
 
 def _version(package: str) -> str:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import read_image
 from depthpose.depth.disparity import depth_from_disparity, resize_disparity
 from depthpose.depth.kitti import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.kitti import read_disparity as read_truth_disparity
@@ -24,8 +25,14 @@ from depthpose.depth.metrics import (
     error_by_decile,
     garg_crop,
     score_confidence,
+    view_errors,
 )
-from depthpose.depth.predictions import has_prediction, read_confidence, read_disparity
+from depthpose.depth.predictions import (
+    has_prediction,
+    read_confidence,
+    read_disparity,
+    read_drawn_view,
+)
 
 SMALLEST_DEPTH_M = 1e-3
 
@@ -100,6 +107,7 @@ class _Prepared:
     disparity_px: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None
     camera: Camera | None
+    view: dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -198,7 +206,22 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         disparity_px=resize_disparity(predicted_px, height, width),
         confidence=confidence,
         camera=camera,
+        view=_measure_view(frame, predictions),
     )
+
+
+def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
+    """Compare the drawn right view with the real one, where there are both."""
+    drawn = read_drawn_view(predictions, frame.name)
+    if drawn is None or frame.right is None:
+        return {}
+    real = read_image(frame.right)
+    if real.shape != drawn.shape:
+        raise InputError(
+            f"{predictions}: the drawn view of {frame.name} is {drawn.shape[2]}x{drawn.shape[1]}, "
+            f"but its right image is {real.shape[2]}x{real.shape[1]}; predict it again"
+        )
+    return asdict(view_errors(drawn, real))
 
 
 def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]:
@@ -226,7 +249,7 @@ def _measure_depth(prepared: _Prepared, rule: Protocol, cap_m: float) -> _Measur
     predicted_m, true_m = predicted_m[mask], prepared.truth[mask]
     row = {"frame": prepared.frame.name, "cap_m": cap_m, "pixels": int(mask.sum())}
     row["coverage"] = float(mask.sum() / counts.sum())
-    row |= asdict(depth_errors(predicted_m, true_m))
+    row |= asdict(depth_errors(predicted_m, true_m)) | prepared.view
     relative = (predicted_m - true_m).abs() / true_m
     return _score(row, relative, prepared.confidence, mask)
 
@@ -255,6 +278,7 @@ def _measure_disparity(prepared: _Prepared) -> _Measured:
         seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
         errors = disparity_errors(prepared.disparity_px[seen], seen_px[seen])
         row |= {"epe_noc_px": errors.epe_px, "d1_noc": errors.d1_all}
+    row |= prepared.view
     return _score(row, (predicted_px - true_px).abs(), prepared.confidence, mask)
 
 

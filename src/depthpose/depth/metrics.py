@@ -49,6 +49,22 @@ class DisparityErrors:
 
 
 @dataclass(frozen=True)
+class ViewErrors:
+    """How like the real right view a drawn one is.
+
+    Attributes:
+        right_l1: mean absolute difference, colours in [0, 1].
+        right_psnr_db: peak signal-to-noise ratio [dB].
+        right_sharpness: mean size of the drawn view's gradient as a share of the real one's: 1 as
+            sharp, less blurred.
+    """
+
+    right_l1: float
+    right_psnr_db: float
+    right_sharpness: float
+
+
+@dataclass(frozen=True)
 class ConfidenceScore:
     """How well a confidence orders the pixels of one image by their error.
 
@@ -187,3 +203,19 @@ def _refuse_unusable(depth_m: Float[Tensor, " n"], role: str) -> None:
             f"depth_errors: the {role} depth holds values that are not positive and finite; mask "
             "or clamp them first, as the protocol says."
         )
+
+
+def view_errors(drawn: Float[Tensor, "3 h w"], real: Float[Tensor, "3 h w"]) -> ViewErrors:
+    """Compare a drawn right view with the real one, both RGB in [0, 1]."""
+    difference = drawn.double() - real.double()
+    mean_square = difference.square().mean().clamp(min=1e-12)
+    return ViewErrors(
+        right_l1=float(difference.abs().mean()),
+        right_psnr_db=float(-10 * torch.log10(mean_square)),
+        right_sharpness=float(_mean_gradient(drawn) / _mean_gradient(real).clamp(min=1e-12)),
+    )
+
+
+def _mean_gradient(image: Float[Tensor, "3 h w"]) -> Float[Tensor, ""]:
+    along = (image[:, :, 1:] - image[:, :, :-1]).abs().double().mean()
+    return along + (image[:, 1:] - image[:, :-1]).abs().double().mean()

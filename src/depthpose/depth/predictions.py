@@ -125,6 +125,12 @@ def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
     return read_map(path) if path.is_file() else None
 
 
+def read_drawn_view(folder: Path, name: str) -> Float[Tensor, "3 h w"] | None:
+    """Read the right view that a prediction was made through, or None where none was drawn."""
+    path = _file(folder / name, "right.png")
+    return read_image(path) if path.is_file() else None
+
+
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
     """Read back what :func:`write_estimate` wrote.
 

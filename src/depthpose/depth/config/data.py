@@ -35,39 +35,6 @@ class AugmentConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsConfig:
-    """Which pairs a training sees, and how."""
-
-    folders: tuple[str, ...] = ()
-    """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
-
-    split: str | None = None
-    """Name or file of a split, for the first folder."""
-
-    exclude: tuple[str, ...] = ()
-    """Names of frames to leave out."""
-
-    limit: int | None = None
-    """Take so many pairs of each folder, spread evenly; None: all."""
-
-    focal_px: float | None = None
-    """Bring every pair to this focal length [px]; None: leave sizes as they are."""
-
-    with_cache: bool = False
-    """Keep decoded pairs in memory (8 bit): for sets that fit."""
-
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
-    """Random changes."""
-
-    def __post_init__(self) -> None:
-        """Refuse what selects nothing."""
-        if self.limit is not None and self.limit < 1:
-            raise InputError(f"limit must be 1 pair or more, got {self.limit}")
-        if self.focal_px is not None and self.focal_px <= 0:
-            raise InputError(f"focal_px must be positive, got {self.focal_px}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class StreetsConfig:
     """What made street scenes are like."""
 
@@ -115,3 +82,39 @@ class StreetsConfig:
             raise InputError(
                 f"rectification_error_px must be from 0 to 10, got {self.rectification_error_px}"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Which pairs a training sees, and how."""
+
+    folders: tuple[str, ...] = ()
+    """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
+
+    streets: StreetsConfig | None = None
+    """Streets that are made while training, each on demand; beside the folders' pairs."""
+
+    split: str | None = None
+    """Name or file of a split, for the first folder."""
+
+    exclude: tuple[str, ...] = ()
+    """Names of frames to leave out."""
+
+    limit: int | None = None
+    """Take so many pairs of each folder, spread evenly; None: all."""
+
+    focal_px: float | None = None
+    """Bring every pair to this focal length [px]; None: leave sizes as they are."""
+
+    with_cache: bool = False
+    """Keep decoded pairs in memory (8 bit): for sets that fit."""
+
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    """Random changes."""
+
+    def __post_init__(self) -> None:
+        """Refuse what selects nothing."""
+        if self.limit is not None and self.limit < 1:
+            raise InputError(f"limit must be 1 pair or more, got {self.limit}")
+        if self.focal_px is not None and self.focal_px <= 0:
+            raise InputError(f"focal_px must be positive, got {self.focal_px}")

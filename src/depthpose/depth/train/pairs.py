@@ -1,4 +1,4 @@
-"""Pairs on disk as training samples by ticket."""
+"""Pairs, on disk or made, as training samples by ticket."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.loop import shuffled_index, ticket_generator
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
@@ -14,6 +15,8 @@ from depthpose.depth.config import PairsConfig
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.kitti.frames import Frame, lidar_truth
+from depthpose.depth.streets import Streets
+from depthpose.depth.types import StereoSample
 
 BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""
@@ -68,58 +71,65 @@ class TrainingPairs:
     def _read(self, index: int) -> TrainingPair:
         dataset, place = self._frames[index]
         sample = dataset[place]
-        rig, right = sample.input.camera, sample.input.right
-        assert right is not None, "frames without a right view were left out"
-        self._check_baseline(dataset, place)
-        left_px = truth_disparity(dataset, place)
+        given, rig = sample.input, sample.input.camera
+        assert given.right is not None, "frames without a right view were left out"
+        if isinstance(rig, StereoRig):
+            self._check_baseline(given.name, rig)
+        left_px = _truth_disparity(sample)
+        if left_px is None and isinstance(dataset, Dataset):
+            left_px = _scanned_disparity(dataset.frames[place], rig)
         if left_px is None:
-            left_px = torch.full_like(sample.input.left[0], torch.nan)
-        right_px = right_disparity_from_left(left_px)
-        pair = TrainingPair(sample.input.left, right, left_px, right_px)
+            left_px = torch.full_like(given.left[0], torch.nan)
+        right_px = sample.truth.right_disparity_px
+        right_px = right_disparity_from_left(left_px) if right_px is None else right_px
+        pair = TrainingPair(given.left, given.right, left_px, right_px)
         if self.config.focal_px is None:
             return pair
         if rig is None:
             raise InputError(
-                f"{sample.input.name}: has no calibration, so it cannot be brought to a focal "
+                f"{given.name}: has no calibration, so it cannot be brought to a focal "
                 f"length of {self.config.focal_px} px; add one, exclude it, or leave focal_px out"
             )
         return scale_pair(pair, self.config.focal_px / float(rig.K[0, 0]), (1, 1))
 
-    def _check_baseline(self, dataset: Dataset, place: int) -> None:
-        if self._baseline_m is None:
-            return
-        rig = dataset.read_rig(place)
-        if rig and abs(rig.baseline_m / self._baseline_m - 1) > BASELINE_TOLERANCE:
+    def _check_baseline(self, name: str, rig: StereoRig) -> None:
+        wanted_m = self._baseline_m
+        if wanted_m is not None and abs(rig.baseline_m / wanted_m - 1) > BASELINE_TOLERANCE:
             raise InputError(
-                f"{dataset.frames[place].name}: its baseline is {rig.baseline_m:.4f} m, but the "
-                f"generator imitates one rig of {self._baseline_m} m. Train it on pairs of one "
-                "rig, and set virtual_baseline_m to that rig's."
+                f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates one "
+                f"rig of {wanted_m} m. Train it on pairs of one rig, and set virtual_baseline_m to "
+                "that rig's."
             )
 
 
-def truth_disparity(dataset: Dataset, place: int) -> Float[Tensor, "h w"] | None:
-    """Disparity that a frame can be trained on: as shipped, or from depth, or from its LiDAR."""
-    frame, rig = dataset.frames[place], dataset.read_rig(place)
-    truth = dataset.read_truth(place)
+def _truth_disparity(sample: StereoSample) -> Float[Tensor, "h w"] | None:
+    """Disparity that the dataset knows, or that follows from depth."""
+    truth, rig = sample.truth, sample.input.camera
     if truth.disparity_px is not None:
         return truth.disparity_px
-    if rig is None:
-        return None
-    if truth.depth_m is not None:
+    if truth.depth_m is not None and isinstance(rig, StereoRig):
         return disparity_from_depth(truth.depth_m, rig)
-    if frame.velodyne is not None:
-        return disparity_from_depth(lidar_truth(frame, "camera_z"), rig)
     return None
 
 
-def _find_frames(config: PairsConfig, *, needs_truth: bool) -> list[tuple[Dataset, int]]:
-    if not config.folders:
+def _scanned_disparity(frame: Frame, rig: Camera | None) -> Float[Tensor, "h w"] | None:
+    """Disparity of the LiDAR points alone."""
+    if frame.velodyne is None or not isinstance(rig, StereoRig):
+        return None
+    return disparity_from_depth(lidar_truth(frame, "camera_z"), rig)
+
+
+def _find_frames(config: PairsConfig, *, needs_truth: bool) -> list[tuple[Dataset | Streets, int]]:
+    if not config.folders and config.streets is None:
         raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
     excluded = set(config.exclude)
-    found: list[tuple[Dataset, int]] = []
+    found: list[tuple[Dataset | Streets, int]] = []
+    if config.streets is not None:
+        made = Streets(config.streets)
+        found += [(made, place) for place in range(len(made))]
     for number, folder in enumerate(config.folders):
         dataset = open_dataset(Path(folder), config.split if number == 0 else None)
-        usable = [
+        usable: list[tuple[Dataset | Streets, int]] = [
             (dataset, place)
             for place, frame in enumerate(dataset.frames)
             if frame.name not in config.exclude and _is_usable(frame, needs_truth=needs_truth)
@@ -142,7 +152,9 @@ def _is_usable(frame: Frame, *, needs_truth: bool) -> bool:
     return frame.right is not None and bool(has_truth or not needs_truth)
 
 
-def _spread(items: Sequence[tuple[Dataset, int]], count: int) -> list[tuple[Dataset, int]]:
+def _spread(
+    items: Sequence[tuple[Dataset | Streets, int]], count: int
+) -> list[tuple[Dataset | Streets, int]]:
     """Take ``count`` items at equal distances: neighbours in a drive look alike."""
     if count >= len(items):
         return list(items)

@@ -1,0 +1,73 @@
+"""What a generator draws, where the left view shows it and where it does not, on made streets.
+
+    python bench/view_quality.py --weights default runs/l1/fakestereo.safetensors --number 20
+
+Streets of a seed that no weights were trained on, so every pixel's truth is known: which points of
+the right view the left one hides, and which points of the left view the right one does.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.report import markdown_table, write_table
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.disparity import right_disparity_from_left
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.streets import StreetFrame, draw_street
+from depthpose.depth.types import StereoInput
+
+
+def mean(values: Tensor, mask: Tensor) -> float:
+    """Mean over a mask; NaN where it is empty."""
+    return float(values[mask].double().mean())
+
+
+def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
+    """L1 of the drawn view and relative depth error, in seen and in hidden regions."""
+    pair = StereoInput(name="street", left=frame.left, right=None, camera=frame.rig)
+    estimate = net.estimate_pair(pair)
+    assert estimate.right is not None
+    assert estimate.depth_m is not None
+    l1 = (estimate.right - frame.right).abs().mean(0)
+    is_solid = torch.isfinite(frame.right_disparity_px)
+    is_carried = torch.isfinite(right_disparity_from_left(frame.disparity_px))
+    relative = (estimate.depth_m - frame.depth_m).abs() / frame.depth_m
+    counts = torch.isfinite(relative) & (frame.depth_m < 80)
+    return {
+        "right_l1_seen": mean(l1, is_solid & is_carried),
+        "right_l1_disoccluded": mean(l1, is_solid & ~is_carried),
+        "abs_rel_seen": mean(relative, counts & ~frame.occluded),
+        "abs_rel_occluded": mean(relative, counts & frame.occluded),
+    }
+
+
+def main() -> None:
+    """Measure each weights file on the same streets."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--weights", nargs="+", default=["default"])
+    parser.add_argument("--number", type=int, default=20)
+    parser.add_argument("--scale", type=float, default=0.5)
+    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    options = parser.parse_args()
+    config = StreetsConfig(seed=9, scale=options.scale)
+    nets = {name: FakestereoNet.load(find_weights(name)) for name in options.weights}
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
+    for index in range(options.number):
+        frame = draw_street(config, index)
+        for name, net in nets.items():
+            found[name].append(measure(net, frame))
+    rows = [
+        {"weights": Path(name).stem, "streets": options.number}
+        | {key: float(torch.tensor([r[key] for r in rows]).nanmean()) for key in rows[0]}
+        for name, rows in found.items()
+    ]
+    write_table(options.out, rows, name="view_quality")
+    print(markdown_table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Every config is read, says its command, and takes its first step."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core.config import config_to_dict, read_config
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.stereo import PSMNet
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+
+FOLDER = Path(__file__).parents[1] / "configs" / "depth"
+FILES = sorted(FOLDER.glob("*.yaml"))
+
+
+def stage_of(path: Path) -> str:
+    return path.stem.removeprefix("compact-")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
+    read_config(path, STAGES[stage_of(path)][0])
+    head = [line for line in path.read_text().splitlines() if line.startswith("#")]
+    command = f"depthpose depth train {stage_of(path)} --config configs/depth/{path.name}"
+    assert any(command in line for line in head)
+    assert re.search("[Ww]all time|Published result|compact generator through", "\n".join(head))
+
+
+@pytest.mark.parametrize("name", ["view", "stereo", "finetune"])
+def test_the_thesis_settings_are_the_defaults(name: str) -> None:
+    """The three full configs only spell out what the dataclasses say already."""
+    kind = STAGES[name][0]
+    found = config_to_dict(read_config(FOLDER / f"{name}.yaml", kind))
+    default = config_to_dict(kind())
+    for part in ("pairs", "matcher"):
+        if isinstance(found.get(part), dict):
+            del found[part], default[part]
+    del found["loop"]["workers"], default["loop"]["workers"]
+    assert found == default
+
+
+def pair(height: int, width: int) -> TrainingPair:
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(2, 1, 3, height, width, generator=generator)
+    truth = torch.full((1, height, width), 5.0)
+    return TrainingPair(images[0], images[1], truth, truth)
+
+
+@pytest.mark.slow
+def test_the_full_widths_take_a_step() -> None:
+    """54 million parameters against the 70x70 judge, then through the full PSMNet, at 256x512."""
+    view = read_config(FOLDER / "view.yaml", ViewTraining)
+    stereo = read_config(FOLDER / "stereo.yaml", StereoTraining)
+    tune = read_config(FOLDER / "finetune.yaml", FinetuneTraining)
+    network = UNetGenerator(view.generator)
+    for task in (
+        ViewTask(network, view, None),
+        FinetuneTask(network, PSMNet(stereo.matcher), tune, None),
+    ):
+        for turn in task.step(pair(256, 512)):
+            assert bool(turn.loss.isfinite())
+            turn.loss.backward()
+            task.optimizers[turn.optimizer][0].step()
+    assert all(bool(p.isfinite().all()) for p in network.parameters())
+
+
+def test_the_compact_set_takes_a_step() -> None:
+    view = read_config(FOLDER / "compact-view.yaml", ViewTraining)
+    stereo = read_config(FOLDER / "compact-stereo.yaml", StereoTraining)
+    assert view.generator.virtual_focal_px == stereo.matcher.work_focal_px
+    small = dataclasses.replace(stereo.matcher, blocks=(1, 1, 1, 1))
+    task = FinetuneTask(UNetGenerator(view.generator), PSMNet(small), FinetuneTraining(), None)
+    (turn,) = task.step(pair(192, 256))
+    turn.loss.backward()
+    assert bool(turn.loss.isfinite())
