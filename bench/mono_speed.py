@@ -1,0 +1,144 @@
+"""Depth from one 375x1242 image: seconds, peak memory and operations of each stage.
+
+    python bench/mono_speed.py [--weights default] [--precision fp32 bf16] [--device cpu]
+
+Beside the shipped set stands the full-width one (random weights: time does not depend on them).
+Each set runs in a process of its own, so that its peak memory is its own.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from stereo_memory import resident_bytes
+from stereo_speed import best_seconds, out_folder, peak_flops
+from torch.utils.flop_counter import FlopCounterMode
+
+from depthpose.core.camera import StereoRig
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.report import markdown_table
+from depthpose.depth.config import GeneratorConfig, MatcherConfig
+from depthpose.depth.estimator import FakestereoNet, focal_size, resize_image
+from depthpose.depth.stereo import PSMNet, PSMNetMatcher
+from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.types import StereoInput
+
+HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
+
+
+def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
+    """Load a set by name, or build the full width."""
+    if weights != "full":
+        return FakestereoNet.load(find_weights(weights), config=config)
+    torch.manual_seed(0)
+    generator = UNetGenerator(GeneratorConfig()).eval()
+    return FakestereoNet(
+        PSMNetMatcher(PSMNet().eval(), config), Synthesiser(generator, config.device)
+    )
+
+
+def street() -> StereoInput:
+    """An image of KITTI's size; what it shows does not matter."""
+    K = torch.tensor([[FOCAL_PX, 0, 609.6], [0, FOCAL_PX, 172.9], [0, 0, 1]], dtype=torch.float64)
+    rig = StereoRig(width=WIDTH, height=HEIGHT, K=K, baseline_m=0.5327)
+    image = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    return StereoInput(name="street", left=image, right=None, camera=rig)
+
+
+def seconds(run: Callable[[], object], device: str) -> float:
+    """Least time of three runs after one to warm up."""
+
+    def waited() -> None:
+        run()
+        if device != "cpu":
+            torch.cuda.synchronize()
+
+    waited()
+    return best_seconds(waited, 3)
+
+
+def count_flops(run: Callable[[], object]) -> int:
+    """Count operations of the generator, module by module."""
+    with FlopCounterMode(display=False) as counter:
+        run()
+    return counter.get_total_flops()
+
+
+def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
+    """Count operations of the plain matcher at this size, without computing anything."""
+    assert isinstance(net.matcher, PSMNetMatcher)
+    config = net.matcher.network_config
+    rows, columns = (max(config.min_side_px, -(-side // 16) * 16) for side in (height, width))
+    with torch.device("meta"):
+        shadow = PSMNet(config).eval()
+        views = torch.empty(2, 1, 3, rows, columns)
+        return count_flops(lambda: shadow(views[0], views[1]))
+
+
+def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
+    """Measure one set in this process."""
+    config = MatcherConfig(precision=precision, device=device)  # pyright: ignore[reportArgumentType]
+    net, image = make_net(weights, config), street()
+    before = resident_bytes("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")
+    begin = time.perf_counter()
+    net.estimate_pair(image)
+    first = time.perf_counter() - begin
+    memory = resident_bytes("VmHWM") - before
+    if device != "cpu":
+        memory = torch.cuda.max_memory_allocated()
+    assert net.synthesiser is not None
+    assert image.camera is not None
+    draw = net.synthesiser.synthesise
+    size = focal_size(image.camera, net.synthesiser.generator.config.virtual_focal_px)
+    left = resize_image(image.left, *size)
+    right = draw(left)
+    whole_s = seconds(lambda: net.estimate_pair(image), device)
+    drawing = count_flops(lambda: draw(left))
+    matching = matcher_flops(net, *size)
+    peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
+    return {
+        "set": weights,
+        "precision": precision,
+        "seconds": whole_s,
+        "first_s": first,
+        "draw_s": seconds(lambda: draw(left), device),
+        "match_s": seconds(lambda: net.matcher.match(left, right), device),
+        "memory_mb": memory / 1e6,
+        "draw_gflop": drawing / 1e9,
+        "match_gflop": matching / 1e9,
+        "share_of_peak": (drawing + matching) / whole_s / peak if device == "cpu" else None,
+    }
+
+
+def main() -> None:
+    """Run every set in a process of its own and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--weights", nargs="+", default=["default", "full"])
+    parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        weights, precision = options.child
+        print(json.dumps(run_once(weights, precision, options.device)))
+        return
+    rows = []
+    for weights in options.weights:
+        for precision in options.precision:
+            command = [sys.executable, __file__, "--device", options.device]
+            command += ["--child", weights, precision]
+            done = subprocess.run(command, check=True, capture_output=True, text=True)
+            rows.append(json.loads(done.stdout.splitlines()[-1]))
+    print(f"{torch.get_num_threads()} threads, torch {torch.__version__}, {WIDTH}x{HEIGHT}")
+    print(markdown_table(rows))
+    (out_folder() / "mono_speed.json").write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""``depth predict`` and ``depth train``, as a user runs them."""
+
+import json
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from tests.made_street import make_street
+
+from depthpose.cli import main
+from depthpose.core.checkpoint import read_checkpoint
+from depthpose.core.files import read_map, read_video, write_disparity_png, write_image, write_video
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.stereo import PSMNet
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.weights import write_depth_weights
+
+CAMERA = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]]}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small weights of both networks, three images and a camera."""
+    folder = tmp_path_factory.mktemp("predict")
+    torch.manual_seed(0)
+    generator = UNetGenerator(GeneratorConfig(width=2, levels=3, virtual_focal_px=70.0))
+    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
+    facts = {"trained_on": "nothing", "licence": "MIT"}
+    write_depth_weights(folder / "w.safetensors", generator=generator, matcher=matcher, facts=facts)
+    for number in range(3):
+        image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(number))
+        write_image(folder / "images" / f"{number}.png", image)
+    (folder / "cam.json").write_text(json.dumps(CAMERA))
+    return folder
+
+
+def predict(home: Path, out: Path, *words: str) -> int:
+    weights = ["--weights", str(home / "w.safetensors"), "--out", str(out)]
+    return main(["depth", "predict", *words, *weights])
+
+
+def test_a_folder_of_images_becomes_depth(home: Path, tmp_path: Path) -> None:
+    camera = ["--camera", str(home / "cam.json"), "--cloud"]
+    assert predict(home, tmp_path, str(home / "images"), *camera) == 0
+    endings = ("depth_m.npy", "depth.png", "disparity_px.npy", "confidence.npy", "right.png",
+               "color.png", "ply")  # fmt: skip
+    for number in range(3):
+        assert all((tmp_path / f"{number}.{ending}").is_file() for ending in endings)
+    assert read_map(tmp_path / "0.depth_m.npy").shape == (48, 64)
+    before = (tmp_path / "0.depth_m.npy").stat().st_mtime_ns
+    assert predict(home, tmp_path, str(home / "images"), *camera) == 0
+    assert (tmp_path / "0.depth_m.npy").stat().st_mtime_ns == before, "finished work is kept"
+
+
+def test_a_focal_length_stands_for_a_centred_camera(home: Path, tmp_path: Path) -> None:
+    image = str(home / "images" / "1.png")
+    assert predict(home, tmp_path / "a", image, "--camera", str(home / "cam.json")) == 0
+    assert predict(home, tmp_path / "b", image, "--focal-px", "70") == 0
+    one, other = (read_map(tmp_path / name / "1.depth_m.npy") for name in ("a", "b"))
+    assert torch.equal(one, other)
+
+
+def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
+    frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
+    write_video(tmp_path / "drive.avi", frames, 5.0)
+    words = ["--focal-px", "70", "--color-range", "1", "40"]
+    assert predict(home, tmp_path / "out", str(tmp_path / "drive.avi"), *words) == 0
+    assert len(list((tmp_path / "out").glob("drive_*.depth_m.npy"))) == 4
+    video = read_video(tmp_path / "out" / "drive.color.mp4")
+    assert len(list(video)) == 4
+    assert video.fps == pytest.approx(5.0)
+
+
+def test_one_broken_image_stops_no_other(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    good = str(home / "images" / "0.png")
+    assert predict(home, tmp_path / "out", str(broken), good, "--focal-px", "70") == 1
+    assert "broken.png" in capsys.readouterr().err
+    assert (tmp_path / "out" / "0.depth_m.npy").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "give --camera FILE.json, or --focal-px"),
+        (["--focal-px", "0.5"], "not a focal length in pixels"),
+        (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
+        (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),
+    ],
+)
+def test_unusable_words_are_refused(
+    home: Path, tmp_path: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = str(home / "images" / "0.png")
+    weights = [] if "--weights" in words else ["--weights", str(home / "w.safetensors")]
+    assert main(["depth", "predict", image, *words, *weights, "--out", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_baseline_is_said_to_be_left_alone(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
+    image = str(home / "images" / "0.png")
+    assert predict(home, tmp_path / "out", image, "--camera", str(tmp_path / "rig.json")) == 0
+    assert "baseline is not looked at" in capsys.readouterr().err
+
+
+def test_packing_writes_the_card_and_halves_the_file(home: Path, tmp_path: Path) -> None:
+    out = tmp_path / "packed-nc.safetensors"
+    words = ["--trained-on", "drives", "--licence", "CC BY-NC-SA 3.0", "--terms", "research only"]
+    assert main(["weights", "pack", str(home / "w.safetensors"), "--out", str(out), "--half",
+                 *words]) == 0  # fmt: skip
+    assert read_checkpoint(out).facts["terms"] == "research only"
+    assert out.stat().st_size < (home / "w.safetensors").stat().st_size
+    image = str(home / "images" / "0.png")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert main(["depth", "predict", image, "--focal-px", "70", "--weights", str(out), "--out",
+                     str(tmp_path / "out")]) == 0  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("train")
+    street = make_street(0.2)
+    assert street.input.right is not None
+    assert street.input.camera is not None
+    assert street.truth.disparity_px is not None
+    write_image(folder / "left" / "a.png", street.input.left)
+    write_image(folder / "right" / "a.png", street.input.right)
+    write_disparity_png(folder / "disp_occ" / "a.png", street.truth.disparity_px)
+    K = street.input.camera.K
+    lines = [f"focal_px: {K[0, 0]}", f"cx: {K[0, 2]}", f"cy: {K[1, 2]}", "baseline_m: 0.5327"]
+    (folder / "calib.txt").write_text("\n".join(lines))
+    return folder
+
+
+VIEW = """
+generator: {width: 2, levels: 3, virtual_focal_px: 130.0}
+discriminator_width: 2
+pairs: {focal_px: 130.0, augment: {crop_px: [32, 64]}}
+loop: {steps: 4, batch_size: 2, device: cpu}
+"""
+
+
+def test_training_by_config_and_words(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "view.yaml").write_text(VIEW)
+    words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
+    words += ["--data", str(pairs), "--out", str(tmp_path / "run")]
+    assert main([*words, "--steps", "2"]) == 0
+    assert "generator.safetensors" in capsys.readouterr().out
+    assert (tmp_path / "run" / "generator.safetensors").is_file()
+    assert main([*words, "--steps", "2"]) == 2
+    assert "Add --resume" in capsys.readouterr().err
+    assert main([*words, "--steps", "2", "--resume"]) == 0
+    assert main([*words, "--steps", "3", "--resume"]) == 2
+    assert "loop.steps = 2, but now it is 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("genrator: {}", "unknown key 'genrator'; did you mean 'generator'?"),
+        ("generator: {widht: 3}", "unknown key 'generator.widht'; did you mean 'width'?"),
+        ("loop: {steps: many}", "steps"),
+    ],
+)
+def test_a_misspelt_config_names_its_nearest_knob(
+    pairs: Path, tmp_path: Path, text: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.yaml").write_text(text)
+    words = ["depth", "train", "view", "--config", str(tmp_path / "c.yaml"), "--data", str(pairs)]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_words_of_another_stage_are_refused(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["depth", "train", "stereo", "--data", str(pairs), "--out", str(tmp_path / "run")]
+    assert main([*words, "--generator", "g.safetensors"]) == 2
+    assert "--generator has no meaning for 'stereo'" in capsys.readouterr().err
