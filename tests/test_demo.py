@@ -8,6 +8,7 @@ from tests.made_street import make_street
 from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.files import read_image, read_map
 from depthpose.demo import make_demo
+from depthpose.demo.motorcycle import read_motorcycle
 from depthpose.depth.disparity import warp_right_to_left
 
 
@@ -39,13 +40,33 @@ def test_the_street_is_the_same_every_time() -> None:
 def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> None:
     result = make_demo(tmp_path, scale=0.5)
     html = result.page.read_text()
-    assert html.count("data:image/png;base64,") == 7
+    assert html.count("data:image/png;base64,") == 3 + 3 + 2 + 2 + 3 + 2 + 2
     assert "http" not in html
     rows = json.loads((tmp_path / "rows.json").read_text())
-    assert [row["method"] for row in rows] == ["SGBM, holes filled", "SGBM, matched pixels"]
-    assert all(0 < row["abs_rel"] < 0.15 for row in rows)
+    assert [(row["scene"], row["sees"]) for row in rows] == [
+        ("street", "one image"),
+        ("street", "both images"),
+        ("street", "both images"),
+        ("motorcycle", "both images"),
+        ("motorcycle", "both images"),
+    ]
+    assert all(0 < row["abs_rel"] < 0.2 for row in rows if row["sees"] == "both images")
+    assert 0 < rows[0]["abs_rel"] < 0.6
     assert rows[0]["coverage"] == 1.0
     camera = read_camera(tmp_path / "street/camera.json")
     assert read_image(tmp_path / "street/left.png").shape == (3, camera.height, camera.width)
-    depth_m = read_map(tmp_path / "sgbm-matched-pixels/street.depth_m.npy")
+    depth_m = read_map(tmp_path / "fakestereo-net-compact/street.depth_m.npy")
     assert depth_m.shape == (camera.height, camera.width)
+
+
+def test_the_motorcycle_is_consistent() -> None:
+    """The published calibration and disparity: the right view looked up by it is the left one."""
+    sample = read_motorcycle()
+    assert sample is not None
+    assert sample.input.right is not None
+    assert sample.truth.disparity_px is not None
+    assert sample.truth.depth_m is not None
+    warped = warp_right_to_left(sample.input.right, sample.truth.disparity_px)
+    assert float((warped - sample.input.left).abs().nanmedian()) < 0.03
+    known_m = sample.truth.depth_m[torch.isfinite(sample.truth.depth_m)]
+    assert 1.5 < float(known_m.min()) < float(known_m.median()) < 6

@@ -134,7 +134,7 @@ def match(
 def evaluate(
     data: Path,
     out: Path,
-    weights: str | None = None,
+    weights: tuple[str, ...] = (),
     matcher: MatcherName | None = None,
     predictions: Path | None = None,
     floor: tuple[FloorName, ...] = (),
@@ -162,7 +162,8 @@ def evaluate(
     Args:
         data: KITTI raw, object, 2012/2015, Middlebury, or a plain folder of pairs.
         out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
-        weights: PSMNet weights, a .safetensors file.
+        weights: files or names. Weights with a generator see the left view alone; 'both:NAME' shows
+            their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one.
         matcher: sgbm measures OpenCV's StereoSGBM.
         predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy.
         floor: what every method must beat: rows (the best constant depth of each image row) or
@@ -181,7 +182,7 @@ def evaluate(
     from depthpose.cli import evaluating, methods
     from depthpose.depth.evaluate import find_protocol
 
-    if weights is None and matcher is None and predictions is None and not floor:
+    if not weights and matcher is None and predictions is None and not floor:
         raise InputError(
             "measure --weights FILE, --matcher sgbm, --predictions DIR or --floor rows, or several."
         )
@@ -190,13 +191,9 @@ def evaluate(
     chosen: list[methods.Method] = []
     if matcher == "sgbm":
         chosen.append(methods.sgbm_method(with_filled_holes=holes == "fill"))
-    if weights is not None:
-        config = MatcherConfig(
-            device=device,
-            precision=precision,
-            max_memory_bytes=methods.parse_bytes(max_memory),
-        )
-        chosen.append(methods.weights_method(weights, config))
+    memory = methods.parse_bytes(max_memory)
+    config = MatcherConfig(device=device, precision=precision, max_memory_bytes=memory)
+    chosen += [methods.named_method(word, config) for word in weights]
     if floor:
         training = evaluating.open_training(train, train_without)
         chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]

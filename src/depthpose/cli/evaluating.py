@@ -149,11 +149,12 @@ def _describe(predictions: Path) -> dict[str, Any]:
     """Columns that say whose predictions these are."""
     settings = read_settings(predictions)
     if settings is None:
-        return {"method": predictions.name, "weights": "", "weights_sha256": ""}
+        return {"method": predictions.name, "sees": "", "weights": "", "weights_sha256": ""}
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     suffix = holes.get(settings.get("with_filled_holes", ""), "")
     return {
         "method": settings.get("matcher", "") + suffix,
+        "sees": settings.get("sees", "both views"),
         "weights": settings.get("weights", ""),
         "weights_sha256": settings.get("weights_sha256", "")[:12],
     }

@@ -67,7 +67,18 @@ def weights_method(
         net = FakestereoNet.load(path, matcher="sgbm", config=SGBMConfig(with_filled_holes=True))
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(config)}, is_shown)
     net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
-    return Method(path.stem, net, {**facts, **config_to_dict(config)}, is_shown)
+    name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
+    return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+
+
+def named_method(word: str, config: MatcherConfig) -> Method:
+    """Build the method of a word: ``NAME``, ``both:NAME`` or ``sgbm:NAME`` (a file or a name)."""
+    how, _, name = word.rpartition(":")
+    if how == "both":
+        return weights_method(name, config, with_right=True)
+    if how == "sgbm":
+        return weights_method(name, config, with_right=False, with_sgbm=True)
+    return weights_method(word, config)
 
 
 def sgbm_method(*, with_filled_holes: bool) -> Method:
@@ -84,6 +95,7 @@ def floor_method(name: FloorName, training: Dataset) -> Method:
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
         "matcher": f"floor: {name}",
+        "sees": "left view" if name == "nearest" else "no image",
         "train": training.name,
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
