@@ -92,13 +92,14 @@ def test_keypoints_move_with_the_cloud(method: str) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_batches_and_weights_change_no_single_answer(method: str) -> None:
     points, directions, _ = made_votes(3, batch=(3,))
-    directions = with_noise(directions, 0.02)
+    # Half a millimetre of tolerance leaves no inliers of noisier votes.
+    directions = with_noise(directions, 0.002 if method == "ransac by distance" else 0.02)
     weight = torch.ones(3, 300, 8).double()
     weight[1:, 200:] = 0
     together = METHODS[method](points, directions, weight)
     alone = METHODS[method](points[1:, :200], directions[1:, :200])
     # RANSAC draws its pairs by place in the batch: its answers agree as well as its noise.
-    tolerance = {"ransac": 2e-3, "ransac by distance": 1e-2}.get(method, 1e-9)
+    tolerance = 2e-3 if "ransac" in method else 1e-9
     assert torch.allclose(together.keypoints_m[1:], alone.keypoints_m, atol=tolerance)
 
 
