@@ -99,6 +99,15 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
     )
 
 
+def locate(lines: Lines, refinements: int) -> Float64[Tensor, "*b k 3"]:
+    """Give the point alone, about the points' mean, without its covariance."""
+    _, p = _nearest(lines)
+    for _ in range(refinements):
+        A, gradient = _score(lines, p)
+        p = p + _short_step(A, gradient.sum(-1).double(), lines[0], p)
+    return p
+
+
 def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor, "*b k 3"]]:
     local, n, w = lines
     wn = n * w[..., None, :]

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.types import Vote
-from depthpose.pose.voting.lines import Lines, meet_prepared, prepare_lines
+from depthpose.pose.voting.lines import Lines, locate, meet_prepared, prepare_lines
 
 _PARALLEL = 1e-6
-_BLOCK = 2**18
-"""Votes judged at a time on a CPU: a block of float32 stays in its cache, which is twice as fast
-as one pass over all. A GPU is given everything at once."""
+_BLOCK = 2**17
+"""Votes judged at a time on a CPU. All blocks of a call share two pieces of memory that stay in its
+cache: fresh megabytes for each call cost three times the arithmetic in page faults alone. A GPU is
+given everything at once."""
 
 
 def vote_ransac(
@@ -47,8 +48,8 @@ def vote_ransac(
     keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
     # Once toward what the best hypothesis gathered, then with those that agree on that.
     used, _ = _inliers(lines, judge, keypoint)
-    vote = meet_prepared((*lines[:2], used), centre_m, min(config.refinements, 1))
-    used, share = _inliers(lines, judge, (vote.keypoints_m - centre_m)[..., None, :])
+    keypoint = locate((*lines[:2], used), min(config.refinements, 1))[..., None, :]
+    used, share = _inliers(lines, judge, keypoint.to(centre_m))
     vote = meet_prepared((*lines[:2], used), centre_m, config.refinements)
     return replace(vote, inlier_share=share)
 
@@ -98,37 +99,65 @@ class Judge:
 
     Both tests compare polynomials in the hypothesis h, and so are two products of matrices:
     ``reach = n . (h - x)`` and ``range^2 = |h|^2 - 2 h . x + |x|^2``. By angle a line agrees when
-    ``reach |reach| > cos^2 range^2``, signed, so that a vote that points away does not; by distance
-    when ``range^2 - reach^2 < limit^2``, whatever the sense of the vote (published practice).
+    ``reach > cos range``, so that a vote that points away does not; by distance when ``range^2 -
+    reach^2 < limit^2``, whatever the sense of the vote (published practice).
     """
 
     def __init__(self, lines: Lines, config: VotingConfig) -> None:
-        local, n, self._w = lines
+        local, n, w = lines
         self._limit = config.max_distance_m**2 if config.inlier_test == "distance" else None
-        self._reach = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
+        reach = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
         square = local.square().sum(-2, keepdim=True)
-        polynomial = torch.cat([-2 * local, torch.ones_like(square), square], -2)
+        far = torch.cat([-2 * local, torch.ones_like(square), square], -2)
         # The scale of the test goes into the small factor, not into the large product.
-        self._range = polynomial * (config.min_cosine**2 if self._limit is None else 1.0)
+        far = far * (config.min_cosine**2 if self._limit is None else 1.0)
+        # Keypoints and objects are alike here: one axis.
+        self._reach = reach.detach().flatten(0, -3)
+        self._far = far.detach().expand(*n.shape[:-2], *far.shape[-2:]).flatten(0, -3)
+        self._w = w.detach().flatten(0, -2)[:, None]
+        self._is_weighted = not bool((w == 1).all())
 
+    @torch.no_grad()
     def score(self, tried: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h"]:
         """Add up the weight of the lines that agree with each hypothesis."""
-        rows = tried.shape[-2]
+        each, n = _polynomials(tried), self._w.shape[-1]
+        lines, rows = each[0].shape[:2]
         if tried.device.type == "cpu":
-            rows = max(1, _BLOCK * rows // (tried[..., 0].numel() * self._w.shape[-1]))
-        blocks = tried.split(rows, dim=-2)
-        weight = self._w[..., None, :]
-        return torch.cat([self.agree(block).mul_(weight).sum(-1) for block in blocks], -1)
+            rows = max(1, min(rows, _BLOCK // (lines * n)))
+        memory = tried.new_empty(2, lines * rows * n)
+        scores = tried.new_empty(tried.shape[:-1])
+        flat = scores.view(lines, -1)
+        for part in range(0, flat.shape[-1], rows):
+            agreed = self._agree([e[:, part : part + rows] for e in each], memory)
+            agreed = agreed.mul_(self._w) if self._is_weighted else agreed
+            flat[:, part : part + rows] = agreed.sum(-1)
+        return scores
 
+    @torch.no_grad()
     def agree(self, tried: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h n"]:
         """Give 1 where a line agrees with a hypothesis, else 0."""
-        ones = torch.ones_like(tried[..., :1])
-        square = tried.square().sum(-1, keepdim=True)
-        reach = torch.cat([tried, ones], -1) @ self._reach
-        far = torch.cat([tried, square, ones], -1) @ self._range
-        if self._limit is None:
-            return far.addcmul_(reach, reach.abs(), value=-1).lt_(0)
-        return far.addcmul_(reach, reach, value=-1).lt_(self._limit)
+        n = self._w.shape[-1]
+        memory = tried.new_empty(2, tried[..., 0].numel() * n)
+        return self._agree(_polynomials(tried), memory).view(*tried.shape[:-1], n)
+
+    def _agree(self, tried: list[Tensor], memory: Tensor) -> Float[Tensor, "b h n"]:
+        shape = (*tried[0].shape[:2], self._w.shape[-1])
+        size = shape[0] * shape[1] * shape[2]
+        reach = torch.bmm(tried[0], self._reach, out=memory[0, :size].view(shape))
+        far = torch.bmm(tried[1], self._far, out=memory[1, :size].view(shape))
+        if self._limit is not None:
+            return far.addcmul_(reach, reach, value=-1).lt_(self._limit)
+        # What points away reaches nothing, and no square is below its own share.
+        return far.addcmul_(reach.clamp_(min=0), reach, value=-1).lt_(0)
+
+
+def _polynomials(tried: Float[Tensor, "*batch k h 3"]) -> list[Tensor]:
+    """Give ``(h, 1)`` and ``(h, |h|^2, 1)``, keypoints and objects on one axis."""
+    flat = tried.detach().flatten(0, -3)
+    whole = torch.cat(
+        [flat, flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])], -1
+    )
+    return [whole[..., [0, 1, 2, 4]], whole]
 
 
 def _pick(lines: Lines, index: Int64[Tensor, "*batch k h"]) -> tuple[Tensor, Tensor]:
