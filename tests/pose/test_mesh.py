@@ -11,6 +11,7 @@ from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import (
+    SymmetryProposal,
     estimate_normals,
     exact_diameter,
     farthest_points,
@@ -253,6 +254,18 @@ def test_real_symmetries(real: Path) -> None:
     assert abs(float(half_turn.axis.direction[2])) > 0.99
     # Half as sure as a perfect copy would be: the scan is of a real, slightly bent box.
     assert 0.4 < half_turn.certainty < 0.6
+
+
+def test_turns_are_completed_to_a_group() -> None:
+    origin = torch.zeros(3).double()
+    axes = [Axis(direction=d, point_m=origin) for d in torch.eye(3).double()]
+    proposals = [
+        SymmetryProposal(kind="discrete", axis=axis, angle_rad=angle, deviation=0, certainty=1)
+        for axis, angle in ((axes[2], math.pi / 3), (axes[0], math.pi))
+    ]
+    found = symmetries_from_proposals(proposals)
+    assert found.discrete is not None
+    assert len(found.discrete.R) == 11
 
 
 def test_an_object_of_one_point_is_refused() -> None:

@@ -15,7 +15,12 @@ from depthpose.core.files import read_depth_png
 from depthpose.core.files.images import opened_image
 from depthpose.pose.bop.frames import Instance, bop_instances, bop_scenes, bop_splits
 from depthpose.pose.bop.linemod import is_linemod, linemod_instances
-from depthpose.pose.bop.models import object_name, read_bop_models, read_models_info
+from depthpose.pose.bop.models import (
+    models_folder,
+    object_name,
+    read_bop_models,
+    read_models_info,
+)
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import CloudConfig, MeshConfig
 from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
@@ -90,7 +95,7 @@ class BopDataset:
         Raises:
             InputError: none is left.
         """
-        infos = read_models_info(self.folder / "models")
+        infos = read_models_info(models_folder(self.folder))
         kept = [
             instance
             for instance in self.instances

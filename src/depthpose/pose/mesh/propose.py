@@ -17,7 +17,7 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 _ORDERS = (2, 3, 4, 5, 6)
 _TRIED_ORDERS = range(2, 13)
 _TURNS = 36
-_COARSE = 0.035
+_COARSE = 0.04
 """Deviation, in diameters, from which following the surface may still find a symmetry: an axis
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
@@ -55,7 +55,8 @@ class _Surface:
         self.points = (dense.double() - self.centre_m) / model.diameter_m
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few, self.many = (self._every(count) for count in (200, 2000))
+        self.few, self.many = (self._every(count) for count in (100, 1000))
+        self._rough_tree = KDTree(self._every(2500).numpy())
 
     def _every(self, count: int) -> Float[Tensor, "m 3"]:
         index = torch.arange(count) * len(self.points) // count
@@ -66,10 +67,14 @@ class _Surface:
         distance, index = self._tree.query(moved.numpy())
         return np.asarray(distance), np.asarray(index)
 
+    def rough_distance(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+        """Mean distance of few turned points to a rough surface: for thousands of turns."""
+        distance, _ = self._rough_tree.query((self.few @ R.mT).numpy())
+        return torch.from_numpy(np.asarray(distance)).mean(-1)
+
     def is_promising(self, R: Float[Tensor, "*batch 3 3"]) -> Tensor:
         """Say coarsely, by few points, whether a turn is worth measuring."""
-        distance, _ = self.nearest(self.few @ R.mT)
-        return torch.from_numpy(distance.mean(-1)) <= _COARSE
+        return self.rough_distance(R) <= _COARSE
 
     def deviation(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
         """The 98th percentile of the distance to the surface, both ways."""
@@ -123,7 +128,10 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 def symmetries_from_proposals(
     proposals: list[SymmetryProposal], min_certainty: float = 0.5
 ) -> Symmetries:
-    """Take the sure ones: turns that an axis of revolution does not already say, and the axes."""
+    """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
+
+    Without an axis the turns are completed to a group: two symmetries one after the other are one.
+    """
     sure = [p for p in proposals if p.certainty >= min_certainty]
     axes = tuple(p.axis for p in sure if p.kind == "continuous")
     kept: list[Rigid] = []
@@ -138,8 +146,24 @@ def symmetries_from_proposals(
             kept.append(turn)
     if not kept:
         return Symmetries(continuous=axes)
+    kept = kept if axes else _completed(kept)
     discrete = Rigid(torch.stack([t.R for t in kept]), torch.stack([t.t_m for t in kept]))
     return Symmetries(discrete=discrete, continuous=axes)
+
+
+def _completed(turns: list[Rigid]) -> list[Rigid]:
+    """Add products until there is no new one; what passes 60 was no group (an icosahedron's)."""
+    every = list(turns)
+    eye = torch.eye(3, dtype=torch.float64)
+    for first in every:  # grows under way
+        for second in turns:
+            product = first @ second
+            known = [eye, *(turn.R for turn in every)]
+            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
+                every.append(product)
+        if len(every) > 60:
+            return turns
+    return every
 
 
 def _is_same_about(axis: Tensor, R: Tensor, kept: list[Tensor]) -> bool:
@@ -172,8 +196,7 @@ def _promising_turns(surface: _Surface) -> list[Float[Tensor, "3 3"]]:
     candidates = torch.cat([torch.linalg.eigh(spread).eigenvectors.T, fibonacci_directions(400)])
     angles = torch.tensor([2 * math.pi / order for order in _ORDERS], dtype=torch.float64)
     turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
-    distance, _ = surface.nearest(surface.few @ turns.mT)
-    coarse = torch.from_numpy(distance.mean(-1))
+    coarse = surface.rough_distance(turns)
     return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _COARSE]
 
 
