@@ -260,7 +260,7 @@ def test_turns_are_completed_to_a_group() -> None:
     origin = torch.zeros(3).double()
     axes = [Axis(direction=d, point_m=origin) for d in torch.eye(3).double()]
     proposals = [
-        SymmetryProposal(kind="discrete", axis=axis, angle_rad=angle, deviation=0, certainty=1)
+        SymmetryProposal(kind="discrete", axis=axis, angle_rad=angle, deviation=0.0, certainty=1.0)
         for axis, angle in ((axes[2], math.pi / 3), (axes[0], math.pi))
     ]
     found = symmetries_from_proposals(proposals)
