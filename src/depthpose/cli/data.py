@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def check(
     path: tyro.conf.Positional[Path], split: str | None = None, with_decoding: bool = True
 ) -> int:
-    """Walk a folder of pairs or a KITTI or Middlebury dataset, and name everything that is wrong.
+    """Walk a dataset and name everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
 
     A line for each file that is missing, truncated or of the wrong size, then a summary. Exit code
     0: nothing wrong. 1: something is. 2: the folder cannot be understood.
@@ -23,20 +23,22 @@ def check(
     Args:
         path: the dataset's folder.
         split: check only these frames: eigen-train, eigen-val, eigen-test, eigen-benchmark, or a
-            file of monodepth's or monodepth2's form.
+            file of monodepth's or monodepth2's form; of a BOP dataset, one of its splits.
         with_decoding: decode every image in full, which finds truncation; off reads headers only.
     """
     from tqdm import tqdm
 
     from depthpose.depth.kitti import check_dataset
+    from depthpose.pose.bop import check_bop, is_bop
 
+    check_folder = check_bop if is_bop(path) else check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        report = check_dataset(path, split, with_decoding=with_decoding, progress=show)
+        report = check_folder(path, split, with_decoding=with_decoding, progress=show)
     for problem in (*report.notices, *report.problems):
         print(f"{problem.kind}: {problem.path}: {problem.message}")
     print(report.summary)

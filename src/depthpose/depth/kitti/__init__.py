@@ -1,8 +1,6 @@
 """KITTI, Middlebury and plain folders of pairs: disk to samples, splits, the check of a folder."""
 
 from depthpose.depth.kitti.calibration import KittiCalibration as KittiCalibration
-from depthpose.depth.kitti.check import CheckReport as CheckReport
-from depthpose.depth.kitti.check import Problem as Problem
 from depthpose.depth.kitti.check import check_dataset as check_dataset
 from depthpose.depth.kitti.dataset import Dataset as Dataset
 from depthpose.depth.kitti.dataset import join_datasets as join_datasets

@@ -1,13 +1,13 @@
 """The check of a folder before hours of work: everything wrong, a line each."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_depth_png, read_image, read_points_bin
+from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.kitti.frames import Frame, frame_rig, kitti_calibration, read_disparity
 from depthpose.depth.kitti.layouts import find_frames
 from depthpose.depth.kitti.splits import read_split
@@ -15,51 +15,6 @@ from depthpose.depth.kitti.splits import read_split
 _MAX_BASELINE_M = 10
 _MAX_DEPTH_M = 200
 """KITTI's LiDAR sees 120 m."""
-_LFS_POINTER = b"version https://git-lfs"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """One thing that is wrong, or worth knowing.
-
-    Attributes:
-        path: the file or folder.
-        kind: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``.
-        message: what is wrong.
-    """
-
-    path: Path
-    kind: str
-    message: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckReport:
-    """What the check of a folder found.
-
-    Attributes:
-        layout: the layout that was recognised.
-        counts: how many frames, and how many of them have each part.
-        problems: what would stop or spoil work.
-        notices: what only limits it, such as frames without a right view.
-    """
-
-    layout: str
-    counts: dict[str, int]
-    problems: list[Problem]
-    notices: list[Problem]
-
-    @property
-    def is_ok(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.problems
-
-    @property
-    def summary(self) -> str:
-        """One line for people."""
-        parts = ", ".join(f"{count} {part}" for part, count in self.counts.items())
-        verdict = "nothing is wrong" if self.is_ok else f"{len(self.problems)} problems"
-        return f"{self.layout}: {parts}; {verdict}, {len(self.notices)} notices"
 
 
 def check_dataset(
@@ -97,12 +52,7 @@ def check_dataset(
         found += _check_frame(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
-    return CheckReport(
-        layout=layout,
-        counts=_count(frames),
-        problems=[problem for problem in found if problem.kind != "note"],
-        notices=[problem for problem in found if problem.kind == "note"],
-    )
+    return make_report(layout, _count(frames), found)
 
 
 def _count(frames: list[Frame]) -> dict[str, int]:
@@ -173,7 +123,7 @@ def _look_at_image(
             return None, (width, height)
         return None, image_size(path)
     except InputError as error:
-        return _unreadable(path, error), None
+        return unreadable(path, error), None
 
 
 def _check_calibration(frame: Frame) -> Iterator[Problem]:
@@ -194,14 +144,14 @@ def _check_calibration(frame: Frame) -> Iterator[Problem]:
             message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
             yield Problem(path=frame.calibration, kind="missing", message=message)
     except InputError as error:
-        yield _unreadable(frame.calibration, error)
+        yield unreadable(frame.calibration, error)
 
 
 def _check_scan(path: Path) -> Iterator[Problem]:
     try:
         points = read_points_bin(path)
     except InputError as error:
-        yield _unreadable(path, error)
+        yield unreadable(path, error)
         return
     if len(points) == 0:
         yield Problem(path=path, kind="empty", message="holds no LiDAR point")
@@ -211,7 +161,7 @@ def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterat
     try:
         truth = read_depth_png(path) if is_depth else read_disparity(path)
     except InputError as error:
-        yield _unreadable(path, error)
+        yield unreadable(path, error)
         return
     height, width = truth.shape
     if (width, height) != size:
@@ -224,17 +174,6 @@ def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterat
     if largest > limit:
         message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
         yield Problem(path=path, kind="mismatch", message=message)
-
-
-def _unreadable(path: Path, error: InputError) -> Problem:
-    message = str(error).removeprefix(f"{path}: ")
-    try:
-        with path.open("rb") as file:
-            if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
-                message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
-    except OSError:
-        pass
-    return Problem(path=path, kind="unreadable", message=message)
 
 
 def _show(size: tuple[int, int] | None) -> str:

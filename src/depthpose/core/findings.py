@@ -1,0 +1,74 @@
+"""What the check of a folder finds: everything wrong, a line each."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from depthpose.core.errors import InputError
+
+_LFS_POINTER = b"version https://git-lfs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """One thing that is wrong, or worth knowing.
+
+    Attributes:
+        path: the file or folder.
+        kind: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``.
+        message: what is wrong.
+    """
+
+    path: Path
+    kind: str
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckReport:
+    """What the check of a folder found.
+
+    Attributes:
+        layout: the layout that was recognised.
+        counts: how many frames, and how many of them have each part.
+        problems: what would stop or spoil work.
+        notices: what only limits it, such as frames without a right view.
+    """
+
+    layout: str
+    counts: dict[str, int]
+    problems: list[Problem]
+    notices: list[Problem]
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        parts = ", ".join(f"{count} {part}" for part, count in self.counts.items())
+        verdict = "nothing is wrong" if self.is_ok else f"{len(self.problems)} problems"
+        return f"{self.layout}: {parts}; {verdict}, {len(self.notices)} notices"
+
+
+def make_report(layout: str, counts: dict[str, int], found: list[Problem]) -> CheckReport:
+    """Part what is wrong from what is only worth knowing."""
+    return CheckReport(
+        layout=layout,
+        counts=counts,
+        problems=[problem for problem in found if problem.kind != "note"],
+        notices=[problem for problem in found if problem.kind == "note"],
+    )
+
+
+def unreadable(path: Path, error: InputError) -> Problem:
+    """Say that a file cannot be read, and why: a Git LFS pointer is the commonest reason."""
+    message = str(error).removeprefix(f"{path}: ")
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
+                message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
+    except OSError:
+        pass
+    return Problem(path=path, kind="unreadable", message=message)

@@ -1,0 +1,1 @@
+"""One partial point cloud of a known object to its 6-DoF pose (Geo-PoseNet)."""

@@ -1,0 +1,20 @@
+"""BOP's layout and that of Linemod_preprocessed: read, write and check; detections and results."""
+
+from depthpose.pose.bop.check import check_bop as check_bop
+from depthpose.pose.bop.dataset import BopDataset as BopDataset
+from depthpose.pose.bop.dataset import is_bop as is_bop
+from depthpose.pose.bop.dataset import open_bop as open_bop
+from depthpose.pose.bop.detections import Detection as Detection
+from depthpose.pose.bop.detections import decode_rle as decode_rle
+from depthpose.pose.bop.detections import encode_rle as encode_rle
+from depthpose.pose.bop.detections import read_detections as read_detections
+from depthpose.pose.bop.frames import Instance as Instance
+from depthpose.pose.bop.results import BopResult as BopResult
+from depthpose.pose.bop.results import read_results as read_results
+from depthpose.pose.bop.results import write_results as write_results
+from depthpose.pose.bop.targets import Target as Target
+from depthpose.pose.bop.targets import read_targets as read_targets
+from depthpose.pose.bop.write import BopFrame as BopFrame
+from depthpose.pose.bop.write import BopObject as BopObject
+from depthpose.pose.bop.write import write_bop_models as write_bop_models
+from depthpose.pose.bop.write import write_bop_scene as write_bop_scene

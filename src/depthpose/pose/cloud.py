@@ -1,0 +1,110 @@
+"""Depth and mask to the partial cloud of one object: flying pixels, samples, voxels."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from depthpose.core.camera import back_project
+from depthpose.core.errors import InputError
+from depthpose.pose.config import CloudConfig
+
+_LARGEST_CELL = 2**20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Voxels:
+    """Which cells of a grid a cloud fills, and the point that was kept in each.
+
+    Attributes:
+        coordinates: cell of each kept point, ``floor((x - mean) / voxel)``; no two are equal.
+        kept: index of that point in the cloud, ascending: the first of its cell.
+    """
+
+    coordinates: Int64[Tensor, "m 3"]
+    kept: Int64[Tensor, " m"]
+
+
+def cloud_from_depth(
+    depth_m: Float[Tensor, "h w"],
+    mask: Bool[Tensor, "mask_h mask_w"],
+    K: Float[Tensor, "3 3"],
+    diameter_m: float | None = None,
+    config: CloudConfig | None = None,
+) -> Float[Tensor, "n 3"]:
+    """Lift the masked pixels that have a depth to points of the camera frame.
+
+    Args:
+        depth_m: along the optical axis; NaN where there is no reading.
+        mask: the object's pixels.
+        K: intrinsic matrix of the depth image.
+        diameter_m: of the object, to drop flying pixels; None: keep all.
+        config: how far a point may lie.
+
+    Raises:
+        InputError: mask and depth differ in size.
+    """
+    if depth_m.shape != mask.shape:
+        raise InputError(
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+        )
+    is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
+    points_m = back_project(depth_m, K)[is_read]
+    if diameter_m is None or len(points_m) == 0:
+        return points_m
+    config = CloudConfig() if config is None else config
+    return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+
+
+def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:
+    """Mark points farther than ``limit_m`` from the median: background at the mask's border."""
+    return (points_m - points_m.median(0).values).norm(dim=-1) > limit_m
+
+
+def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
+    """Say why a cloud is too small to be posed; None where it is not."""
+    config = CloudConfig() if config is None else config
+    if len(points_m) >= config.min_points:
+        return None
+    return (
+        f"the cloud has {len(points_m)} points, fewer than the {config.min_points} that a pose "
+        "takes: is the mask empty, or the depth missing there?"
+    )
+
+
+def sample_points(
+    points_m: Float[Tensor, "n 3"], count: int | None, generator: torch.Generator
+) -> Float[Tensor, "m 3"]:
+    """Take ``count`` points at random, in their order; all where there are no more."""
+    if count is None or len(points_m) <= count:
+        return points_m
+    index = torch.randperm(len(points_m), generator=generator)[:count].sort().values
+    return points_m[index.to(points_m.device)]
+
+
+def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
+    """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
+
+    Votes are cast from the kept points' own coordinates, not from the centres of cells.
+
+    Raises:
+        InputError: there is no point, or the cloud is over a million voxels wide.
+    """
+    if len(points_m) == 0:
+        raise InputError("voxelise: the cloud has no point; see refusal_of first.")
+    cells = torch.floor((points_m - points_m.mean(0)) / voxel_m).long()
+    extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
+    if extent > _LARGEST_CELL:
+        raise InputError(
+            f"voxelise: the cloud is {extent} voxels of {voxel_m} m wide; are its points in mm, "
+            "or is one of them far away? Give metres."
+        )
+    local = cells - cells.amin(0)
+    key = (local[:, 0] * extent + local[:, 1]) * extent + local[:, 2]
+    _, cell = torch.unique(key, return_inverse=True)
+    order = torch.arange(len(cells), device=cells.device)
+    first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
+    kept = first.scatter_reduce_(0, cell, order, "amin").sort().values
+    return Voxels(coordinates=cells[kept], kept=kept)

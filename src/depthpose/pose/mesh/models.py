@@ -1,0 +1,166 @@
+"""Model files to :class:`ObjectModel`: PLY, STL, OBJ and GLB, with faces or points alone."""
+
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import AnyPath, read_bytes, read_cloud
+from depthpose.core.files.disk import refused_as, refused_suffix
+from depthpose.pose.config import METRES, MeshConfig, Unit
+from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
+from depthpose.pose.types import ObjectModel, Symmetries
+
+MESHES = (".ply", ".stl", ".obj", ".glb")
+CLOUDS = (".pcd", ".npy", ".xyz", ".txt")
+_COARSE = 1000
+"""A mesh of fewer points (a CAD box has eight) lends keypoints from inside its faces too."""
+_LARGEST_M, _SMALLEST_M = 20.0, 0.002
+
+
+def read_model(
+    path: AnyPath,
+    unit: Unit,
+    *,
+    name: str | None = None,
+    number: int = 0,
+    symmetries: Symmetries | None = None,
+    config: MeshConfig | None = None,
+) -> ObjectModel:
+    """Read a model file.
+
+    Args:
+        path: mesh (PLY, STL, OBJ, GLB) or bare points (PLY, PCD, NPY, text).
+        unit: unit of the numbers in the file; no format but GLB says it.
+        name: what samples call the object; None: the file's name.
+        number: BOP's ``obj_id``.
+        symmetries: as declared; None: none.
+        config: how many keypoints.
+
+    Raises:
+        InputError: the file is missing, damaged or of another format, holds no extent, or is so
+            large or small that the unit must be another.
+    """
+    scale = METRES[unit]
+    vertices, faces = _read_geometry(path)
+    vertices_m = torch.from_numpy(vertices) * scale
+    _refuse_unit(path, vertices_m, unit)
+    return make_model(
+        vertices_m,
+        torch.from_numpy(faces),
+        name=Path(path).stem if name is None else name,
+        number=number,
+        symmetries=symmetries,
+        config=config,
+    )
+
+
+def make_model(
+    vertices_m: Float[Tensor, "v 3"],
+    faces: Tensor,
+    *,
+    name: str,
+    number: int = 0,
+    symmetries: Symmetries | None = None,
+    config: MeshConfig | None = None,
+) -> ObjectModel:
+    """Make a model of points and faces that are in memory; the rest is computed.
+
+    Raises:
+        InputError: all points are one, or fewer of them differ than keypoints are wanted.
+    """
+    config = MeshConfig() if config is None else config
+    # Points of no face are not surface: one stray would set the diameter and take a keypoint.
+    if len(faces):
+        kept, faces = torch.unique(faces, return_inverse=True)
+        vertices_m = vertices_m[kept]
+    vertices_m = vertices_m.float()
+    normals = _vertex_normals(vertices_m, faces) if len(faces) else estimate_normals(vertices_m)
+    model = ObjectModel(
+        name=name,
+        number=number,
+        vertices_m=vertices_m,
+        faces=faces.long().reshape(-1, 3),
+        normals=normals,
+        diameter_m=exact_diameter(vertices_m),
+        keypoints_m=vertices_m[:0],
+        symmetries=Symmetries() if symmetries is None else symmetries,
+    )
+    return _with_keypoints(model, config.keypoints)
+
+
+def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
+    """Largest distance of two points [m]: both are corners of the convex hull."""
+    points = points_m.double().cpu().numpy()
+    # All on one plane, or fewer than four: there is no hull, and every pair is looked at.
+    with suppress(QhullError, ValueError):
+        points = points[ConvexHull(points).vertices]
+    everything = torch.from_numpy(points)
+    exactly = "donot_use_mm_for_euclid_dist"
+    rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
+    return max(float(row.max()) for row in rows)
+
+
+def _with_keypoints(model: ObjectModel, count: int) -> ObjectModel:
+    candidates = model.vertices_m
+    if len(model.faces) and len(candidates) < _COARSE:
+        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
+    keypoints_m = candidates[farthest_points(candidates, count)]
+    fields = {**vars(model), "keypoints_m": keypoints_m}
+    return ObjectModel(**fields)
+
+
+def _read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    suffix = Path(path).suffix.lower()
+    if suffix in CLOUDS:
+        return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
+    if suffix not in MESHES:
+        raise refused_suffix(path, "model", (*MESHES, *CLOUDS))
+    data = read_bytes(path)
+    with refused_as(path, "model", "export it again"):
+        import trimesh
+
+        loaded: Any = trimesh.load(
+            BytesIO(data), suffix[1:], process=False, skip_materials=True, allow_remote=False
+        )
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_mesh()
+        vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
+        faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
+    if len(vertices) < 4 or not np.isfinite(vertices).all():
+        raise InputError(
+            f"{path}: holds {len(vertices)} points, or one that is not finite; a model needs 4 and "
+            "more. Export it again."
+        )
+    return vertices, faces
+
+
+def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
+    """Mean of the normals of the faces at a vertex, each by its area."""
+    corners = vertices_m.double()[faces]
+    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = torch.zeros(len(vertices_m), 3, dtype=torch.float64)
+    for corner in range(3):
+        total.index_add_(0, faces[:, corner], doubled)
+    return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
+
+
+def _refuse_unit(path: AnyPath, vertices_m: Tensor, unit: Unit) -> None:
+    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
+    if extent_m > _LARGEST_M and unit == "m":
+        raise InputError(
+            f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
+            "Then say unit mm."
+        )
+    if 0 < extent_m < _SMALLEST_M and unit == "mm":
+        raise InputError(
+            f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
+            "it in metres? Then say unit m."
+        )

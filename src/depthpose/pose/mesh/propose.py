@@ -1,0 +1,251 @@
+"""Symmetries found: what a new CAD file looks like when it is turned, and how sure that is."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+from depthpose.pose.mesh.sampling import fibonacci_directions, sample_surface
+from depthpose.pose.mesh.symmetry import turn_about
+from depthpose.pose.types import Axis, ObjectModel, Symmetries
+
+_ORDERS = (2, 3, 4, 5, 6)
+_TRIED_ORDERS = range(2, 13)
+_TURNS = 36
+_COARSE = 0.04
+"""Deviation, in diameters, from which following the surface may still find a symmetry: an axis
+that is off by 4 degrees moves the surface by about as much."""
+_SAME_RAD = 0.15
+_SHADOW_RAD = 0.25
+_MOST_AXES = 40
+"""A cube has 13 axes, an icosahedron 31."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SymmetryProposal:
+    """One way in which an object may look alike.
+
+    Attributes:
+        kind: ``discrete`` or ``continuous``.
+        axis: what to turn about.
+        angle_rad: by how much; nothing for a continuous symmetry.
+        deviation: distance of the turned surface from the surface, in diameters: the largest but
+            for 2 % of the points, and for ``continuous`` over all turns.
+        certainty: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond.
+    """
+
+    kind: str
+    axis: Axis
+    angle_rad: float | None
+    deviation: float
+    certainty: float
+
+
+class _Surface:
+    """Measures how far a turned surface lies from itself, in diameters."""
+
+    def __init__(self, model: ObjectModel) -> None:
+        dense, normals = sample_surface(model, 20000)
+        self.centre_m = dense.double().mean(0)
+        self.points = (dense.double() - self.centre_m) / model.diameter_m
+        self._normals = normals.double().numpy()
+        self._tree = KDTree(self.points.numpy())
+        self.few, self.many = (self._every(count) for count in (100, 1000))
+        self._rough_tree = KDTree(self._every(2500).numpy())
+
+    def _every(self, count: int) -> Float[Tensor, "m 3"]:
+        index = torch.arange(count) * len(self.points) // count
+        return self.points[index.unique()]
+
+    def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Give distance and index of the nearest sample."""
+        distance, index = self._tree.query(moved.numpy())
+        return np.asarray(distance), np.asarray(index)
+
+    def rough_distance(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+        """Mean distance of few turned points to a rough surface: for thousands of turns."""
+        distance, _ = self._rough_tree.query((self.few @ R.mT).numpy())
+        return torch.from_numpy(np.asarray(distance)).mean(-1)
+
+    def is_promising(self, R: Float[Tensor, "*batch 3 3"]) -> Tensor:
+        """Say coarsely, by few points, whether a turn is worth measuring."""
+        return self.rough_distance(R) <= _COARSE
+
+    def deviation(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+        """The 98th percentile of the distance to the surface, both ways."""
+        return torch.maximum(self._one_way(R), self._one_way(R.mT))
+
+    def _one_way(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+        moved = self.many @ R.mT
+        distance, index = self.nearest(moved)
+        gap = moved.numpy() - self.points.numpy()[index]
+        height = np.abs((gap * self._normals[index]).sum(-1))
+        # Between samples the plane says the distance; beside an edge, the sample does.
+        spacing = 2.0 / math.sqrt(len(self.points))
+        beside = np.maximum(distance - spacing, 0)
+        return torch.from_numpy(np.maximum(height, beside)).quantile(0.98, dim=-1)
+
+
+def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
+    """Search for turns that leave the shape as it is, and say how sure each is.
+
+    Every symmetry fixes the centre of the surface. Turns by a half to a sixth about the principal
+    axes and about 400 directions are tried coarsely; the promising ones follow the surface to an
+    exact axis; there, turns of order 2 to 12 and a full circle are measured. Texture does not
+    count: neither does it to a method that sees depth alone. Bumps smaller than the tolerance are
+    overlooked, so that a cup's handle is seen and its seam is not. Takes some seconds. A sphere is
+    told as two axes of revolution.
+
+    Args:
+        model: the object.
+        tolerance: deviation in diameters at which the certainty is one half.
+
+    Returns:
+        Proposals of a certainty of 1/5 and more, continuous first, then the surest.
+    """
+    surface = _Surface(model)
+    limit = 2 * tolerance
+    found: list[SymmetryProposal] = []
+    tried: list[Tensor] = []
+    for R in _promising_turns(surface):
+        revolved = [p.axis.direction for p in found if p.kind == "continuous"]
+        if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
+            break
+        if _is_known(_axis_of(R), tried, revolved):
+            continue
+        direction = _axis_of(_follow(surface, R))
+        if not _is_known(direction, tried, revolved):
+            tried.append(direction)
+            found += _measure(surface, direction, limit, tolerance)
+    return sorted(found, key=lambda p: (p.kind != "continuous", -p.certainty))
+
+
+def symmetries_from_proposals(
+    proposals: list[SymmetryProposal], min_certainty: float = 0.5
+) -> Symmetries:
+    """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
+
+    Without an axis the turns are completed to a group: two symmetries one after the other are one.
+    """
+    sure = [p for p in proposals if p.certainty >= min_certainty]
+    axes = tuple(p.axis for p in sure if p.kind == "continuous")
+    kept: list[Rigid] = []
+    for proposal in sure:
+        if proposal.angle_rad is None:
+            continue
+        turn = turn_about(proposal.axis.direction, proposal.axis.point_m,
+                          torch.tensor(proposal.angle_rad, dtype=torch.float64))  # fmt: skip
+        if not any(float(geodesic_rad(turn.R, other.R)) < _SAME_RAD for other in kept) and not any(
+            _is_same_about(axis.direction, turn.R, [other.R for other in kept]) for axis in axes
+        ):
+            kept.append(turn)
+    if not kept:
+        return Symmetries(continuous=axes)
+    kept = kept if axes else _completed(kept)
+    discrete = Rigid(torch.stack([t.R for t in kept]), torch.stack([t.t_m for t in kept]))
+    return Symmetries(discrete=discrete, continuous=axes)
+
+
+def _completed(turns: list[Rigid]) -> list[Rigid]:
+    """Add products until there is no new one; what passes 60 was no group (an icosahedron's)."""
+    every = list(turns)
+    eye = torch.eye(3, dtype=torch.float64)
+    for first in every:  # grows under way
+        for second in turns:
+            product = first @ second
+            known = [eye, *(turn.R for turn in every)]
+            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in known):
+                every.append(product)
+        if len(every) > 60:
+            return turns
+    return every
+
+
+def _is_same_about(axis: Tensor, R: Tensor, kept: list[Tensor]) -> bool:
+    """Whether a turn about the axis makes ``R`` one of those kept: they move the axis alike."""
+    return any(float((R @ axis - other @ axis).norm()) < _SAME_RAD for other in kept)
+
+
+def _proposal(
+    kind: str, axis: Axis, angle_rad: float | None, deviation: float, tolerance: float
+) -> SymmetryProposal:
+    certainty = 1 / (1 + (deviation / tolerance) ** 2)
+    return SymmetryProposal(
+        kind=kind, axis=axis, angle_rad=angle_rad, deviation=deviation, certainty=certainty
+    )
+
+
+def _fractions() -> Float[Tensor, " a"]:
+    """Every turn of order 2 to 12, each once."""
+    turns = {k / order for order in _TRIED_ORDERS for k in range(1, order)}
+    return torch.tensor(sorted(turns), dtype=torch.float64) * (2 * math.pi)
+
+
+def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
+    return turn_about(direction, torch.zeros_like(direction), angles).R
+
+
+def _promising_turns(surface: _Surface) -> list[Float[Tensor, "3 3"]]:
+    """Try turns about principal axes and many directions; those that fit, the best first."""
+    spread = surface.points.T @ surface.points
+    candidates = torch.cat([torch.linalg.eigh(spread).eigenvectors.T, fibonacci_directions(400)])
+    angles = torch.tensor([2 * math.pi / order for order in _ORDERS], dtype=torch.float64)
+    turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
+    coarse = surface.rough_distance(turns)
+    return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _COARSE]
+
+
+def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) -> bool:
+    """Whether an axis was tried, or follows: all lines across an axis of revolution are alike."""
+    near = math.cos(_SAME_RAD)
+    across = [a for a in revolved if abs(float(a @ direction)) < math.sin(_SAME_RAD)]
+    is_across = any(abs(float(a @ t)) < math.sin(_SAME_RAD) for a in across for t in tried)
+    return is_across or any(abs(float(direction @ t)) > near for t in tried)
+
+
+def _measure(
+    surface: _Surface, direction: Tensor, limit: float, tolerance: float
+) -> list[SymmetryProposal]:
+    """Measure the full circle about an axis, or else every turn of order 2 to 12."""
+    axis = Axis(direction=direction, point_m=surface.centre_m)
+    circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
+    if bool(surface.is_promising(circle).all()):
+        worst = float(surface.deviation(circle).max())
+        if worst <= limit:
+            return [_proposal("continuous", axis, None, worst, tolerance)]
+    angles = _fractions()
+    angles = angles[surface.is_promising(_turns(direction, angles))]
+    if len(angles) == 0:
+        return []
+    deviation = surface.deviation(_turns(direction, angles))
+    kept: list[SymmetryProposal] = []
+    for i in deviation.argsort().tolist():
+        angle, value = float(angles[i]), float(deviation[i])
+        # A turn beside a better one is its shadow, not another symmetry.
+        is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SHADOW_RAD for p in kept)
+        if value <= limit and not is_shadow:
+            kept.append(_proposal("discrete", axis, angle, value, tolerance))
+    return kept
+
+
+def _follow(surface: _Surface, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """Let the turned surface slide onto the surface (ICP about the fixed centre)."""
+    points = surface.many
+    weight = torch.ones(2 * len(points), dtype=torch.float64)
+    for _ in range(15):
+        _, index = surface.nearest(points @ R.mT)
+        target = surface.points[torch.from_numpy(index)]
+        # With each point its mirror image through the centre, the fit cannot shift.
+        R = fit_rigid(torch.cat([points, -points]), torch.cat([target, -target]), weight).R
+    return R
+
+
+def _axis_of(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
+    """The direction that a rotation leaves alone; well defined for half turns too."""
+    _, _, vh = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype))
+    return vh[-1]

@@ -1,0 +1,222 @@
+"""How far a pose is from the truth: ADD, ADD-S, MSSD, MSPD, VSD, degrees and metres.
+
+Definitions of Hinterstoisser et al. (2012) and of the BOP toolkit (Hodan et al. 2018, 2020).
+Computed in float64.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from depthpose.core.camera import pixel_grid, project
+from depthpose.core.rigid import Rigid, geodesic_rad
+
+VSD_DELTA_M = 0.015
+"""Tolerance of visibility [m]; BOP takes 15 mm for all sets but ITODD (5 mm)."""
+BOP_SHARES = tuple(round(0.05 * i, 2) for i in range(1, 11))
+"""BOP's taus of VSD and thresholds of VSD and MSSD: 0.05 to 0.5 (of the diameter)."""
+BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))
+"""BOP's thresholds of MSPD [px], for an image 640 wide."""
+
+_CHUNK = 2**22
+
+RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
+"""Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """What VSD compares poses in.
+
+    Attributes:
+        depth_m: measured; NaN or 0 where there is no reading.
+        K: intrinsic matrix of that image.
+        render: depth of the object at a pose, in this camera; with ``core.raster``
+            ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
+    """
+
+    depth_m: Float[Tensor, "h w"]
+    K: Float[Tensor, "3 3"]
+    render: RenderDepth
+
+
+def rotation_error_rad(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
+    """Angle between two poses' rotations [rad]."""
+    return geodesic_rad(estimated.R.double(), true.R.double())
+
+
+def translation_error_m(estimated: Rigid, true: Rigid) -> Float[Tensor, "*batch"]:
+    """Distance between two poses' translations [m]."""
+    return (estimated.t_m.double() - true.t_m.double()).norm(dim=-1)
+
+
+def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
+    """ADD [m]: mean distance of each model point at one pose to itself at the other."""
+    return (_moved(estimated, points_m) - _moved(true, points_m)).norm(dim=-1).mean(-1)
+
+
+def adds_m(
+    estimated: Rigid,
+    true: Rigid,
+    points_m: Float[Tensor, "n 3"],
+    *,
+    from_estimate: bool = False,
+) -> Float[Tensor, "*batch"]:
+    """ADD-S [m]: mean distance of each point to the nearest at the other pose.
+
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same, annotated.
+        points_m: of the model.
+        from_estimate: BOP and Hinterstoisser go from each true point to the nearest estimated one;
+            True goes the other way, as DenseFusion and the method's published code do.
+    """
+    first, second = _moved(true, points_m), _moved(estimated, points_m)
+    if from_estimate:
+        first, second = second, first
+    rows = zip(first.reshape(-1, *first.shape[-2:]), second.reshape(-1, *second.shape[-2:]),
+               strict=True)  # fmt: skip
+    means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
+    return torch.tensor(means, dtype=torch.float64).reshape(first.shape[:-2])
+
+
+def mssd_m(
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
+) -> Float[Tensor, ""]:
+    """MSSD [m]: largest distance of a surface point, for the most lenient symmetric truth.
+
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same, annotated.
+        points_m: of the model.
+        symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
+    """
+    found = _moved(estimated, points_m)
+    largest = [
+        (_moved(copy, points_m) - found).norm(dim=-1).amax(-1)
+        for copy in _symmetric_copies(true, symmetries, len(points_m))
+    ]
+    return torch.cat(largest).min()
+
+
+def mspd_px(
+    estimated: Rigid,
+    true: Rigid,
+    points_m: Float[Tensor, "n 3"],
+    symmetries: Rigid,
+    K: Float[Tensor, "3 3"],
+) -> Float[Tensor, ""]:
+    """MSPD [px]: largest distance of a projected point, for the most lenient symmetric truth.
+
+    Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
+    thresholds; see :func:`average_recall`.
+    """
+    found = project(_moved(estimated, points_m), K)
+    largest = [
+        (project(_moved(copy, points_m), K) - found).norm(dim=-1).nan_to_num(torch.inf).amax(-1)
+        for copy in _symmetric_copies(true, symmetries, len(points_m))
+    ]
+    return torch.cat(largest).min()
+
+
+def vsd(
+    estimated: Rigid,
+    true: Rigid,
+    view: View,
+    taus_m: Sequence[float],
+    delta_m: float = VSD_DELTA_M,
+) -> Float[Tensor, " t"]:
+    """VSD: share of the visible surface whose distance is off by ``tau`` or more, for each tau.
+
+    Distances are those from the camera's centre, not along its axis. A pixel of a render is
+    visible where the measured surface is not more than ``delta_m`` in front of it, or where
+    nothing was measured ("bop19"); the estimate is visible also where the truth is. A pixel
+    visible in one render alone is off. 1 where neither is visible anywhere.
+
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same, annotated.
+        view: the measured image, and how the object is drawn into it.
+        taus_m: tolerances; BOP's are ``BOP_SHARES`` times the diameter.
+        delta_m: tolerance of visibility.
+    """
+    rays = _ray_lengths(view.depth_m, view.K)
+    depths = (view.depth_m, view.render(estimated), view.render(true))
+    measured, found, known = (_filled(depth) * rays for depth in depths)
+    is_known = _is_visible(known, measured, delta_m)
+    is_found = _is_visible(found, measured, delta_m) | (is_known & (found > 0))
+    both, either = is_known & is_found, is_known | is_found
+    count = int(either.sum())
+    if count == 0:
+        return torch.ones(len(taus_m), dtype=torch.float64)
+    gap_m = (known[both] - found[both]).abs()
+    alone = count - int(both.sum())
+    bad = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
+    return (bad.double() + alone) / count
+
+
+def is_within_diameter(
+    error_m: Float[Tensor, "*batch"], diameter_m: float, share: float = 0.1
+) -> Bool[Tensor, "*batch"]:
+    """Whether an ADD or ADD-S is below a share of the diameter; NaN (no estimate) is not."""
+    return error_m < share * diameter_m
+
+
+def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
+    """Area under the share of errors below a threshold, for thresholds 0 to ``limit_m``; 0..1.
+
+    The exact area. PoseCNN's script takes the upper step at each error and is larger by up to one
+    part in the number of errors. A missing estimate is NaN or infinite, and counts as 0.
+    """
+    gain = (1 - error_m.double() / limit_m).clamp(min=0)
+    return float(gain.nan_to_num(0.0).mean())
+
+
+def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) -> float:
+    """BOP's average recall: share of errors below each threshold, mean over thresholds and taus.
+
+    A missing estimate is infinite or NaN: it stays in the denominator.
+
+    Args:
+        errors: one row a target; the taus of VSD, or one column. MSPD is scaled by 640 / width and
+            MSSD divided by the diameter first.
+        thresholds: ``BOP_SHARES`` for VSD and MSSD, ``BOP_PIXELS`` for MSPD.
+    """
+    return float(torch.stack([(errors < limit).double().mean() for limit in thresholds]).mean())
+
+
+def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
+    points = points_m.double()
+    return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
+
+
+def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
+    """Poses that look like the true one, in groups that fit into memory."""
+    pose = Rigid(true.R.double(), true.t_m.double())
+    R, t_m = symmetries.R.double(), symmetries.t_m.double()
+    size = max(1, _CHUNK // (3 * points))
+    return [
+        Rigid(pose.R @ rows, pose.t_m + (pose.R @ shift[..., None]).squeeze(-1))
+        for rows, shift in zip(R.split(size), t_m.split(size), strict=True)
+    ]
+
+
+def _ray_lengths(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> Float[Tensor, "h w"]:
+    """Distance from the centre of a point at depth 1, by pixel."""
+    height, width = depth_m.shape
+    pixels = pixel_grid(height, width, torch.float64)
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    return (x * x + y * y + 1).sqrt()
+
+
+def _filled(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    return depth_m.double().nan_to_num(nan=0.0, posinf=0.0)
+
+
+def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:
+    return (model > 0) & ((model - measured <= delta_m) | (measured == 0))

@@ -1,0 +1,204 @@
+"""What flows through the pose room: input apart from truth, the object, and the estimate."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+
+Status = Literal[
+    "ok", "too few points", "votes do not meet", "keypoints do not fit", "not observable"
+]
+"""An answer, or why there is none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CloudInput:
+    """What a pose estimate may look at. There is no truth here, so none can leak.
+
+    Attributes:
+        name: what the files made from this input are called.
+        points_m: the visible part of one object, in the camera frame (x right, y down, z forward).
+        object: name of the object, as its :class:`ObjectModel` carries it.
+    """
+
+    name: str
+    points_m: Float[Tensor, "n 3"]
+    object: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseTruth:
+    """What is known about the object of a sample.
+
+    Attributes:
+        camera_from_model: its pose.
+        visible_fraction: share of its silhouette that is not hidden, 0..1; None where unknown.
+        is_measured: whether the pose was annotated, not itself fitted to the same depth.
+    """
+
+    camera_from_model: Rigid
+    visible_fraction: float | None = None
+    is_measured: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CloudSample:
+    """One sample of a dataset."""
+
+    input: CloudInput
+    truth: PoseTruth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Axis:
+    """A continuous symmetry: every turn about this line leaves the object as it is.
+
+    Attributes:
+        direction: unit vector in the model frame.
+        point_m: a point that the axis goes through.
+    """
+
+    direction: Float[Tensor, "3"]
+    point_m: Float[Tensor, "3"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Symmetries:
+    """Motions of the model frame that leave the object as it is, as BOP's models_info says them.
+
+    Attributes:
+        discrete: ``model_from_model``, the identity not among them; None where there is none.
+        continuous: axes of revolution.
+    """
+
+    discrete: Rigid | None = None
+    continuous: tuple[Axis, ...] = ()
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the object looks alike from no two sides."""
+        return self.discrete is None and not self.continuous
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectModel:
+    """A known object: what its CAD file and the config say of it, in metres.
+
+    Attributes:
+        name: what samples call it.
+        number: BOP's ``obj_id``.
+        vertices_m: points of the surface; all that there is where ``faces`` is empty.
+        faces: three vertices each, counter-clockwise seen from outside.
+        normals: outward unit normal of each vertex; of an unknown side for a model of points.
+        diameter_m: largest distance of two points.
+        keypoints_m: what the network's directions point at.
+        symmetries: as declared or found.
+    """
+
+    name: str
+    number: int
+    vertices_m: Float[Tensor, "v 3"]
+    faces: Int64[Tensor, "f 3"]
+    normals: Float[Tensor, "v 3"]
+    diameter_m: float
+    keypoints_m: Float[Tensor, "k 3"]
+    symmetries: Symmetries = field(default_factory=Symmetries)
+
+    def __post_init__(self) -> None:
+        if not self.diameter_m > 0:
+            raise InputError(
+                f"object {self.name!r} has a diameter of {self.diameter_m} m; it is a single "
+                "point. Give a model with an extent."
+            )
+
+    @property
+    def triangles_m(self) -> Float[Tensor, "f 3 3"]:
+        """Corners of every face: what a renderer takes."""
+        return self.vertices_m[self.faces]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Vote:
+    """Where the directions of many points meet, with leading batch axes.
+
+    Attributes:
+        keypoints_m: the meeting points, in the frame of the points.
+        covariance_m2: their covariance, from how well the directions meet.
+        condition: largest over smallest eigenvalue of the normal matrix; infinite where all lines
+            are parallel. Above about 1000 the depth of the keypoint is a guess (figure 3-4).
+        inlier_share: share of the voting weight that agrees with the keypoint, 0..1.
+    """
+
+    keypoints_m: Float[Tensor, "*batch k 3"]
+    covariance_m2: Float[Tensor, "*batch k 3 3"]
+    condition: Float[Tensor, "*batch k"]
+    inlier_share: Float[Tensor, "*batch k"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseFit:
+    """The rigid transform that carries the model's keypoints onto found ones.
+
+    Attributes:
+        camera_from_model: the pose.
+        covariance: of (rotation [rad], translation [m]), left perturbation in the camera frame:
+            the true pose is ``R = exp(rotation) R_found``, ``t = exp(rotation) t_found +
+            translation``.
+        residual_m: root mean square distance of the keypoints that were used.
+        misfit: squared distances in units of their covariance, over the degrees of freedom: about 1
+            where the covariances of the keypoints are honest, far above where they break rigidity.
+        is_used: the keypoints that agree with the shape of the model.
+    """
+
+    camera_from_model: Rigid
+    covariance: Float[Tensor, "*batch 6 6"]
+    residual_m: Float[Tensor, "*batch"]
+    misfit: Float[Tensor, "*batch"]
+    is_used: Bool[Tensor, "*batch k"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseEstimate:
+    """The pose of one object, or the reason why there is none.
+
+    Attributes:
+        name: that of the input.
+        object: name of the object.
+        status: ``ok``, or the kind of refusal.
+        reason: one sentence for people; empty where the status is ``ok``.
+        camera_from_model: the pose; None where it is refused.
+        keypoints_m: the found keypoints in the camera frame.
+        covariance: 6x6, order and frame as :class:`PoseFit` says. Finite: it leaves out the
+            motions of ``free_motions``.
+        free_motions: unit vectors of (rotation, translation) along which a declared continuous
+            symmetry makes the variance infinite; no row where there is none.
+        inlier_share: share of the votes that agree, 0..1.
+        residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
+        seconds: time of each stage.
+    """
+
+    name: str
+    object: str
+    status: Status
+    reason: str = ""
+    camera_from_model: Rigid | None = None
+    keypoints_m: Float[Tensor, "k 3"] | None = None
+    covariance: Float[Tensor, "6 6"] | None = None
+    free_motions: Float[Tensor, "m 6"] | None = None
+    inlier_share: float | None = None
+    residual_m: float | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # No default may look like success: an answer has a pose, a refusal has a reason.
+        assert (self.camera_from_model is not None) == self.is_ok
+        assert self.is_ok or self.reason
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether there is a pose."""
+        return self.status == "ok"

@@ -1,0 +1,114 @@
+"""Keypoints to pose: Kabsch, then the most likely pose under the keypoints' own covariances."""
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid, fit_rigid
+from depthpose.pose.types import Axis, PoseFit
+
+_STEPS = 4
+"""Gauss-Newton from Kabsch converges quadratically; the fourth step is below float64's noise."""
+
+
+def fit_pose(
+    keypoints_m: Float[Tensor, "*batch k 3"],
+    covariance_m2: Float[Tensor, "*batch k 3 3"],
+    model_keypoints_m: Float[Tensor, "k 3"],
+    is_used: Bool[Tensor, "*batch k"] | None = None,
+) -> PoseFit:
+    """Carry the model's keypoints onto the found ones.
+
+    Begins with the weighted Kabsch fit, weights one over each covariance's trace, then minimises
+    ``sum e^T C^-1 e`` with ``e = R m + t - p`` over left perturbations. A vote is far surer across
+    its lines than along them, which one weight a keypoint cannot say. The covariance of the pose is
+    the inverse of ``sum J^T C^-1 J`` with ``J = [-[R m + t]_x, I]``.
+
+    Args:
+        keypoints_m: found, in the camera frame.
+        covariance_m2: of each; a floor keeps exact keypoints finite.
+        model_keypoints_m: known, in the model frame.
+        is_used: which count; None: all. Three at least, not on a line.
+
+    Raises:
+        InputError: fewer than three keypoints are used.
+    """
+    found, model = keypoints_m.double(), model_keypoints_m.double()
+    model = model.expand_as(found)
+    used = torch.ones_like(found[..., 0], dtype=torch.bool) if is_used is None else is_used
+    information = torch.linalg.inv(_with_floor(covariance_m2.double(), model))
+    information = information * used[..., None, None]
+    trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
+    pose = fit_rigid(model, found, _balanced(trace))
+    for _ in range(_STEPS):
+        H, step = _normal_equations(pose, (model, found, information))
+        pose = perturb(pose, torch.linalg.solve(H, step))
+    H, _ = _normal_equations(pose, (model, found, information))
+    error_m = pose.apply(model) - found
+    count = used.sum(-1)
+    misfit = (error_m[..., None, :] @ information @ error_m[..., None]).sum((-1, -2, -3))
+    square = (error_m.square().sum(-1) * used).sum(-1) / count
+    return PoseFit(
+        camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
+        covariance=torch.linalg.inv(H).to(keypoints_m),
+        residual_m=square.sqrt().to(keypoints_m),
+        misfit=(misfit / (3 * count - 6).clamp(min=1)).to(keypoints_m),
+        is_used=used,
+    )
+
+
+def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
+    """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
+    turn = torch.linalg.matrix_exp(cross_matrix(motion[..., :3]))
+    moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
+    return Rigid(turn @ pose.R, moved_m)
+
+
+def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Give ``[v]_x``, with ``[v]_x w = v x w``."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
+    """Give the motions of the camera frame that turn the object about its axes of revolution.
+
+    Unit vectors of (rotation, translation): along them no observation says anything, the variance
+    is infinite, and the pose stands all the same.
+    """
+    rows = []
+    for axis in axes:
+        direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
+        point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
+        # Turning by w about a line through c moves c nowhere: w x c + v = 0.
+        motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
+        rows.append(motion / motion.norm())
+    return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
+
+
+def _normal_equations(
+    pose: Rigid, terms: tuple[Tensor, Tensor, Tensor]
+) -> tuple[Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6"]]:
+    model, found, information = terms
+    moved_m = pose.apply(model)
+    eye = torch.eye(3, dtype=moved_m.dtype, device=moved_m.device).expand(*moved_m.shape, 3)
+    J = torch.cat([-cross_matrix(moved_m), eye], -1)
+    weighted = J.mT @ information
+    step = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
+    return (weighted @ J).sum(-3), step
+
+
+def _with_floor(
+    covariance_m2: Float64[Tensor, "*batch k 3 3"], model: Float64[Tensor, "*batch k 3"]
+) -> Float64[Tensor, "*batch k 3 3"]:
+    # No keypoint is known better than a millionth of the object, whatever its votes say.
+    spread = (model - model.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
+    eye = torch.eye(3, dtype=model.dtype, device=model.device)
+    return covariance_m2 + (1e-12 * spread)[..., None, None, None] * eye
+
+
+def _balanced(trace: Float64[Tensor, "*batch k"]) -> Float64[Tensor, "*batch k"]:
+    """Keep one keypoint that looks exact from deciding alone; a rotation takes three."""
+    return trace.clamp(max=100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300))

@@ -1,0 +1,117 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core.camera import project
+from depthpose.core.config import config_from_dict
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_depth_png, read_image
+from depthpose.pose.cloud import (
+    cloud_from_depth,
+    is_flying,
+    refusal_of,
+    sample_points,
+    voxelise,
+)
+from depthpose.pose.config import CloudConfig
+
+K = torch.tensor([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]]).double()
+
+
+def test_a_cloud_projects_onto_its_mask() -> None:
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[10:20, 30:50] = True
+    depth = torch.full((48, 64), 0.8)
+    depth[12, 30] = torch.nan
+    depth[13, 31] = 0
+    cloud = cloud_from_depth(depth, mask, K)
+    assert len(cloud) == 198
+    pixels = project(cloud, K).round().long()
+    assert bool(mask[pixels[:, 1], pixels[:, 0]].all())
+
+
+def test_flying_pixels_are_dropped() -> None:
+    depth = torch.full((48, 64), 0.8)
+    depth[:, 33:] = 2.0
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[10:20, 20:36] = True
+    assert len(cloud_from_depth(depth, mask, K)) == 160
+    assert len(cloud_from_depth(depth, mask, K, diameter_m=0.1)) == 130
+    points = torch.tensor([[0.0, 0, 1], [0, 0, 1.01], [0, 0, 1.02], [0, 0, 1.5]])
+    assert is_flying(points, 0.1).tolist() == [False, False, False, True]
+
+
+def test_a_mask_of_another_size_is_refused() -> None:
+    with pytest.raises(InputError, match="the mask is 3x2, but the depth image is 64x48"):
+        cloud_from_depth(torch.ones(48, 64), torch.ones(2, 3, dtype=torch.bool), K)
+
+
+def test_too_small_a_cloud_is_refused_with_a_reason() -> None:
+    assert refusal_of(torch.rand(16, 3)) is None
+    assert refusal_of(torch.rand(15, 3)) == (
+        "the cloud has 15 points, fewer than the 16 that a pose takes: is the mask empty, or the "
+        "depth missing there?"
+    )
+    empty = cloud_from_depth(torch.ones(4, 4), torch.zeros(4, 4, dtype=torch.bool), K, 0.1)
+    assert "0 points" in (refusal_of(empty) or "")
+
+
+def test_voxels_are_what_a_plain_loop_gives() -> None:
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.03
+    voxels = voxelise(points, 0.01)
+    seen: dict[tuple[int, ...], int] = {}
+    for i, cell in enumerate(((points - points.mean(0)) / 0.01).floor().long().tolist()):
+        seen.setdefault(tuple(cell), i)
+    assert voxels.kept.tolist() == list(seen.values())
+    assert [tuple(c) for c in voxels.coordinates.tolist()] == list(seen)
+
+
+def test_voxels_do_not_know_where_the_object_is() -> None:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double()
+    here, there = voxelise(points, 0.1), voxelise(points + 0.5, 0.1)
+    assert torch.equal(here.coordinates, there.coordinates)
+    assert torch.equal(here.kept, there.kept)
+
+
+def test_voxels_of_nothing_and_of_millimetres_are_refused() -> None:
+    with pytest.raises(InputError, match="no point"):
+        voxelise(torch.empty(0, 3), 0.01)
+    with pytest.raises(InputError, match="are its points in mm"):
+        voxelise(torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]), 0.001)
+
+
+def test_samples_are_a_subset_in_order_and_reproducible() -> None:
+    points = torch.arange(300.0).reshape(100, 3)
+    taken = [sample_points(points, 10, torch.Generator().manual_seed(3)) for _ in range(2)]
+    assert torch.equal(*taken)
+    assert taken[0][:, 0].diff().min() > 0
+    generator = torch.Generator()
+    assert sample_points(points, None, generator) is points
+    assert sample_points(points, 100, generator) is points
+
+
+@pytest.mark.parametrize(
+    ("knob", "value", "said"),
+    [
+        ("voxel_m", 8.0, "0.008 means 8 mm"),
+        ("voxel_m", 0.0, "positive part of a metre"),
+        ("min_points", 2, "take 16"),
+        ("max_points", 10, "every cloud would be refused"),
+        ("max_offset_diameters", 0.0, "take 1"),
+    ],
+)
+def test_knobs_out_of_range_are_refused(knob: str, value: object, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        config_from_dict({knob: value}, CloudConfig, source="test")
+
+
+def test_the_real_cat(real: Path) -> None:
+    folder = real / "pose/lm/test/000006"
+    depth = read_depth_png(folder / "depth/000000.png", 0.001)
+    mask = read_image(folder / "mask_visib/000000_000000.png")[0] > 0.5
+    intrinsic = torch.tensor([[572.4114, 0, 325.2611], [0, 573.57043, 242.04899], [0, 0, 1]])
+    cloud = cloud_from_depth(depth, mask, intrinsic.double(), 0.1545)
+    assert 2000 < len(cloud) <= 2212
+    assert float((cloud.amax(0) - cloud.amin(0)).norm()) < 0.25
+    assert 50 < len(voxelise(cloud, 0.008).kept) < 500

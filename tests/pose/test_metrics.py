@@ -1,0 +1,182 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from depthpose.core.camera import project
+from depthpose.core.files import read_depth_png
+from depthpose.core.rigid import Rigid
+from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
+from depthpose.pose.metrics import (
+    BOP_PIXELS,
+    BOP_SHARES,
+    View,
+    add_m,
+    adds_m,
+    auc,
+    average_recall,
+    is_within_diameter,
+    mspd_px,
+    mssd_m,
+    rotation_error_rad,
+    translation_error_m,
+    vsd,
+)
+from depthpose.pose.types import Axis, Symmetries
+
+K = torch.tensor(
+    [[572.4114, 0, 325.2611], [0, 573.57043, 242.04899], [0, 0, 1]], dtype=torch.float64
+)
+
+
+def pose_of(R: list[float], t_mm: list[float]) -> Rigid:
+    rotation = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
+    return Rigid(rotation, torch.tensor(t_mm, dtype=torch.float64) / 1000)
+
+
+def random_pose(seed: int) -> Rigid:
+    generator = torch.Generator().manual_seed(seed)
+    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    return Rigid(q * torch.linalg.det(q), torch.tensor([0.1, -0.1, 0.9]).double())
+
+
+def draw_depth(triangles_m: Tensor, size: tuple[int, int]) -> Tensor:
+    """Depth of a mesh by brute force: every small triangle against the pixels of its box."""
+    height, width = size
+    pixels = project(triangles_m, K)
+    low = pixels.amin(1).ceil().long()
+    span = int((pixels.amax(1) - pixels.amin(1)).max()) + 2
+    steps = torch.cartesian_prod(torch.arange(span), torch.arange(span))
+    at = low[:, None] + steps
+    a, b, c = ((pixels[:, i] - pixels[:, (i + 1) % 3])[:, None] for i in range(3))
+    from_a, from_b, from_c = (at - pixels[:, (i + 1) % 3][:, None] for i in range(3))
+    cross = [e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0] for e, f in
+             ((a, from_a), (b, from_b), (c, from_c))]  # fmt: skip
+    weights = torch.stack([cross[1], cross[2], cross[0]], -1)
+    total = weights.sum(-1, keepdim=True)
+    share = weights / total
+    inside = (share >= 0).all(-1) & (total[..., 0].abs() > 1e-12)
+    # 1 / z is linear in the image.
+    z = 1 / (share / triangles_m[:, None, :, 2]).sum(-1)
+    u, v = at.unbind(-1)
+    inside &= (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
+    depth.scatter_reduce_(0, (v * width + u)[inside], z[inside], "amin")
+    return depth.reshape(height, width)
+
+
+def test_errors_are_those_of_the_bop_toolkit(real: Path) -> None:
+    reference = json.loads((real / "reference/bop_errors/errors.json").read_text())
+    folder = real / "pose/lm/models"
+    info = json.loads((folder / "models_info.json").read_text())
+    points, symmetries = {}, {}
+    for number in {row["obj_id"] for row in reference["errors"]}:
+        model = read_model(folder / f"obj_{number:06d}.ply", "mm")
+        points[number] = model.vertices_m.double()[:: reference["vertex_stride"]]
+        declared = symmetries_from_bop(info[str(number)], source="models_info.json")
+        symmetries[number] = symmetry_transforms(declared)
+    for row in reference["errors"]:
+        estimated, true = pose_of(row["R_est"], row["t_est"]), pose_of(row["R_gt"], row["t_gt"])
+        cloud, turns = points[row["obj_id"]], symmetries[row["obj_id"]]
+        ours = [
+            1000 * float(add_m(estimated, true, cloud)),
+            1000 * float(adds_m(estimated, true, cloud)),
+            1000 * float(mssd_m(estimated, true, cloud, turns)),
+            float(mspd_px(estimated, true, cloud, turns, K)),
+            math.degrees(float(rotation_error_rad(estimated, true))),
+            1000 * float(translation_error_m(estimated, true)),
+        ]
+        names = ("add_mm", "adds_mm", "mssd_mm", "mspd_px", "rotation_deg", "translation_mm")
+        assert ours == pytest.approx([row[name] for name in names], rel=1e-6, abs=2e-6)
+
+
+def test_vsd_is_that_of_the_bop_toolkit(real: Path) -> None:
+    reference = json.loads((real / "reference/bop_errors/errors.json").read_text())["vsd"]
+    folder = real / "pose/lm"
+    model = read_model(folder / "models/obj_000006.ply", "mm")
+    depth_m = read_depth_png(folder / "test/000006/depth/000000.png", 0.001)
+    size = (depth_m.shape[0], depth_m.shape[1])
+
+    def render(pose: Rigid) -> Tensor:
+        corners = model.triangles_m.double().flatten(0, 1)
+        return draw_depth(pose.apply(corners).unflatten(0, (-1, 3)), size)
+
+    view = View(depth_m=depth_m, K=K, render=render)
+    true = pose_of(reference["rows"][0]["R_est"], reference["rows"][0]["t_est"])
+    taus_m = [tau * model.diameter_m for tau in reference["taus"]]
+    assert tuple(reference["taus"]) == BOP_SHARES
+    for row in reference["rows"]:
+        ours = vsd(pose_of(row["R_est"], row["t_est"]), true, view, taus_m)
+        assert ours.tolist() == pytest.approx(row["vsd"], abs=0.01)
+
+
+def test_an_exact_pose_has_no_error_and_a_symmetric_one_neither() -> None:
+    pose, points = random_pose(0), torch.rand(50, 3).double() * 0.1
+    axis = Axis(direction=torch.tensor([0.0, 0, 1]).double(), point_m=torch.zeros(3).double())
+    turns = symmetry_transforms(Symmetries(continuous=(axis,)))
+    ring = torch.tensor([math.cos(1.0), math.sin(1.0)])
+    turned = pose @ Rigid(
+        torch.tensor([[ring[0], -ring[1], 0], [ring[1], ring[0], 0], [0, 0, 1]]).double(),
+        torch.zeros(3).double(),
+    )
+    assert float(add_m(pose, pose, points)) == 0
+    assert float(mssd_m(pose, pose, points, turns)) < 1e-9
+    assert float(add_m(turned, pose, points)) > 0.01
+    # BOP's steps are 0.02 rad: half a step at a radius below 0.15 m stays under 1.5 mm.
+    assert float(mssd_m(turned, pose, points, turns)) < 0.0015
+    assert float(mspd_px(turned, pose, points, turns, K)) < 1.5
+
+
+def test_both_ways_of_add_s_differ_where_the_shape_is_uneven() -> None:
+    points = torch.cat([torch.zeros(9, 3), torch.tensor([[0.1, 0, 0]])]).double()
+    true = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    moved = Rigid(torch.eye(3).double(), torch.tensor([0.1, 0, 0]).double())
+    assert float(adds_m(moved, true, points)) == pytest.approx(0.09)
+    assert float(adds_m(moved, true, points, from_estimate=True)) == pytest.approx(0.01)
+
+
+def test_add_takes_batches() -> None:
+    poses = [random_pose(i) for i in range(4)]
+    batch = Rigid(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
+    points = torch.rand(20, 3).double()
+    for errors, one in ((add_m(batch, poses[0], points), add_m),
+                        (adds_m(batch, Rigid(poses[0].R.expand(4, 3, 3), poses[0].t_m.expand(4, 3)),
+                                points), adds_m)):  # fmt: skip
+        assert errors.tolist() == pytest.approx([float(one(p, poses[0], points)) for p in poses])
+
+
+def test_missing_estimates_stay_in_the_denominator() -> None:
+    errors = torch.tensor([0.0, 0.05, math.inf, math.nan])
+    assert auc(errors) == pytest.approx((1 + 0.5) / 4)
+    assert is_within_diameter(errors, 0.6).tolist() == [True, True, False, False]
+    assert average_recall(errors[:, None], BOP_SHARES) == pytest.approx((10 + 9) / 40)
+    assert len(BOP_PIXELS) == 10
+
+
+def test_vsd_counts_what_is_seen_in_one_render_alone() -> None:
+    flat = torch.full((4, 4), 1.0).double()
+    poses = {0.0: flat.clone(), 1.0: flat.clone()}
+    poses[0.0][:, 2:] = torch.nan
+    poses[1.0][:, :1] = 0
+
+    def render(pose: Rigid) -> Tensor:
+        return poses[float(pose.t_m[0])]
+
+    first = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, 0]).double())
+    second = Rigid(torch.eye(3).double(), torch.tensor([1.0, 0, 0]).double())
+    # Truth covers columns 0-1, the estimate 1-3: one of four columns is common and right.
+    assert vsd(second, first, View(depth_m=flat, K=K, render=render), [0.01]).tolist() == [0.75]
+    nothing = torch.full((4, 4), 0.5).double()
+    assert vsd(second, first, View(depth_m=nothing, K=K, render=render), [0.01, 0.1]).tolist() == [
+        1,
+        1,
+    ]
+
+
+def test_a_point_behind_the_camera_has_no_picture() -> None:
+    pose = Rigid(torch.eye(3).double(), torch.tensor([0, 0, -1.0]).double())
+    eye = symmetry_transforms(Symmetries())
+    assert math.isinf(float(mspd_px(pose, random_pose(1), torch.zeros(1, 3), eye, K)))

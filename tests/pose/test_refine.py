@@ -1,0 +1,150 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from depthpose.core.config import config_from_dict
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.bop import open_bop
+from depthpose.pose.config import IcpConfig
+from depthpose.pose.mesh import make_model, sample_surface
+from depthpose.pose.metrics import add_m
+from depthpose.pose.refine import Surface, prepare_surface, refine_pose
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.voting import perturb
+
+
+@pytest.fixture(scope="module")
+def stone() -> ObjectModel:
+    points = np.random.default_rng(0).normal(size=(25, 3)) * [0.03, 0.05, 0.07]
+    mesh = trimesh.convex.convex_hull(points)
+    vertices = torch.from_numpy(np.array(mesh.vertices))
+    return make_model(vertices, torch.from_numpy(np.array(mesh.faces)), name="stone")
+
+
+@pytest.fixture(scope="module")
+def surface(stone: ObjectModel) -> Surface:
+    return prepare_surface(stone)
+
+
+def pose_near(true: Rigid, seed: int, turn_rad: float, shift_m: float) -> Rigid:
+    generator = torch.Generator().manual_seed(seed)
+    axis, way = torch.nn.functional.normalize(
+        torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+    turned = perturb(Rigid(true.R, torch.zeros(3).double()),
+                     torch.cat([turn_rad * axis, torch.zeros(3).double()]))  # fmt: skip
+    return Rigid(turned.R, true.t_m + shift_m * way)
+
+
+def seen_half(stone: ObjectModel, pose: Rigid, count: int = 3000) -> torch.Tensor:
+    points, normals = sample_surface(stone, count)
+    moved = pose.apply(points.double())
+    return moved[(moved * (normals.double() @ pose.R.mT)).sum(-1) < 0]
+
+
+TRUE = perturb(
+    Rigid(torch.eye(3).double(), torch.zeros(3).double()),
+    torch.tensor([0.5, -0.8, 0.3, 0.05, -0.02, 0.8]).double(),
+)
+
+
+def test_a_near_pose_becomes_the_true_one(stone: ObjectModel, surface: Surface) -> None:
+    cloud = seen_half(stone, TRUE)
+    starts = [pose_near(TRUE, seed, math.radians(8), 0.005) for seed in range(4)]
+    batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
+    refined = refine_pose(cloud, batch, surface)
+    assert float(geodesic_rad(refined.camera_from_model.R, TRUE.R.expand(4, 3, 3)).max()) < 2e-3
+    assert float((refined.camera_from_model.t_m - TRUE.t_m).norm(dim=-1).max()) < 3e-4
+    assert refined.inlier_share.min() == 1
+    assert float(refined.residual_m.max()) < 2e-4
+    one = refine_pose(cloud, starts[2], surface).camera_from_model
+    assert torch.allclose(one.R, refined.camera_from_model.R[2], atol=1e-4)
+
+
+def test_the_refined_pose_moves_with_the_cloud(stone: ObjectModel, surface: Surface) -> None:
+    cloud, start = seen_half(stone, TRUE), pose_near(TRUE, 5, 0.1, 0.005)
+    motion = perturb(TRUE, torch.tensor([1.0, 0.4, -0.3, 0.2, 0.1, -0.3]).double())
+    here = refine_pose(cloud, start, surface).camera_from_model
+    there = refine_pose(motion.apply(cloud), motion @ start, surface).camera_from_model
+    assert torch.allclose((motion @ here).R, there.R, atol=1e-9)
+    assert torch.allclose((motion @ here).t_m, there.t_m, atol=1e-9)
+
+
+def test_far_points_have_no_say(stone: ObjectModel, surface: Surface) -> None:
+    cloud = seen_half(stone, TRUE)
+    wrong = cloud[::3] + torch.tensor([0.1, 0, 0])
+    clean = refine_pose(cloud, pose_near(TRUE, 6, 0.05, 0.003), surface)
+    mixed = refine_pose(torch.cat([cloud, wrong]), pose_near(TRUE, 6, 0.05, 0.003), surface)
+    error_m = add_m(mixed.camera_from_model, clean.camera_from_model, stone.vertices_m)
+    assert float(error_m) < 0.01 * stone.diameter_m
+    assert float(mixed.inlier_share) < float(clean.inlier_share) - 0.1
+
+
+def test_a_pose_that_meets_nothing_stays(stone: ObjectModel, surface: Surface) -> None:
+    away = Rigid(TRUE.R, TRUE.t_m + torch.tensor([0.5, 0, 0]))
+    refined = refine_pose(seen_half(stone, TRUE), away, surface)
+    assert torch.allclose(refined.camera_from_model.t_m, away.t_m)
+    assert float(refined.inlier_share) == 0
+    assert math.isinf(float(refined.residual_m))
+
+
+def test_its_covariance_is_honest(stone: ObjectModel, surface: Surface) -> None:
+    squares = []
+    for seed in range(60):
+        generator = torch.Generator().manual_seed(seed)
+        cloud = seen_half(stone, TRUE, 900)
+        cloud = cloud + 0.001 * torch.randn(cloud.shape, generator=generator, dtype=torch.float64)
+        refined = refine_pose(cloud, TRUE, surface)
+        turn = TRUE.R @ refined.camera_from_model.R.T
+        rotation = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0],
+                                turn[1, 0] - turn[0, 1]]) / 2  # fmt: skip
+        shift = TRUE.t_m - turn @ refined.camera_from_model.t_m
+        error = torch.cat([rotation, shift])
+        squares.append(float(error @ torch.linalg.solve(refined.covariance, error)))
+    # Chi-square with 6 degrees of freedom; nearest points and weights are not in the theory.
+    assert 4 < float(np.mean(squares)) < 10
+
+
+def test_what_a_surface_does_not_fix_is_uncertain() -> None:
+    ball = trimesh.creation.icosphere(3, 0.05)
+    vertices = torch.from_numpy(np.array(ball.vertices))
+    model = make_model(vertices, torch.from_numpy(np.array(ball.faces)), name="ball")
+    pose = Rigid(torch.eye(3).double(), torch.tensor([0, 0, 0.5]).double())
+    refined = refine_pose(seen_half(model, pose), pose, prepare_surface(model))
+    at_centre = torch.eye(6).double()
+    at_centre[3:, :3] = -torch.tensor([[0, -0.5, 0], [0.5, 0, 0], [0, 0, 0]]).double()
+    own = at_centre @ refined.covariance @ at_centre.mT
+    assert float(own[:3, :3].diagonal().min().sqrt()) > 10 * float(own[3:, 3:].diagonal().max())
+    assert float((refined.camera_from_model.t_m - pose.t_m).norm()) < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("knobs", "said"),
+    [
+        ({"iterations": 0}, "take 1, 100 and 100"),
+        ({"cloud_points": 10}, "take 1, 100 and 100"),
+        ({"end_distance_diameters": 0.2}, "the limit shrinks"),
+    ],
+)
+def test_knobs_out_of_range_are_refused(knobs: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        config_from_dict(knobs, IcpConfig, source="test")
+
+
+def test_the_real_cat_and_ape(real: Path) -> None:
+    data = open_bop(real / "pose/lm")
+    for i in range(2):
+        sample, model = data[i], data.objects[data.instances[i].object_id]
+        true = sample.truth.camera_from_model
+        starts = [pose_near(true, seed, math.radians(8), 0.04 * model.diameter_m)
+                  for seed in range(5)]  # fmt: skip
+        batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
+        refined = refine_pose(sample.input.points_m, batch, prepare_surface(model))
+        known = Rigid(true.R.expand(5, 3, 3), true.t_m.expand(5, 3))
+        error_m = add_m(refined.camera_from_model, known, model.vertices_m[::7])
+        assert float(error_m.max()) < 0.025 * model.diameter_m
