@@ -65,7 +65,7 @@ def starts_near(true: Rigid, turn_rad: float, shift_m: float) -> list[Rigid]:
 
 def peer(cloud: Tensor, model: ObjectModel, kind: str) -> Callable[[Rigid], Rigid]:
     """small_gicp, its target prepared once."""
-    import small_gicp
+    import small_gicp  # pyright: ignore[reportMissingImports]
 
     target = small_gicp.PointCloud(prepare_surface(model).points_m.numpy())
     tree = small_gicp.KdTree(target)

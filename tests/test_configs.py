@@ -32,6 +32,19 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["view", "stereo", "finetune"])
+def test_one_knob_leaves_the_stages_other_defaults(name: str, tmp_path: Path) -> None:
+    """Nested defaults are the stage's: Adam's betas for the GAN, the length of each loop."""
+    kind = STAGES[name][0]
+    adam = "generator_adam" if name == "view" else "adam"
+    (tmp_path / "c.yaml").write_text(f"{adam}: {{learning_rate: 0.5}}\nloop: {{batch_size: 2}}\n")
+    found, default = config_to_dict(read_config(tmp_path / "c.yaml", kind)), config_to_dict(kind())
+    default[adam]["learning_rate"], default["loop"]["batch_size"] = 0.5, 2
+    assert found == default
+    (tmp_path / "c.yaml").write_text("loop: {steps: 7}\n")
+    assert read_config(tmp_path / "c.yaml", kind).loop.epochs is None
+
+
+@pytest.mark.parametrize("name", ["view", "stereo", "finetune"])
 def test_the_thesis_settings_are_the_defaults(name: str) -> None:
     """The three full configs only spell out what the dataclasses say already."""
     kind = STAGES[name][0]

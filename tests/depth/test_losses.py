@@ -27,14 +27,15 @@ def test_cross_entropy_by_hand() -> None:
 
 
 def test_least_squares_by_hand() -> None:
-    assert float(adversarial_loss(LOGITS, "lsgan", is_real=True)) == pytest.approx((1 + 4) / 2)
-    assert float(adversarial_loss(LOGITS, "lsgan", is_real=False)) == pytest.approx((4 + 1) / 2)
+    assert float(adversarial_loss(2 * LOGITS, "lsgan", is_real=True)) == pytest.approx((9 + 9) / 2)
+    fake = adversarial_loss(2 * LOGITS, "lsgan", is_real=False)
+    assert float(fake) == pytest.approx((16 + 4) / 2)
 
 
 def test_the_discriminator_pays_half_of_both_mistakes() -> None:
-    loss = discriminator_loss(LOGITS, -LOGITS, "vanilla")
+    loss = discriminator_loss(LOGITS, 3 * LOGITS, "vanilla")
     real = (log1exp(-2) + log1exp(1)) / 2
-    fake = (log1exp(-2) + log1exp(1)) / 2
+    fake = (log1exp(6) + log1exp(-3)) / 2
     assert float(loss) == pytest.approx((real + fake) / 2, rel=1e-6)
 
 

@@ -115,9 +115,14 @@ def test_running_mode_is_deterministic_and_does_not_depend_on_neighbours() -> No
 
 
 def test_batch_mode_uses_the_image_itself_and_keeps_the_statistics() -> None:
-    drawer = Synthesiser(_warmed(small(7, test_mode="batch")))
+    network = _warmed(small(7, test_mode="batch"))
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    drawer = Synthesiser(network)
     image = torch.rand(3, 128, 256)
     assert not torch.equal(drawer.synthesise(image), drawer.synthesise(image)), "dropout is on"
+    after = network.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(tensor, after[name]) for name, tensor in before.items())
     running = Synthesiser(_warmed(small(7)))
     assert not torch.equal(drawer.synthesise(image), running.synthesise(image))
 

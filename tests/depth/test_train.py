@@ -242,9 +242,38 @@ def test_pairs_that_cannot_train_are_refused(
 
 
 def test_another_rig_than_the_generators_is_refused(pairs: PairsConfig) -> None:
-    samples = TrainingPairs(pairs, 0, needs_truth=False, baseline_m=0.3)
-    with pytest.raises(InputError, match=r"imitates one rig of 0\.3 m"):
-        samples.read(0)
+    made = PairsConfig(streets=StreetsConfig(frames=3))
+    for config in (pairs, made):
+        with pytest.raises(InputError, match=r"imitates one rig of 0\.3 m"):
+            TrainingPairs(config, 0, needs_truth=False, baseline_m=0.3)
+
+
+def test_another_focal_length_than_the_generators_is_refused(
+    pairs: PairsConfig, tmp_path: Path
+) -> None:
+    run = Run(folder=tmp_path)
+    config = ViewTraining(generator=GENERATOR, pairs=pairs, loop=LOOP)
+    other = dataclasses.replace(config, pairs=dataclasses.replace(pairs, focal_px=99.0))
+    with pytest.raises(InputError, match=r"pairs\.focal_px is 99\.0, but the generator imitates"):
+        train_view(other, run)
+    zoom = dataclasses.replace(pairs.augment, scale=(0.9, 1.2))
+    zoomed = dataclasses.replace(config, pairs=dataclasses.replace(pairs, augment=zoom))
+    with pytest.raises(InputError, match="another size is another focal length"):
+        train_view(zoomed, run)
+
+
+def test_a_start_of_another_network_names_the_knob(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
+    first = train_view(config, Run(folder=tmp_path / "first"))
+    wider = dataclasses.replace(GENERATOR, width=6)
+    other = dataclasses.replace(config, generator=wider, start=str(first))
+    with pytest.raises(InputError, match="was trained with width = 4, but the config says 6"):
+        train_view(other, Run(folder=tmp_path / "second"))
+
+
+def test_fine_tuning_asks_for_both_weights(pairs: PairsConfig, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needs weights of a generator to begin with"):
+        train_finetune(FinetuneTraining(pairs=pairs), Run(folder=tmp_path))
 
 
 def test_other_settings_do_not_share_a_run(

@@ -62,8 +62,9 @@ def main(words: Sequence[str] | None = None) -> int:
     except (InputError, MissingExtraError) as error:
         print(f"depthpose: error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("depthpose: interrupted; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        said = str(stop) or "interrupted"
+        print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
         return 130
 
 

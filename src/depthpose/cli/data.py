@@ -119,7 +119,7 @@ def make_streets(
 
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.kitti import has_raw_frame
-    from depthpose.depth.streets import street_rig
+    from depthpose.depth.streets import rig_number
 
     if number < 1 or first < 0 or not 0 <= seed <= 9999:
         raise InputError(
@@ -131,7 +131,7 @@ def make_streets(
     )
     _keep_settings(out, asdict(config))
     indices = range(first, first + number)
-    drives = {index: _drive(config, street_rig(config, index)[0].width) for index in indices}
+    drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
     for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
         _make_street(out, drives[index], config, index)
@@ -158,10 +158,7 @@ def _keep_settings(out: Path, settings: dict) -> None:
         )
 
 
-def _drive(config: "StreetsConfig", width: int) -> str:
-    from depthpose.depth.streets.rigs import KITTI_RIGS
-
-    day = next(n for n, rig in enumerate(KITTI_RIGS, 1) if round(rig[0] * config.scale) == width)
+def _drive(config: "StreetsConfig", day: int) -> str:
     return f"2100_01_{day:02d}_drive_{config.seed:04d}_sync"
 
 

@@ -56,6 +56,8 @@ def predict(
     )
     if not 0 < color_range[0] < color_range[1]:
         raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
+    if matcher == "sgbm" and config != MatcherConfig():
+        raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
     sources = predicting.find_sources(images)
     lens = predicting.read_lens(camera, focal_px)
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")

@@ -10,7 +10,7 @@ from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import list_images, read_image
-from depthpose.core.run import claim_folder, find_shard
+from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
 from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
@@ -73,6 +73,7 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
     rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
     claim_folder(out, {**method.settings, "camera": rig})
+    claim_names(out, {path.stem: path for path in pairs.left})
     failures: list[str] = []
     mine = find_shard().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):

@@ -64,8 +64,9 @@ def weights_method(
         facts["sees"] = "both views" if is_shown else "left view"
     if with_sgbm:
         facts["matcher"] += " with sgbm"
-        net = FakestereoNet.load(path, matcher="sgbm", config=SGBMConfig(with_filled_holes=True))
-        return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(config)}, is_shown)
+        sgbm = SGBMConfig(with_filled_holes=True)
+        net = FakestereoNet.load(path, matcher="sgbm", config=sgbm)
+        return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
     net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
     name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
     return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)

@@ -21,7 +21,7 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.run import claim_folder, find_shard
+from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
 from depthpose.depth.types import StereoInput
 
@@ -93,6 +93,7 @@ def predict_all(sources: list[Path], lens: Lens, method: Method, out: Path, look
     known = lens.camera
     facts = {"K": known.K.tolist()} if known else {"focal_px": lens.focal_px}
     claim_folder(out, {**method.settings, "camera": facts, "color_range_m": list(look.range_m)})
+    claim_names(out, {source.stem: source for source in sources})
     mine = [sources[k] for k in find_shard().share(len(sources))]
     failures: list[str] = []
     done = 0

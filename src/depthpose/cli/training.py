@@ -48,6 +48,7 @@ def train(
         resume: go on from the state that OUT holds.
     """
     from depthpose.core.config import read_config
+    from depthpose.core.run import find_shard
     from depthpose.depth.train import STAGES, Run
 
     kind, run_stage = STAGES[stage]
@@ -64,7 +65,8 @@ def train(
     chosen = _changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
     with _progress_bar() as on_step:
         path = run_stage(chosen, Run(folder=out, resume=resume, on_step=on_step))
-    print(f"trained weights: {path}")
+    if find_shard().rank == 0:
+        print(f"trained weights: {path}")
     return 0
 
 
@@ -78,7 +80,10 @@ class _progress_bar:  # noqa: N801 - reads as a verb where it is used
     def __enter__(self) -> Callable[[Any], None]:
         from tqdm import tqdm
 
-        self.bar = tqdm(unit=" steps", disable=None)
+        from depthpose.core.run import find_shard
+
+        # Opened before the length is known; other processes than the first never show a step.
+        self.bar = tqdm(unit=" steps", disable=True if find_shard().rank else None)
         return self.show
 
     def show(self, progress: Any) -> None:  # noqa: ANN401

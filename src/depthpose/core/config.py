@@ -31,7 +31,8 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
             f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
             "values, one 'name: value' a line."
         )
-    return config_from_dict(content, kind, source=str(path))
+    _refuse_unknown_keys(content, kind, str(path), prefix="")
+    return config_from_dict(_over_defaults(content, kind), kind, source=str(path))
 
 
 def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source: str) -> ConfigT:
@@ -62,6 +63,30 @@ def write_config(path: Path, config: object) -> None:
     """Write every knob of ``config``, defaults too, so that the file is a full record."""
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
+
+
+def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
+    """Lay nested differences over the defaults of ``kind``, which may differ from their class's.
+
+    A knob given in place of another (``INSTEAD`` in its class) takes that one's default away.
+    """
+    laid: dict[str, Any] = dict(content)
+    for field in dataclasses.fields(kind):
+        own = content.get(field.name)
+        default = _default_of(field)
+        if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
+            rivals = getattr(type(default), "INSTEAD", {})
+            left_out = {rivals[name] for name in own if name in rivals}
+            kept = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
+            nested = _over_defaults(own, type(default))
+            laid[field.name] = kept | nested
+    return laid
+
+
+def _default_of(field: dataclasses.Field[Any]) -> object:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 def _plain_value(value: object) -> object:

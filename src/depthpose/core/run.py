@@ -17,6 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_json
 
 _RECORD = "run.json"
+_SOURCES = "sources.json"
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 
@@ -114,6 +115,30 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     write_json(record, {"settings": dict(settings), "environment": environment()})
+
+
+def claim_names(folder: Path, sources: Mapping[str, Path]) -> None:
+    """Reserve names of results for the files that they are made from.
+
+    Args:
+        folder: where the results go.
+        sources: the file behind each name.
+
+    Raises:
+        InputError: an earlier run made a result of that name from another file.
+    """
+    record = folder / _SOURCES
+    there = read_json(record) if record.exists() else {}
+    known = there if isinstance(there, dict) else {}
+    wanted = {name: str(path.resolve()) for name, path in sources.items()}
+    for name, path in wanted.items():
+        if known.get(name, path) != path:
+            raise InputError(
+                f"{folder}: {name!r} is the result of {known[name]}, not of {path}; two files of "
+                "one name need two folders: choose another"
+            )
+    if known | wanted != known and find_shard().rank == 0:
+        write_json(record, known | wanted)
 
 
 def read_settings(folder: Path) -> dict[str, Any] | None:

@@ -2,7 +2,6 @@
 
 import warnings
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -62,7 +61,7 @@ class FakestereoNet:
         cls,
         weights: str | Path | None = None,
         *,
-        matcher: Literal["psmnet", "sgbm"] | Matcher | Path | None = None,
+        matcher: str | Path | Matcher | None = None,
         config: MatcherConfig | SGBMConfig | None = None,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file or by name.
@@ -71,7 +70,7 @@ class FakestereoNet:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed), or of PSMNet alone (then real pairs only). None: ``matcher`` alone.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
-                weights of PSMNet in another file, or any matcher of your own.
+                weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.
 
         Raises:
@@ -203,7 +202,8 @@ def virtual_camera(camera: Camera, focal_px: float) -> Camera:
     """Make the camera of the image brought to ``focal_px``."""
     rows, columns = focal_size(camera, focal_px)
     K = torch.tensor(
-        [[focal_px, 0, columns / 2], [0, focal_px, rows / 2], [0, 0, 1]], dtype=torch.float64
+        [[focal_px, 0, (columns - 1) / 2], [0, focal_px, (rows - 1) / 2], [0, 0, 1]],
+        dtype=torch.float64,
     )
     return Camera(width=columns, height=rows, K=K)
 
@@ -233,10 +233,14 @@ def refuse_unrectified(pair: StereoInput) -> None:
 def _choose_matcher(
     weights: str | Path | None,
     found: DepthWeights | None,
-    matcher: Literal["psmnet", "sgbm"] | Matcher | Path | None,
+    matcher: str | Path | Matcher | None,
     config: MatcherConfig | SGBMConfig | None,
 ) -> Matcher:
     run = config if isinstance(config, MatcherConfig) else MatcherConfig()
+    if isinstance(config, SGBMConfig) and matcher != "sgbm":
+        raise InputError(
+            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
+        )
     if matcher == "sgbm":
         if found is not None and found.generator is None:
             raise InputError(
@@ -244,15 +248,17 @@ def _choose_matcher(
                 "matcher. Leave one of the two away."
             )
         return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-    if isinstance(matcher, Path):
+    # Paths first: a Path has a method 'match' too, and would pass for a matcher.
+    if isinstance(matcher, str | Path) and matcher != "psmnet":
         found = read_depth_weights(find_weights(matcher))
-    elif isinstance(matcher, Matcher):
+    elif matcher is not None and not isinstance(matcher, str | Path):
         return matcher
     if found is None or found.matcher is None:
         raise InputError(
             f"weights is {None if weights is None else str(weights)!r} and matcher is "
             f"{None if matcher is None else str(matcher)!r}: there is no matcher in that. Give "
-            "weights='psmnet.safetensors', or matcher='sgbm', which needs none."
+            "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and a "
+            "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
         )
     return PSMNetMatcher(found.matcher, run)
 
@@ -295,6 +301,11 @@ def _tensor(image: Picture) -> Float[Tensor, "3 h w"]:
     match image:
         case str() | Path():
             return read_image(Path(image))
+        case np.ndarray() if image.dtype != np.uint8:
+            raise InputError(
+                f"the image is an array of {image.dtype}; give 8-bit RGB (H, W, 3), or a tensor "
+                "(3, H, W) of float in [0, 1]"
+            )
         case np.ndarray():
             return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
         case _:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import nn
@@ -30,7 +30,7 @@ class AdamConfig:
     """constant; constant-linear (second half falls to zero); halving; cosine (falls to zero)."""
 
     halvings: int = 4
-    """How often ``halving`` halves, at equal distances."""
+    """Equal parts of a training; ``halving`` halves after each but the last."""
 
     warmup_steps: int = 0
     """Steps over which the rate rises linearly from zero."""
@@ -41,6 +41,11 @@ class AdamConfig:
             raise InputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
         if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
             raise InputError(f"betas must be in [0, 1), got {self.beta1} and {self.beta2}")
+        if self.halvings < 1 or self.warmup_steps < 0:
+            raise InputError(
+                f"halvings must be 1 or more and warmup_steps 0 or more, got {self.halvings} and "
+                f"{self.warmup_steps}"
+            )
         if self.schedule not in ("constant", "constant-linear", "halving", "cosine"):
             raise InputError(
                 f"schedule must be constant, constant-linear, halving or cosine, "
@@ -64,6 +69,9 @@ class AdamConfig:
 class LoopConfig:
     """How long and how a task is trained; the task says what."""
 
+    INSTEAD: ClassVar[dict[str, str]] = {"steps": "epochs", "epochs": "steps"}
+    """A config file that gives one of these takes the other's default away."""
+
     steps: int | None = None
     """Optimiser steps; or give ``epochs``."""
 
@@ -74,7 +82,8 @@ class LoopConfig:
     """Samples of a micro-batch, in each process."""
 
     accumulate: int = 1
-    """Micro-batches whose gradients are averaged before a step."""
+    """Micro-batches whose gradients are averaged before a step. The view stage holds the graphs of
+    all of them until the discriminator has moved."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Arithmetic of the forward pass; fp16 needs a GPU."""
@@ -98,7 +107,8 @@ class LoopConfig:
     """Processes that make samples; 0: the training process itself."""
 
     ema_decay: float | None = None
-    """Decay of the moving average of the weights, which is then what is exported; None: off."""
+    """Decay of the moving average of the weights, which is then what is exported; None: off. The
+    first steps decay faster, so that the initial weights are soon forgotten."""
 
     device: Literal["auto", "cpu"] = "auto"
     """auto: the accelerator that ``accelerate`` finds; cpu: none."""

@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -67,8 +68,8 @@ def train(
         on_step: told after each step, in the main process.
 
     Raises:
-        InputError: nothing to train on, a folder with a state and no ``resume`` (or the reverse),
-            a precision that this machine lacks, or a loss that is no longer finite.
+        InputError: nothing to train on, a folder with a state and no ``resume``, a precision that
+            this machine lacks, or a loss that is no longer finite.
         Interrupted: asked to stop; the state is saved first.
     """
     if not len(samples):
@@ -101,12 +102,12 @@ class _Run:
             name: self.accelerator.prepare(optimizer)
             for name, (optimizer, _) in self.task.optimizers.items()
         }
+        if not (resume and has_state(folder)):
+            self._agree_on_weights()
         if self.config.ema_decay is not None:
             self.average = {name: _copied(m) for name, m in self.task.modules.items()}
         if resume and has_state(folder):
             self._restore(read_state(folder))
-        else:
-            self._agree_on_weights()
         self.journal.open(self.step)
 
     def walk(
@@ -128,7 +129,10 @@ class _Run:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
             if stop and self.step < self.steps:
                 self.journal.close()
-                raise Interrupted(f"stopped after step {self.step} of {self.steps}")
+                self.accelerator.wait_for_everyone()  # rank 0 may still be writing
+                raise Interrupted(
+                    f"stopped after step {self.step} of {self.steps}, --resume goes on from there"
+                )
         self._load(self.average)  # what is exported
         self.journal.close()
 
@@ -203,6 +207,7 @@ class _Run:
             batch_sampler=_Tickets(self, first),
             num_workers=self.config.workers,
             pin_memory=self.accelerator.device.type == "cuda",
+            worker_init_fn=_leave_signals_to_the_loop,
         )
         from accelerate.utils import send_to_device
 
@@ -240,9 +245,9 @@ class _Run:
         # fp16 overflows now and then, and its scaler skips such steps by itself.
         if self.config.precision != "fp16" and not math.isfinite(loss):
             raise InputError(
-                f"the {owner}'s loss is {loss} at step {self.step}. Lower its "
-                "learning_rate, set clip_norm, or use precision fp32; --resume goes on from the "
-                "last state."
+                f"the {owner}'s loss is {loss} at step {self.step}. Start anew in another folder "
+                "with a lower learning_rate, with clip_norm, or in precision fp32; 'start' can "
+                "take weights from before."
             )
 
     def _any_process(self, is_asked: bool) -> bool:
@@ -261,7 +266,8 @@ class _Run:
                     tensor.copy_(broadcast(tensor))
 
     @torch.no_grad()
-    def _update_average(self, decay: float) -> None:
+    def _update_average(self, most: float) -> None:
+        decay = min(most, (1 + self.step) / (10 + self.step))
         for name, module in self.task.modules.items():
             for key, tensor in module.state_dict().items():
                 held = self.average[name][key]
@@ -307,16 +313,24 @@ class _Tickets:
 def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
     try:
         from accelerate import Accelerator
+        from accelerate.state import AcceleratorState
+        from accelerate.utils import InitProcessGroupKwargs
     except ImportError as error:
         raise MissingExtraError("accelerate", "train", "training") from error
-    try:
-        return Accelerator(
-            cpu=config.device == "cpu", mixed_precision=_PRECISIONS[config.precision]
-        )
-    except ValueError as error:
+    # A second training of this process may have another precision; accelerate keeps the first.
+    AcceleratorState._reset_state()
+    # The others wait while rank 0 looks at the held-out samples.
+    patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
+    accelerator = Accelerator(
+        cpu=config.device == "cpu",
+        mixed_precision=_PRECISIONS[config.precision],
+        kwargs_handlers=[patience],
+    )
+    if config.precision == "fp16" and accelerator.scaler is None:
         raise InputError(
-            f"precision {config.precision!r} cannot be used here ({error}); take fp32 or bf16"
-        ) from error
+            "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has too."
+        )
+    return accelerator
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
@@ -325,6 +339,12 @@ def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
 
 def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
+
+
+def _leave_signals_to_the_loop(_: int) -> None:
+    """Let a worker outlive a SIGTERM to the whole job, until the loop has saved its state."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager

@@ -101,7 +101,7 @@ class PairsConfig:
     """Names of frames to leave out."""
 
     limit: int | None = None
-    """Take so many pairs of each folder, spread evenly; None: all."""
+    """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
 
     focal_px: float | None = None
     """Bring every pair to this focal length [px]; None: leave sizes as they are."""

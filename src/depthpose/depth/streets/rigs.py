@@ -1,5 +1,7 @@
 """Stereo rigs: those of KITTI's recording days, and others."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -22,6 +24,16 @@ _KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
 def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
     """Give the rig of a frame and the height of its mount [m], without drawing the frame."""
     return draw_rig(np.random.default_rng([72, config.seed, index]), config)
+
+
+def rig_number(config: StreetsConfig, index: int) -> int:
+    """Say which of KITTI's rigs a frame has, where ``config.rigs`` knows no others.
+
+    Rigs cannot be told apart by their size: small pictures of two of them are of one.
+    """
+    full = replace(config, scale=1.0, crop=None)
+    width = street_rig(full, index)[0].width
+    return next(n for n, rig in enumerate(KITTI_RIGS) if rig[0] == width)
 
 
 def kitti_rig(number: int = 0) -> StereoRig:

@@ -60,6 +60,5 @@ def _keep_training(module: nn.Module) -> None:
         if isinstance(part, nn.BatchNorm2d):
             part.train()
             part.track_running_stats = False
-            part.running_mean = part.running_var = None
         elif isinstance(part, nn.Dropout):
             part.train()

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from depthpose.core.loop import Evidence, Turn, make_adam
 from depthpose.depth.augment import TrainingPair
@@ -56,9 +56,10 @@ class FinetuneTask:
             return Evidence()
         self.generator.eval()
         device = next(self.generator.parameters()).device
-        pairs = [self.held_out.read(index) for index in range(len(self.held_out))]
-        drawn = [draw_right(self.generator, p.left[None].to(device))[0].cpu() for p in pairs]
-        evidence = held_out_evidence(self.matcher, self.held_out, drawn)
+
+        def draw(left: Tensor) -> Tensor:
+            return draw_right(self.generator, left[None].to(device))[0].cpu()
+
+        evidence = held_out_evidence(self.matcher, self.held_out, draw)
         self.generator.train()
-        pictures = {"right_drawn": torch.cat([pairs[0].right, drawn[0]], 1)}
-        return Evidence(numbers=evidence.numbers, pictures={**evidence.pictures, **pictures})
+        return evidence

@@ -1,6 +1,6 @@
 """Pairs, on disk or made, as training samples by ticket."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -15,7 +15,7 @@ from depthpose.depth.config import PairsConfig
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.kitti.frames import Frame, lidar_truth
-from depthpose.depth.streets import Streets
+from depthpose.depth.streets import Streets, kitti_rig, street_rig
 from depthpose.depth.types import StereoSample
 
 BASELINE_TOLERANCE = 0.02
@@ -46,7 +46,9 @@ class TrainingPairs:
     ) -> None:
         self.config, self.seed = config, seed
         self._frames = _find_frames(config, needs_truth=needs_truth)
-        self._baseline_m = baseline_m
+        self._needs_truth = needs_truth
+        if baseline_m is not None:
+            self._check_baselines(baseline_m)
         self._cache: dict[int, tuple[Tensor, ...]] = {}
 
     def __len__(self) -> int:
@@ -73,15 +75,14 @@ class TrainingPairs:
         sample = dataset[place]
         given, rig = sample.input, sample.input.camera
         assert given.right is not None, "frames without a right view were left out"
-        if isinstance(rig, StereoRig):
-            self._check_baseline(given.name, rig)
-        left_px = _truth_disparity(sample)
-        if left_px is None and isinstance(dataset, Dataset):
-            left_px = _scanned_disparity(dataset.frames[place], rig)
-        if left_px is None:
-            left_px = torch.full_like(given.left[0], torch.nan)
-        right_px = sample.truth.right_disparity_px
-        right_px = right_disparity_from_left(left_px) if right_px is None else right_px
+        left_px = right_px = torch.full_like(given.left[0], torch.nan)
+        if self._needs_truth:
+            left_px = _truth_disparity(sample)
+            if left_px is None and isinstance(dataset, Dataset):
+                left_px = _scanned_disparity(dataset.frames[place], rig)
+            assert left_px is not None, "frames without truth were left out"
+            right_px = sample.truth.right_disparity_px
+            right_px = right_disparity_from_left(left_px) if right_px is None else right_px
         pair = TrainingPair(given.left, given.right, left_px, right_px)
         if self.config.focal_px is None:
             return pair
@@ -92,14 +93,30 @@ class TrainingPairs:
             )
         return scale_pair(pair, self.config.focal_px / float(rig.K[0, 0]), (1, 1))
 
-    def _check_baseline(self, name: str, rig: StereoRig) -> None:
-        wanted_m = self._baseline_m
-        if wanted_m is not None and abs(rig.baseline_m / wanted_m - 1) > BASELINE_TOLERANCE:
-            raise InputError(
-                f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates one "
-                f"rig of {wanted_m} m. Train it on pairs of one rig, and set virtual_baseline_m to "
-                "that rig's."
-            )
+    def _check_baselines(self, wanted_m: float) -> None:
+        """Look at every rig before any work: a pair of another one would teach other metres."""
+        for name, rig in self._rigs():
+            if rig is None:
+                raise InputError(
+                    f"{name}: has no calibration, and the generator imitates one rig; add one, or "
+                    "exclude the frame"
+                )
+            if abs(rig.baseline_m / wanted_m - 1) > BASELINE_TOLERANCE:
+                raise InputError(
+                    f"{name}: its baseline is {rig.baseline_m:.4f} m, but the generator imitates "
+                    f"one rig of {wanted_m} m. Train it on pairs of one rig, and set "
+                    "virtual_baseline_m to that rig's."
+                )
+
+    def _rigs(self) -> Iterator[tuple[str, StereoRig | None]]:
+        for dataset, place in self._frames:
+            if isinstance(dataset, Dataset):
+                yield dataset.frames[place].name, dataset.read_rig(place)
+            elif dataset.config.rigs != "kitti":
+                yield f"street {place}", street_rig(dataset.config, place)[0]
+        made = self.config.streets
+        if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
+            yield from ((f"street with KITTI's rig {n}", kitti_rig(n)) for n in range(5))
 
 
 def _truth_disparity(sample: StereoSample) -> Float[Tensor, "h w"] | None:
@@ -114,8 +131,13 @@ def _truth_disparity(sample: StereoSample) -> Float[Tensor, "h w"] | None:
 
 def _scanned_disparity(frame: Frame, rig: Camera | None) -> Float[Tensor, "h w"] | None:
     """Disparity of the LiDAR points alone."""
-    if frame.velodyne is None or not isinstance(rig, StereoRig):
+    if frame.velodyne is None:
         return None
+    if not isinstance(rig, StereoRig):
+        raise InputError(
+            f"{frame.name}: has a LiDAR scan but no calibration, so it is no truth; add the "
+            "calibration, or exclude the frame"
+        )
     return disparity_from_depth(lidar_truth(frame, "camera_z"), rig)
 
 
@@ -126,7 +148,8 @@ def _find_frames(config: PairsConfig, *, needs_truth: bool) -> list[tuple[Datase
     found: list[tuple[Dataset | Streets, int]] = []
     if config.streets is not None:
         made = Streets(config.streets)
-        found += [(made, place) for place in range(len(made))]
+        places = [(made, place) for place in range(len(made))]
+        found += places if config.limit is None else _spread(places, config.limit)
     for number, folder in enumerate(config.folders):
         dataset = open_dataset(Path(folder), config.split if number == 0 else None)
         usable: list[tuple[Dataset | Streets, int]] = [

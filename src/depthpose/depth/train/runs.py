@@ -1,7 +1,7 @@
 """A config to a trained weights file: the three stages as commands run them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +9,10 @@ import torch
 
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict, write_config
+from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, Progress, Task, train
-from depthpose.core.run import claim_folder
-from depthpose.depth.config import PairsConfig
+from depthpose.core.run import claim_folder, find_shard
+from depthpose.depth.config import GeneratorConfig, PairsConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
@@ -20,6 +21,9 @@ from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stereo import StereoTask
 from depthpose.depth.train.view import ViewTask
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+
+_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
+"""Knobs of the loop that change no weight: a resumed run may have others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +45,13 @@ class Run:
 def train_view(config: ViewTraining, run: Run) -> Path:
     """Train the generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
+    config = replace(config, pairs=_at_virtual_focal(config.pairs, config.generator))
     rig_m = config.generator.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=False, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
-        generator.load_state_dict(read_generator(find_weights(config.start)).state_dict())
+        _start_from(generator, read_generator(find_weights(config.start)), config.start)
     _walk(ViewTask(generator, config, held_out), pairs, config, run)
     return _export(run, config, generator=generator)
 
@@ -58,7 +63,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=True)
     matcher = PSMNet(config.matcher)
     if config.start is not None:
-        matcher.load_state_dict(read_matcher(find_weights(config.start)).state_dict())
+        _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
     _walk(StereoTask(matcher, config, held_out), pairs, config, run)
     return _export(run, config, matcher=matcher)
 
@@ -66,8 +71,15 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)
+    for knob in ("generator", "matcher"):
+        if not getattr(config, knob):
+            raise InputError(
+                f"fine-tuning needs weights of a {knob} to begin with: --{knob} FILE (what 'depth "
+                "train view' and 'depth train stereo' wrote)."
+            )
     generator = read_generator(find_weights(config.generator))
     matcher = read_matcher(find_weights(config.matcher))
+    config = replace(config, pairs=_at_virtual_focal(config.pairs, generator.config))
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=True)
@@ -86,6 +98,8 @@ STAGES = {
 def _walk(task: Task, pairs: TrainingPairs, config: Any, run: Run) -> None:  # noqa: ANN401
     """Claim the folder for this config, then train."""
     settings = {"stage": type(config).__name__, **config_to_dict(config)}
+    decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
+    settings["loop"] = decisive | {"processes": find_shard().world}
     for knob in ("start", "generator", "matcher"):
         if isinstance(name := settings.get(knob), str):
             settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
@@ -103,6 +117,8 @@ def _export(
 ) -> Path:
     names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]
     path = run.folder / f"{names[0] if len(names) == 1 else 'fakestereo'}.safetensors"
+    if find_shard().rank:
+        return path  # statistics of batch norm are rank 0's, and so is the file
     facts = {
         "trained_on": ", ".join(Path(folder).name for folder in config.pairs.folders),
         "stage": type(config).__name__,
@@ -110,6 +126,40 @@ def _export(
     }
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
     return path
+
+
+def _at_virtual_focal(pairs: PairsConfig, generator: GeneratorConfig) -> PairsConfig:
+    """Bring the pairs to the rig that the generator imitates, and refuse what would leave it."""
+    focal_px = generator.virtual_focal_px
+    if pairs.focal_px not in (None, focal_px):
+        raise InputError(
+            f"pairs.focal_px is {pairs.focal_px}, but the generator imitates a rig of {focal_px} "
+            "px (virtual_focal_px); leave pairs.focal_px out"
+        )
+    if pairs.augment.scale != (1.0, 1.0):
+        raise InputError(
+            f"augment.scale is {pairs.augment.scale}: another size is another focal length, and "
+            "the generator imitates one; leave it out"
+        )
+    return replace(pairs, focal_px=focal_px)
+
+
+def _start_from(
+    network: UNetGenerator | PSMNet, found: UNetGenerator | PSMNet, source: str
+) -> None:
+    """Copy weights whose config is the network's own.
+
+    Raises:
+        InputError: a knob differs, so the weights would mean something else.
+    """
+    wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    for knob, value in wanted.items():
+        if given[knob] != value:
+            raise InputError(
+                f"{source}: was trained with {knob} = {given[knob]!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
+    network.load_state_dict(found.state_dict())
 
 
 def _pairs(

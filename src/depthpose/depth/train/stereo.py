@@ -1,6 +1,6 @@
 """Stage 2: the matcher from pairs with truth."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from jaxtyping import Float
@@ -46,21 +46,24 @@ class StereoTask:
 
 
 def held_out_evidence(
-    matcher: PSMNet, held_out: TrainingPairs, drawn: list[Tensor] | None = None
+    matcher: PSMNet, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
 ) -> Evidence:
-    """Disparity error of a matcher on held-out pairs, or on drawn right views in their place."""
+    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws."""
     errors, bad, pictures = [], [], {}
     for index in range(len(held_out)):
         pair = held_out.read(index)
-        right = pair.right if drawn is None else drawn[index]
+        right = pair.right if draw is None else draw(pair.left)
         found = match_whole(matcher, pair.left, right)
         is_known = valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
+        if index == 0:
+            views = [pair.left, right, draw_disparity(found)]
+            pictures["left_right_disparity"] = torch.cat(views, 1)
+        if not bool(is_known.any()):
+            continue
         error = (found - pair.left_px)[is_known].abs()
         errors.append(float(error.mean()))
         is_bad = (error > 3) & (error > 0.05 * pair.left_px[is_known])
         bad.append(float(is_bad.float().mean()))
-        if index == 0:
-            pictures["left_disparity"] = torch.cat([pair.left, draw_disparity(found)], 1)
     count = max(len(errors), 1)
     numbers = {"held_out/epe_px": sum(errors) / count, "held_out/d1": sum(bad) / count}
     return Evidence(numbers=numbers, pictures=pictures)
