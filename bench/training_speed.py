@@ -43,6 +43,9 @@ def sources(data: str, view: ViewTraining) -> dict[str, PairsConfig]:
 def data_rate(config: PairsConfig, workers: int, samples: int) -> float:
     """Samples a second, after the workers have started."""
     pairs = TrainingPairs(config, 0, needs_truth=False)
+    if config.with_cache:
+        for index in range(len(pairs)):
+            pairs.read(index)
     tickets = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(samples)]
     loader = iter(DataLoader(pairs, batch_sampler=tickets, num_workers=workers))  # pyright: ignore[reportArgumentType]
     warm = 2 + 2 * workers

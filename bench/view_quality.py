@@ -15,7 +15,7 @@ from torch import Tensor
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.report import markdown_table, write_table
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.disparity import right_disparity_from_left
+from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.streets import StreetFrame, draw_street
 from depthpose.depth.types import StereoInput
@@ -26,6 +26,14 @@ def mean(values: Tensor, mask: Tensor) -> float:
     return float(values[mask].double().mean())
 
 
+def seen_by_left(frame: StreetFrame) -> Tensor:
+    """Whether the left view shows the point of a right pixel: both disparities are one there."""
+    mirrored = warp_right_to_left(
+        frame.disparity_px.flip(-1)[None], frame.right_disparity_px.flip(-1)
+    )[0].flip(-1)
+    return (mirrored - frame.right_disparity_px).abs() < 1
+
+
 def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
     """L1 of the drawn view and relative depth error, in seen and in hidden regions."""
     pair = StereoInput(name="street", left=frame.left, right=None, camera=frame.rig)
@@ -34,12 +42,12 @@ def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
     assert estimate.depth_m is not None
     l1 = (estimate.right - frame.right).abs().mean(0)
     is_solid = torch.isfinite(frame.right_disparity_px)
-    is_carried = torch.isfinite(right_disparity_from_left(frame.disparity_px))
+    is_seen = seen_by_left(frame)
     relative = (estimate.depth_m - frame.depth_m).abs() / frame.depth_m
     counts = torch.isfinite(relative) & (frame.depth_m < 80)
     return {
-        "right_l1_seen": mean(l1, is_solid & is_carried),
-        "right_l1_disoccluded": mean(l1, is_solid & ~is_carried),
+        "right_l1_seen": mean(l1, is_solid & is_seen),
+        "right_l1_disoccluded": mean(l1, is_solid & ~is_seen),
         "abs_rel_seen": mean(relative, counts & ~frame.occluded),
         "abs_rel_occluded": mean(relative, counts & frame.occluded),
     }
