@@ -66,7 +66,12 @@ def weights(task: ToyTask) -> dict[str, Tensor]:
 if __name__ == "__main__":
     folder, steps, accumulate, pause_s = Path(sys.argv[1]), *map(float, sys.argv[2:5])
     config = LoopConfig(
-        steps=int(steps), batch_size=4, accumulate=int(accumulate), save_every_steps=3, device="cpu"
+        steps=int(steps),
+        batch_size=4,
+        accumulate=int(accumulate),
+        save_every_steps=3,
+        workers=int((sys.argv[5:] or ["0"])[0]),
+        device="cpu",
     )
     toy = ToyTask(pause_s)
     train(toy, ToySamples(), config, folder, resume=True)

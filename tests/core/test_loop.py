@@ -129,7 +129,7 @@ def test_a_full_disk_keeps_the_last_state(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_loss_that_is_not_finite_stops_with_advice(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"loss is inf at step 0\. Lower its learning_rate"):
+    with pytest.raises(InputError, match=r"loss is inf at step 0\. Start anew in another folder"):
         train(ToyTask(factor=float("inf")), ToySamples(), loop(), tmp_path)
 
 
@@ -232,6 +232,20 @@ def test_two_processes_equal_one_that_accumulates(tmp_path: Path) -> None:
         for name, tensor in states[0][network].items():
             if "running" not in name and "num_batches" not in name:
                 torch.testing.assert_close(tensor, states[1][network][name], rtol=1e-5, atol=1e-6)
+
+
+def test_a_signal_to_the_whole_job_saves_the_state(tmp_path: Path) -> None:
+    """Schedulers signal every process of a job, the workers that make samples too."""
+    words = [sys.executable, *program(tmp_path, 4000, 1, 0.05), "2"]
+    process = subprocess.Popen(
+        words, env=environment(), stderr=subprocess.PIPE, start_new_session=True
+    )
+    _wait_for_progress(tmp_path, process)
+    os.killpg(process.pid, signal.SIGTERM)
+    _, said = process.communicate(timeout=60)
+    assert b"stopped after step" in said, said.decode()[-2000:]
+    step = torch.load(tmp_path / "state.pt", weights_only=True)["step"]
+    assert f"stopped after step {step} ".encode() in said
 
 
 @pytest.mark.slow

@@ -6,25 +6,20 @@ fake pair), and N processes equal one that accumulates N micro-batches.
 """
 
 import math
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError
 from depthpose.core.loop.config import LoopConfig
+from depthpose.core.loop.host import leave_signals_to_the_loop, make_accelerator, polite_stop
 from depthpose.core.loop.journal import Journal, has_state, read_state
 from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
-
-_PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
 
 
 class Interrupted(KeyboardInterrupt):
@@ -76,14 +71,14 @@ def train(
         raise InputError("there is no sample to train on; the dataset is empty.")
     run = _Run(task, samples, config, folder)
     run.start(resume=resume)
-    with _polite_stop() as is_asked_to_stop:
+    with polite_stop() as is_asked_to_stop:
         run.walk(on_step, is_asked_to_stop)
 
 
 class _Run:
     def __init__(self, task: Task, samples: Samples, config: LoopConfig, folder: Path) -> None:
         self.task, self.samples, self.config = task, samples, config
-        self.accelerator = _make_accelerator(config)
+        self.accelerator = make_accelerator(config)
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
@@ -207,7 +202,7 @@ class _Run:
             batch_sampler=_Tickets(self, first),
             num_workers=self.config.workers,
             pin_memory=self.accelerator.device.type == "cuda",
-            worker_init_fn=_leave_signals_to_the_loop,
+            worker_init_fn=leave_signals_to_the_loop,
         )
         from accelerate.utils import send_to_device
 
@@ -310,57 +305,9 @@ class _Tickets:
         return len(self.places)
 
 
-def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
-    try:
-        from accelerate import Accelerator
-        from accelerate.state import AcceleratorState
-        from accelerate.utils import InitProcessGroupKwargs
-    except ImportError as error:
-        raise MissingExtraError("accelerate", "train", "training") from error
-    # A second training of this process may have another precision; accelerate keeps the first.
-    AcceleratorState._reset_state()
-    # The others wait while rank 0 looks at the held-out samples.
-    patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
-    accelerator = Accelerator(
-        cpu=config.device == "cpu",
-        mixed_precision=_PRECISIONS[config.precision],
-        kwargs_handlers=[patience],
-    )
-    if config.precision == "fp16" and accelerator.scaler is None:
-        raise InputError(
-            "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has too."
-        )
-    return accelerator
-
-
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
     return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def _copied(module: torch.nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
-
-
-def _leave_signals_to_the_loop(_: int) -> None:
-    """Let a worker outlive a SIGTERM to the whole job, until the loop has saved its state."""
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.SIG_IGN)
-
-
-@contextmanager
-def _polite_stop() -> Iterator[Callable[[], bool]]:
-    """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
-    asked: list[int] = []
-
-    def remember(number: int, _: FrameType | None) -> None:
-        asked.append(number)
-
-    try:
-        before = {s: signal.signal(s, remember) for s in (signal.SIGTERM, signal.SIGINT)}
-    except ValueError:  # not the main thread: whoever runs us handles signals
-        before = {}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

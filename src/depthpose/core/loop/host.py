@@ -1,0 +1,70 @@
+"""What the loop runs on: devices and processes by accelerate, and the signals that stop it."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from types import FrameType
+from typing import Any
+
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.loop.config import LoopConfig
+
+_PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
+
+
+def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
+    """Bring up accelerate with the device and precision of a config.
+
+    Raises:
+        MissingExtraError: accelerate is not installed.
+        InputError: the precision needs a GPU.
+    """
+    try:
+        from accelerate import Accelerator
+        from accelerate.state import AcceleratorState
+        from accelerate.utils import InitProcessGroupKwargs
+    except ImportError as error:
+        raise MissingExtraError("accelerate", "train", "training") from error
+    # A second training of this process may have another precision; accelerate keeps the first.
+    AcceleratorState._reset_state()
+    # The others wait while rank 0 looks at the held-out samples.
+    patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
+    accelerator = Accelerator(
+        cpu=config.device == "cpu",
+        mixed_precision=_PRECISIONS[config.precision],
+        kwargs_handlers=[patience],
+    )
+    if config.precision == "fp16" and accelerator.scaler is None:
+        raise InputError(
+            "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has too."
+        )
+    return accelerator
+
+
+def leave_signals_to_the_loop(_: int) -> None:
+    """Take a worker out of the job's process group: a signal to the group is for the loop.
+
+    A worker that dies takes the loop with it before its state is saved.
+    """
+    os.setsid()
+
+
+@contextmanager
+def polite_stop() -> Iterator[Callable[[], bool]]:
+    """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
+    asked: list[int] = []
+
+    def remember(number: int, _: FrameType | None) -> None:
+        asked.append(number)
+
+    try:
+        before = {s: signal.signal(s, remember) for s in (signal.SIGTERM, signal.SIGINT)}
+    except ValueError:  # not the main thread: whoever runs us handles signals
+        before = {}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
