@@ -139,14 +139,30 @@ def test_pairs_of_a_small_case_by_hand() -> None:
     """Three voxels in a row along x, and one apart: who meets whom, at which offset."""
     cache = CoordinateCache(pack(torch.tensor([[0, -1, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0],
                                                [1, 0, 0, 0]])))  # fmt: skip
-    pairs = cache.kernel_map(0, 3).pairs
-    met = {(int(k), int(i), int(o)) for k, i, o in zip(pairs.offset, pairs.fine, pairs.coarse, strict=True)}  # noqa: E501  # fmt: skip
+    kernel_map = cache.kernel_map(0, 3)
+    pairs = kernel_map.meetings.pairs
+    met = set(zip(*(t.tolist() for t in (pairs.offset, pairs.fine, pairs.coarse)), strict=True))
     offsets = kernel_offsets(3)
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
     assert met == {(left, 0, 1), (left, 1, 2), (right, 1, 0), (right, 2, 1)}
-    assert pairs.centre == 13
-    assert len(pairs.segments) == 2
+    assert (kernel_map.centre, kernel_map.filled, kernel_map.counts) == (13, (left, right), (2, 2))
     assert cache.coordinates(1).tolist() == [[0, -2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
+
+
+def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud_keys = Voxels.from_points(cloud()).cache
+    by_table = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
+    monkeypatch.setattr("depthpose.pose.sparse.search.MAX_CELLS", 0)
+    cloud_keys = CoordinateCache(cloud_keys.keys(0))
+    by_search = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
+    assert all(map(torch.equal, by_table, by_search))
+
+
+def test_voxels_far_apart_need_no_table_of_the_air_between() -> None:
+    ends = COORDINATE_LIMIT - 1
+    far = torch.tensor([[0, -ends, -ends, -ends], [0, ends, ends, ends], [0, ends, ends, ends - 1]])
+    table = Voxels.from_points(far).cache.kernel_map(0, 3).meetings.table
+    assert int((table >= 0).sum()) == 3 + 2
 
 
 def test_offsets_run_with_x_fastest() -> None:
@@ -230,9 +246,9 @@ def test_one_voxel_meets_itself_alone() -> None:
 def test_maps_are_made_once() -> None:
     cache = Voxels.from_points(cloud()).cache
     down = cache.kernel_map(0, 3, 2)
-    assert cache.kernel_map(0, 3, 2).pairs is down.pairs
-    assert cache.kernel_map(1, 3, 2, is_transposed=True).pairs is down.pairs
-    assert cache.kernel_map(0, 3).pairs is not down.pairs
+    assert cache.kernel_map(0, 3, 2).meetings is down.meetings
+    assert cache.kernel_map(1, 3, 2, is_transposed=True).meetings is down.meetings
+    assert cache.kernel_map(0, 3).meetings is not down.meetings
 
 
 def test_the_gathered_rows_are_not_kept() -> None:

@@ -4,88 +4,123 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int32, Int64
 from torch import Tensor
-
-from depthpose.pose.sparse.keys import Keys, packed_move
-
-Segment = tuple[int, int, int]
-"""Offset number, and the first and past-the-last pair that it has."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pairs:
-    """All meetings of a fine and a coarse level (or of a level with itself), offset by offset.
-
-    Offsets without a pair have no segment, so that nobody spends time on them.
+class PairList:
+    """Meetings of two levels, offset by offset.
 
     Attributes:
         fine: row of each pair in the finer level: where the kernel reads.
         coarse: row of each pair in the coarser level: where the kernel stands.
-        offset: number of each pair's offset.
-        segments: which pairs belong to which offset.
-        centre: offset at which each voxel meets itself, left out of the pairs; None across levels.
-        volume: number of offsets of the kernel.
-        fine_rows: number of voxels of the finer level.
-        coarse_rows: number of voxels of the coarser level.
+        offset: number of each pair's offset, ascending.
+        filled: offsets that have pairs; nobody spends time on the others.
+        counts: how many pairs each of them has.
     """
 
     fine: Int64[Tensor, " pairs"]
     coarse: Int64[Tensor, " pairs"]
     offset: Int64[Tensor, " pairs"]
-    segments: tuple[Segment, ...]
-    centre: int | None
-    volume: int
+    filled: tuple[int, ...]
+    counts: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Meetings:
+    """All meetings of a fine and a coarse level, or of a level with itself.
+
+    Attributes:
+        table: row of the fine voxel that each coarse one meets at each offset; -1: none.
+        fine_rows: number of voxels of the finer level.
+        centre: offset at which each voxel meets itself; None across levels.
+    """
+
+    table: Int32[Tensor, "volume coarse_rows"]
     fine_rows: int
-    coarse_rows: int
+    centre: int | None
+
+    @cached_property
+    def pairs(self) -> PairList:
+        """The meetings listed, but for the centre: there input and output rows are the same."""
+        is_pair = self.table >= 0
+        if self.centre is not None:
+            is_pair[self.centre] = False
+        counts = is_pair.sum(1).tolist()
+        filled = [number for number, count in enumerate(counts) if count]
+        offset, coarse = is_pair.nonzero(as_tuple=True)
+        fine = self.table.flatten().index_select(0, offset * self.table.shape[1] + coarse)
+        return PairList(
+            fine=fine.long(), coarse=coarse, offset=offset, filled=tuple(filled),
+            counts=tuple(counts[number] for number in filled),
+        )  # fmt: skip
 
     @cached_property
     def by_fine(self) -> tuple[Tensor, Tensor]:
-        """Pairs grouped by fine row, as :func:`_grouped` gives them."""
-        return _grouped(self.fine, self.offset, self.fine_rows, self.volume)
+        """Pairs grouped by fine row: their order, and where in it each row begins."""
+        return _grouped(self.pairs.fine, self.pairs.offset, (self.fine_rows, len(self.table)))
 
     @cached_property
     def by_coarse(self) -> tuple[Tensor, Tensor]:
         """Pairs grouped by coarse row."""
-        return _grouped(self.coarse, self.offset, self.coarse_rows, self.volume)
+        volume, rows = self.table.shape
+        return _grouped(self.pairs.coarse, self.pairs.offset, (rows, volume))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KernelMap:
-    """Pairs with a direction: what a convolution reads and where it writes.
+    """Meetings with a direction: what a convolution reads and where it writes.
 
     Attributes:
-        pairs: the meetings.
+        meetings: of the two levels, or of the one.
         is_transposed: False: fine to coarse (or the level to itself); True: coarse to fine.
     """
 
-    pairs: Pairs
+    meetings: Meetings
     is_transposed: bool = False
 
     @property
     def transposed(self) -> "KernelMap":
         """The way back: the map of the transposed convolution and of the input's gradient."""
-        return KernelMap(pairs=self.pairs, is_transposed=not self.is_transposed)
+        return KernelMap(meetings=self.meetings, is_transposed=not self.is_transposed)
+
+    @property
+    def volume(self) -> int:
+        """Number of offsets of the kernel."""
+        return len(self.meetings.table)
+
+    @property
+    def centre(self) -> int | None:
+        """Offset at which each voxel meets itself, which the pairs leave out."""
+        return self.meetings.centre
+
+    @property
+    def filled(self) -> tuple[int, ...]:
+        """Offsets that have pairs."""
+        return self.meetings.pairs.filled
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of pairs of each of these offsets."""
+        return self.meetings.pairs.counts
 
     @property
     def rows_in(self) -> Int64[Tensor, " pairs"]:
         """Row that each pair reads."""
-        return self.pairs.coarse if self.is_transposed else self.pairs.fine
+        pairs = self.meetings.pairs
+        return pairs.coarse if self.is_transposed else pairs.fine
 
     @property
     def rows_out(self) -> Int64[Tensor, " pairs"]:
         """Row that each pair adds to."""
-        return self.pairs.fine if self.is_transposed else self.pairs.coarse
-
-    @property
-    def inputs(self) -> int:
-        """Number of voxels read."""
-        return self.pairs.coarse_rows if self.is_transposed else self.pairs.fine_rows
+        pairs = self.meetings.pairs
+        return pairs.fine if self.is_transposed else pairs.coarse
 
     @property
     def outputs(self) -> int:
         """Number of voxels written."""
-        return self.pairs.fine_rows if self.is_transposed else self.pairs.coarse_rows
+        return self.meetings.fine_rows if self.is_transposed else self.meetings.table.shape[1]
 
     def sum_by_output(self, products: Tensor) -> Tensor:
         """Add up the rows of each output voxel, always in the same order.
@@ -93,95 +128,25 @@ class KernelMap:
         A gather, not a scatter: the same bits on every run, on CUDA too, and several times faster
         on the CPU than ``index_add_``.
         """
-        order, starts = self.pairs.by_fine if self.is_transposed else self.pairs.by_coarse
+        order, starts = self.meetings.by_fine if self.is_transposed else self.meetings.by_coarse
         return torch.nn.functional.embedding_bag(order, products, starts, mode="sum")
 
 
 def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
     """Offsets (x, y, z) in the order of a weight's rows: x fastest, as in MinkowskiEngine."""
-    steps = _steps(kernel)
+    first = -(kernel // 2) if kernel % 2 else 0
+    steps = range(first, first + kernel)
     return tuple((x, y, z) for z in steps for y in steps for x in steps)
 
 
-def match_level(keys: Keys, kernel: int, step: int) -> Pairs:
-    """Pair each voxel of a level with its neighbours; the kernel is odd.
-
-    Half the offsets are searched; the other half are the same pairs the other way round.
-    """
-    columns = kernel * kernel // 2 + 1
-    at, standing, reading = _search(keys, keys, kernel, step, columns)
-    # The last column is the kernel's own axis: its upper half mirrors its lower one.
-    is_new = (at % kernel**2 < columns - 1) | (at < kernel**3 // 2)
-    at, standing, reading = at[is_new], standing[is_new], reading[is_new]
-    mirrored = kernel**3 - 1 - at
-    return _pairs(
-        torch.cat([at, mirrored]),
-        torch.cat([reading, standing]),
-        torch.cat([standing, reading]),
-        (kernel**3, len(keys), len(keys)),
-        centre=kernel**3 // 2,
-    )
-
-
-def match_levels(fine: Keys, coarse: Keys, kernel: int, step: int) -> Pairs:
-    """Pair each coarse voxel with the fine ones that its kernel reads, ``step`` apart."""
-    at, standing, reading = _search(coarse, fine, kernel, step, kernel * kernel)
-    return _pairs(at, reading, standing, (kernel**3, len(fine), len(coarse)), centre=None)
-
-
-def _steps(kernel: int) -> range:
-    first = -(kernel // 2) if kernel % 2 else 0
-    return range(first, first + kernel)
-
-
-def _search(
-    standing: Keys, reading: Keys, kernel: int, step: int, columns: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find pairs at the offsets of the first ``columns`` (x, y) of a kernel.
-
-    z is the lowest field, so the voxels of a column are neighbours in sorted order: one binary
-    search finds the first, and the next ones are read off.
-
-    Returns:
-        Offset number, standing row and reading row of each pair, sorted by offset.
-    """
-    steps = _steps(kernel)
-    moves = [packed_move(x, y, steps[0]) * step for y in steps for x in steps][:columns]
-    wanted = standing + torch.tensor(moves, device=standing.device)[:, None]
-    rows = torch.searchsorted(reading, wanted)
-    ended = torch.nn.functional.pad(reading, (0, 1), value=torch.iinfo(torch.int64).max)
-    hits, found = [], []
-    for _ in steps:
-        hits.append(ended[rows] == wanted)
-        found.append(rows)
-        rows, wanted = rows + hits[-1], wanted + step
-    is_pair = torch.stack(hits)
-    level, column, row = is_pair.nonzero(as_tuple=True)
-    return level * kernel**2 + column, row, torch.stack(found)[is_pair]
-
-
-def _pairs(
-    at: Tensor, fine: Tensor, coarse: Tensor, sizes: tuple[int, int, int], centre: int | None
-) -> Pairs:
-    volume, fine_rows, coarse_rows = sizes
-    numbers, counts = (t.tolist() for t in torch.unique_consecutive(at, return_counts=True))
-    segments, first = [], 0
-    for number, count in zip(numbers, counts, strict=True):
-        segments.append((number, first, first + count))
-        first += count
-    return Pairs(
-        fine=fine, coarse=coarse, offset=at, segments=tuple(segments), centre=centre,
-        volume=volume, fine_rows=fine_rows, coarse_rows=coarse_rows,
-    )  # fmt: skip
-
-
-def _grouped(rows: Tensor, offset: Tensor, count: int, volume: int) -> tuple[Tensor, Tensor]:
+def _grouped(rows: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Give the pairs in the order of their row, and where in that order each row begins.
 
     A row has at most one pair an offset, so a table of rows by offsets sorts in linear time.
     """
-    table = torch.full((count, volume), -1, dtype=torch.int64, device=rows.device)
-    table[rows, offset] = torch.arange(len(rows), device=rows.device)
+    table = torch.full(shape, -1, dtype=torch.int32, device=rows.device)
+    numbers = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
+    table.view(-1)[rows * shape[1] + offset] = numbers
     is_pair = table >= 0
     counts = is_pair.sum(1)
-    return table[is_pair], counts.cumsum(0) - counts
+    return table[is_pair].long(), counts.cumsum(0) - counts
