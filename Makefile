@@ -37,6 +37,7 @@ bench: $(READY)
 	$(BIN)/python bench/startup.py
 	$(BIN)/python bench/stereo_speed.py
 	$(BIN)/python bench/stereo_memory.py
+	$(BIN)/python bench/sparse_speed.py
 
 clean:
 	rm -rf .venv $(OUT) .pytest_cache .ruff_cache .hypothesis .import_linter_cache

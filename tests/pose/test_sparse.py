@@ -76,11 +76,11 @@ def dense_conv(x: Tensor, weight: Tensor, stride: int, *, is_transposed: bool) -
     return F.conv3d(x, w, None, stride, k // 2)
 
 
-@pytest.fixture(params=["at once", "by offset"])
+@pytest.fixture(params=["by grid", "by offset"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways of computing the same."""
     module = conv_function.__globals__
-    monkeypatch.setitem(module, "BUFFER_ELEMENTS", 0 if request.param == "by offset" else 1 << 30)
+    monkeypatch.setitem(module, "GRID_PAIRS", -1 if request.param == "by offset" else 1 << 30)
 
 
 CASES = [
@@ -141,7 +141,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
                                                [1, 0, 0, 0]])))  # fmt: skip
     kernel_map = cache.kernel_map(0, 3)
     pairs = kernel_map.meetings.pairs
-    met = set(zip(*(t.tolist() for t in (pairs.offset, pairs.fine, pairs.coarse)), strict=True))
+    met = set(zip(*(t.tolist() for t in (pairs.slot // 2, pairs.fine, pairs.coarse)), strict=True))
     offsets = kernel_offsets(3)
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
     assert met == {(left, 0, 1), (left, 1, 2), (right, 1, 0), (right, 2, 1)}

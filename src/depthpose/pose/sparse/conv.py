@@ -4,7 +4,6 @@ Every way of computing it is gather, multiply, add up; the ways differ in how mu
 once. A faster kernel would replace :func:`conv` and nothing else.
 """
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -14,9 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from depthpose.pose.sparse.kernel_map import KernelMap
 
-BUFFER_ELEMENTS = 1 << 20
-"""Products of all pairs up to this many numbers are added up at once; beyond, an offset at a
-time, which stays in the processor's cache (measured by bench/sparse_speed.py)."""
+GRID_PAIRS = 64
+"""Kernels whose fullest offset has up to this many pairs are multiplied in one batched product,
+padded; beyond, offset by offset without padding (measured by bench/sparse_speed.py)."""
 
 NARROW = 4
 """Inputs of up to this many channels are laid out as a table: their products are too thin."""
@@ -42,6 +41,10 @@ def conv(
     return _Convolution.apply(features, weight, kernel_map)
 
 
+Gradients = tuple[Tensor | None, Tensor | None]
+"""Of the features and of the weight."""
+
+
 class _Convolution(torch.autograd.Function):
     """Saves the features and the weight alone: what is gathered is gathered again."""
 
@@ -59,33 +62,24 @@ class _Convolution(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None]:
         features, weight = ctx.saved_tensors
         gradient = gradient.contiguous()
-        back, (with_features, with_weight, _) = ctx.kernel_map.transposed, ctx.needs_input_grad
-        return (
-            _convolve(gradient, weight.transpose(1, 2), back) if with_features else None,
-            _weight_gradient(features, gradient, ctx.kernel_map) if with_weight else None,
-            None,
-        )
+        wanted = ctx.needs_input_grad[:2]
+        if _is_narrow(features, ctx.kernel_map):
+            return *_gradients_by_table(gradient, features, weight, ctx.kernel_map), None
+        way = _gradients_by_grid if _is_gridded(features, ctx.kernel_map) else _gradients_by_offset
+        return *way(gradient, features, weight, ctx.kernel_map, wanted), None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     if _is_narrow(x, m):
         return _table(x, m).T @ weight.flatten(0, 1)
-    if _is_small(len(m.rows_in) * max(weight.shape[1:])):
-        out = _at_once(x, weight, m)
-    else:
-        out = _by_offset(x, weight, m)
+    out = _by_grid(x, weight, m) if _is_gridded(x, m) else _by_offset(x, weight, m)
     return out if m.centre is None else out.addmm_(x, weight[m.centre])
 
 
-def _at_once(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    """Gather and add up all pairs in one operation each: least overhead, most memory."""
-    rows = x.index_select(0, m.rows_in)
-    products = x.new_empty(len(rows), weight.shape[2])
-    # Lists of views, each made by one call: slicing one by one would cost as much as multiplying.
-    kernels, parts = weight.unbind(), products.split(m.counts)
-    for offset, read, part in zip(m.filled, rows.split(m.counts), parts, strict=True):
-        torch.mm(read, kernels[offset], out=part)
-    return m.sum_by_output(products)
+def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
+    """Gather, multiply and add up all offsets in one operation each, padded to the fullest."""
+    products = torch.bmm(_read(x, m.grid_in, m), weight)
+    return m.sum_by_output(products.flatten(0, 1))
 
 
 def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
@@ -97,32 +91,57 @@ def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     return out
 
 
-def _weight_gradient(x: Tensor, gradient: Tensor, m: KernelMap) -> Tensor:
-    shape = (m.volume, x.shape[1], gradient.shape[1])
-    if _is_narrow(x, m):
-        return (_table(x, m) @ gradient).view(shape)
-    out = x.new_empty(shape)
-    kernels = out.unbind()
-    for offset in set(range(m.volume)) - {*m.filled, m.centre}:
-        kernels[offset].zero_()
-    for offset, rows, pulls in zip(m.filled, *_gathered(x, gradient, m), strict=True):
-        torch.mm(rows.T, pulls, out=kernels[offset])
-    if m.centre is not None:
-        torch.mm(x.T, gradient, out=kernels[m.centre])
-    return out
+def _gradients_by_table(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Gradients:
+    with_weight = (_table(x, m) @ gradient).view(weight.shape)
+    return _convolve(gradient, weight.mT, m.transposed), with_weight
 
 
-def _gathered(
-    x: Tensor, gradient: Tensor, m: KernelMap
-) -> tuple[Iterable[Tensor], Iterable[Tensor]]:
-    """Give what each offset read and what pulls at it: all at once if that is little."""
-    if _is_small(len(m.rows_in) * max(x.shape[1], gradient.shape[1])):
-        reads, pulls = x.index_select(0, m.rows_in), gradient.index_select(0, m.rows_out)
-        return reads.split(m.counts), pulls.split(m.counts)
-    return (
-        (x.index_select(0, rows) for rows in m.rows_in.split(m.counts)),
-        (gradient.index_select(0, rows) for rows in m.rows_out.split(m.counts)),
-    )
+def _gradients_by_grid(
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
+) -> Gradients:
+    pulls = _read(gradient, m.grid_out, m)
+    for_x = for_weight = None
+    if wanted[0]:
+        for_x = m.transposed.sum_by_output(torch.bmm(pulls, weight.mT).flatten(0, 1))
+    if wanted[1]:
+        for_weight = torch.bmm(_read(x, m.grid_in, m).mT, pulls)
+    return _with_centre(gradient, x, weight, m, (for_x, for_weight))
+
+
+def _gradients_by_offset(
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
+) -> Gradients:
+    for_x = torch.zeros_like(x) if wanted[0] else None
+    for_weight = torch.empty_like(weight) if wanted[1] else None
+    if for_weight is not None:
+        for offset in set(range(m.volume)).difference(m.filled):
+            for_weight[offset].zero_()
+    reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
+    for offset, read, write in zip(m.filled, reads, writes, strict=True):
+        pulls = gradient.index_select(0, write)
+        if for_weight is not None:
+            torch.mm(x.index_select(0, read).T, pulls, out=for_weight[offset])
+        if for_x is not None:
+            for_x.index_add_(0, read, pulls @ weight[offset].T)
+    return _with_centre(gradient, x, weight, m, (for_x, for_weight))
+
+
+def _with_centre(
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, so_far: Gradients
+) -> Gradients:
+    """Add the part of the offset at which each voxel meets itself."""
+    for_x, for_weight = so_far
+    if m.centre is not None and for_x is not None:
+        for_x.addmm_(gradient, weight[m.centre].T)
+    if m.centre is not None and for_weight is not None:
+        torch.mm(x.T, gradient, out=for_weight[m.centre])
+    return so_far
+
+
+def _read(x: Tensor, slots: Tensor, m: KernelMap) -> Tensor:
+    """Gather the slots of (volume, most); empty ones read a row of zeros."""
+    padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
+    return padded.index_select(0, slots).view(m.volume, m.most, x.shape[1])
 
 
 def _table(x: Tensor, m: KernelMap) -> Tensor:
@@ -140,5 +159,7 @@ def _is_narrow(x: Tensor, m: KernelMap) -> bool:
     return not m.is_transposed and channels <= NARROW and elements <= TABLE_ELEMENTS
 
 
-def _is_small(elements: int) -> bool:
-    return elements <= BUFFER_ELEMENTS or torch.are_deterministic_algorithms_enabled()
+def _is_gridded(x: Tensor, m: KernelMap) -> bool:
+    # CUDA adds up offset by offset in no fixed order, so only a grid is the same on each run.
+    is_fixed = x.is_cuda and torch.are_deterministic_algorithms_enabled()
+    return is_fixed or m.most <= GRID_PAIRS

@@ -15,16 +15,21 @@ class PairList:
     Attributes:
         fine: row of each pair in the finer level: where the kernel reads.
         coarse: row of each pair in the coarser level: where the kernel stands.
-        offset: number of each pair's offset, ascending.
-        filled: offsets that have pairs; nobody spends time on the others.
+        slot: place of each pair in a grid of (volume, most), where ``most`` is the largest count.
+        filled: offsets that have pairs; nobody need spend time on the others.
         counts: how many pairs each of them has.
     """
 
     fine: Int64[Tensor, " pairs"]
     coarse: Int64[Tensor, " pairs"]
-    offset: Int64[Tensor, " pairs"]
+    slot: Int64[Tensor, " pairs"]
     filled: tuple[int, ...]
     counts: tuple[int, ...]
+
+    @property
+    def most(self) -> int:
+        """Pairs of the fullest offset."""
+        return max(self.counts, default=0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,25 +52,44 @@ class Meetings:
         is_pair = self.table >= 0
         if self.centre is not None:
             is_pair[self.centre] = False
-        counts = is_pair.sum(1).tolist()
-        filled = [number for number, count in enumerate(counts) if count]
+        counts = is_pair.sum(1)
+        numbers = counts.tolist()
+        filled = tuple(offset for offset, count in enumerate(numbers) if count)
         offset, coarse = is_pair.nonzero(as_tuple=True)
         fine = self.table.flatten().index_select(0, offset * self.table.shape[1] + coarse)
+        # The pairs of an offset fill its line of the grid from the left.
+        shifts = torch.arange(len(counts), device=counts.device) * max(numbers, default=0)
+        lines = (shifts - counts.cumsum(0) + counts).index_select(0, offset)
         return PairList(
-            fine=fine.long(), coarse=coarse, offset=offset, filled=tuple(filled),
-            counts=tuple(counts[number] for number in filled),
+            fine=fine.long(), coarse=coarse, filled=filled,
+            slot=lines + torch.arange(len(fine), device=fine.device),
+            counts=tuple(numbers[offset] for offset in filled),
         )  # fmt: skip
 
     @cached_property
+    def fine_grid(self) -> Int64[Tensor, " slots"]:
+        """Fine row of each slot; one past the last row where the slot is empty."""
+        return self._grid(self.pairs.fine, self.fine_rows)
+
+    @cached_property
+    def coarse_grid(self) -> Int64[Tensor, " slots"]:
+        """Coarse row of each slot; one past the last row where the slot is empty."""
+        return self._grid(self.pairs.coarse, self.table.shape[1])
+
+    @cached_property
     def by_fine(self) -> tuple[Tensor, Tensor]:
-        """Pairs grouped by fine row: their order, and where in it each row begins."""
-        return _grouped(self.pairs.fine, self.pairs.offset, (self.fine_rows, len(self.table)))
+        """Slots grouped by fine row: their order, and where in it each row begins."""
+        return _grouped(self.pairs.fine, self.pairs.slot, self.fine_rows)
 
     @cached_property
     def by_coarse(self) -> tuple[Tensor, Tensor]:
-        """Pairs grouped by coarse row."""
-        volume, rows = self.table.shape
-        return _grouped(self.pairs.coarse, self.pairs.offset, (rows, volume))
+        """Slots grouped by coarse row."""
+        return _grouped(self.pairs.coarse, self.pairs.slot, self.table.shape[1])
+
+    def _grid(self, rows: Tensor, nobody: int) -> Tensor:
+        grid = rows.new_full((len(self.table) * self.pairs.most,), nobody)
+        grid[self.pairs.slot] = rows
+        return grid
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +120,11 @@ class KernelMap:
         return self.meetings.centre
 
     @property
+    def most(self) -> int:
+        """Pairs of the fullest offset."""
+        return self.meetings.pairs.most
+
+    @property
     def filled(self) -> tuple[int, ...]:
         """Offsets that have pairs."""
         return self.meetings.pairs.filled
@@ -122,8 +151,18 @@ class KernelMap:
         """Number of voxels written."""
         return self.meetings.fine_rows if self.is_transposed else self.meetings.table.shape[1]
 
+    @property
+    def grid_in(self) -> Int64[Tensor, " slots"]:
+        """Row that each slot of (volume, most) reads; one past the last where it is empty."""
+        return self.meetings.coarse_grid if self.is_transposed else self.meetings.fine_grid
+
+    @property
+    def grid_out(self) -> Int64[Tensor, " slots"]:
+        """Row that each slot adds to; one past the last where it is empty."""
+        return self.meetings.fine_grid if self.is_transposed else self.meetings.coarse_grid
+
     def sum_by_output(self, products: Tensor) -> Tensor:
-        """Add up the rows of each output voxel, always in the same order.
+        """Add up the slots of each output voxel, always in the same order.
 
         A gather, not a scatter: the same bits on every run, on CUDA too, and several times faster
         on the CPU than ``index_add_``.
@@ -139,14 +178,7 @@ def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
     return tuple((x, y, z) for z in steps for y in steps for x in steps)
 
 
-def _grouped(rows: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Give the pairs in the order of their row, and where in that order each row begins.
-
-    A row has at most one pair an offset, so a table of rows by offsets sorts in linear time.
-    """
-    table = torch.full(shape, -1, dtype=torch.int32, device=rows.device)
-    numbers = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    table.view(-1)[rows * shape[1] + offset] = numbers
-    is_pair = table >= 0
-    counts = is_pair.sum(1)
-    return table[is_pair].long(), counts.cumsum(0) - counts
+def _grouped(rows: Tensor, slot: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Give the slots in the order of their row, and where in that order each row begins."""
+    counts = torch.bincount(rows, minlength=count)
+    return slot[torch.argsort(rows, stable=True)], counts.cumsum(0) - counts
