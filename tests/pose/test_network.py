@@ -197,7 +197,7 @@ def test_both_kinds_begin_with_answers_of_a_sensible_size_and_learn(
     config = ResUNetConfig(classes=1, keypoints=2, norm=norm, encoder=(16, 32, 64, 64),
                            decoder=(32, 32, 32, 64))  # fmt: skip
     network, voxels = ResUNet(config), Voxels.from_points(surface())
-    assert 0.1 < float(network.point_features(voxels).std()) < 3
+    assert 0.1 < float(network.point_features(voxels).detach().std()) < 3
     truth = torch.nn.functional.normalize(-voxels.coordinates[:, 1:].float(), dim=1)
     optimiser, losses = torch.optim.Adam(network.parameters(), 2e-3), []
     for _ in range(12):
@@ -205,7 +205,7 @@ def test_both_kinds_begin_with_answers_of_a_sensible_size_and_learn(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
     assert losses[-1] < 0.6 * losses[0]
 
 

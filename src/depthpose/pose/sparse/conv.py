@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from depthpose.pose.sparse.kernel_map import KernelMap
 
-GRID_PAIRS = 64
+GRID_PAIRS = 128
 """Kernels whose fullest offset has up to this many pairs are multiplied in one batched product,
 padded; beyond, offset by offset without padding (measured by bench/sparse_speed.py)."""
 
@@ -85,9 +85,11 @@ def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
 def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     """Gather and add up an offset at a time: its pairs write each row once at most."""
     out = x.new_zeros(m.outputs, weight.shape[2])
+    # Lists of views, each made by one call: slicing one by one costs as much as small products.
+    kernels = weight.unbind()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
-        out.index_add_(0, write, x.index_select(0, read) @ weight[offset])
+        out.index_add_(0, write, torch.mm(x.index_select(0, read), kernels[offset]))
     return out
 
 
@@ -113,16 +115,17 @@ def _gradients_by_offset(
 ) -> Gradients:
     for_x = torch.zeros_like(x) if wanted[0] else None
     for_weight = torch.empty_like(weight) if wanted[1] else None
+    kernels, pulled = weight.mT.unbind(), () if for_weight is None else for_weight.unbind()
     if for_weight is not None:
         for offset in set(range(m.volume)).difference(m.filled):
-            for_weight[offset].zero_()
+            pulled[offset].zero_()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
         pulls = gradient.index_select(0, write)
         if for_weight is not None:
-            torch.mm(x.index_select(0, read).T, pulls, out=for_weight[offset])
+            torch.mm(x.index_select(0, read).T, pulls, out=pulled[offset])
         if for_x is not None:
-            for_x.index_add_(0, read, pulls @ weight[offset].T)
+            for_x.index_add_(0, read, torch.mm(pulls, kernels[offset]))
     return _with_centre(gradient, x, weight, m, (for_x, for_weight))
 
 
@@ -147,8 +150,7 @@ def _read(x: Tensor, slots: Tensor, m: KernelMap) -> Tensor:
 def _table(x: Tensor, m: KernelMap) -> Tensor:
     """Lay out what each output voxel reads: (volume * channels, outputs), 0 where it is empty."""
     padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
-    # -1 of an empty cell finds the row of zeros, if it is made a row number.
-    rows = torch.where(m.meetings.table < 0, len(x), m.meetings.table)
+    rows = m.meetings.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
 

@@ -37,7 +37,8 @@ class Meetings:
     """All meetings of a fine and a coarse level, or of a level with itself.
 
     Attributes:
-        table: row of the fine voxel that each coarse one meets at each offset; -1: none.
+        table: row of the fine voxel that each coarse one meets at each offset; one past the last
+            where there is none.
         fine_rows: number of voxels of the finer level.
         centre: offset at which each voxel meets itself; None across levels.
     """
@@ -49,7 +50,7 @@ class Meetings:
     @cached_property
     def pairs(self) -> PairList:
         """The meetings listed, but for the centre: there input and output rows are the same."""
-        is_pair = self.table >= 0
+        is_pair = self.table < self.fine_rows
         if self.centre is not None:
             is_pair[self.centre] = False
         counts = is_pair.sum(1)

@@ -33,9 +33,12 @@ class VoxelIndex:
             self._lay_out()
 
     def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
-        """Give the row of each voxel ``standing + move * step``; -1 where there is none."""
+        """Give the row of each voxel ``standing + move * step``.
+
+        Where there is none, one past the last row: a row of zeros put there answers for it.
+        """
         if not len(self._keys):
-            return standing.new_full((len(moves), len(standing)), -1, dtype=torch.int32)
+            return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
         if self._table is None:
             return self._by_search(standing, moves)
         cells = self._cells(standing)
@@ -55,7 +58,7 @@ class VoxelIndex:
         strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
         device = low.device
         self._low, self._strides = low, torch.tensor(strides, device=device)
-        self._table = torch.full((cells,), -1, dtype=torch.int32, device=device)
+        self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
         rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
         self._table[self._cells(self._keys)] = rows
 
@@ -71,4 +74,4 @@ class VoxelIndex:
         packed = [packed_move(*move) * self._step for move in moves]
         wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
         rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
-        return torch.where(self._keys[rows] == wanted, rows, -1).int()
+        return torch.where(self._keys[rows] == wanted, rows, len(self._keys)).int()
