@@ -333,3 +333,19 @@ def test_cuda_answers_as_the_cpu_does_and_the_same_each_time() -> None:
         torch.use_deterministic_algorithms(False)
     torch.testing.assert_close(found[0].cpu(), expected, rtol=1e-12, atol=1e-12)
     assert all(torch.equal(found[0], again) for again in found)
+
+
+def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    coordinates = cloud(900)
+    m = Voxels.from_points(coordinates).cache.kernel_map(0, 3)
+    x, weight = features_of(coordinates, 8), weight_of(3, 8, 5)
+    pull = features_of(coordinates, 5, seed=3)
+    single = [t.float().requires_grad_() for t in (x, weight)]
+    double = [t.clone().requires_grad_() for t in (x, weight)]
+    monkeypatch.setattr("depthpose.pose.sparse.product.BLOCK_PRODUCTS", 8 * 5 * 16)
+    monkeypatch.setitem(conv_function.__globals__, "GRID_PAIRS", -1)
+    torch.testing.assert_close(conv(*single, m), conv(*double, m).float(), rtol=1e-4, atol=1e-4)
+    mine = torch.autograd.grad(conv(*single, m), single, pull.float())
+    theirs = torch.autograd.grad(conv(*double, m), double, pull)
+    for gradient, wanted in zip(mine, theirs, strict=True):
+        torch.testing.assert_close(gradient, wanted.float(), rtol=1e-4, atol=1e-4)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from depthpose.pose.sparse.kernel_map import KernelMap
+from depthpose.pose.sparse.product import add_product, block_rows, multiply
 
 GRID_PAIRS = 128
 """Kernels whose fullest offset has up to this many pairs are multiplied in one batched product,
@@ -73,7 +74,7 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     if _is_narrow(x, m):
         return _table(x, m).T @ weight.flatten(0, 1)
     out = _by_grid(x, weight, m) if _is_gridded(x, m) else _by_offset(x, weight, m)
-    return out if m.centre is None else out.addmm_(x, weight[m.centre])
+    return out if m.centre is None else add_product(out, x, weight[m.centre])
 
 
 def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
@@ -89,8 +90,16 @@ def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     kernels = weight.unbind()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
-        out.index_add_(0, write, torch.mm(x.index_select(0, read), kernels[offset]))
+        _add_rows(out, write, (x, read), kernels[offset])
     return out
+
+
+def _add_rows(out: Tensor, write: Tensor, source: tuple[Tensor, Tensor], kernel: Tensor) -> None:
+    """Add ``x[read] @ kernel`` to the rows ``write`` of ``out``, block by block."""
+    x, read = source
+    block = block_rows(x, kernel)
+    for reads, writes in zip(read.split(block), write.split(block), strict=True):
+        out.index_add_(0, writes, multiply(x.index_select(0, reads), kernel, block))
 
 
 def _gradients_by_table(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Gradients:
@@ -121,11 +130,11 @@ def _gradients_by_offset(
             pulled[offset].zero_()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
-        pulls = gradient.index_select(0, write)
         if for_weight is not None:
+            pulls = gradient.index_select(0, write)
             torch.mm(x.index_select(0, read).T, pulls, out=pulled[offset])
         if for_x is not None:
-            for_x.index_add_(0, read, torch.mm(pulls, kernels[offset]))
+            _add_rows(for_x, read, (gradient, write), kernels[offset])
     return _with_centre(gradient, x, weight, m, (for_x, for_weight))
 
 
@@ -135,7 +144,7 @@ def _with_centre(
     """Add the part of the offset at which each voxel meets itself."""
     for_x, for_weight = so_far
     if m.centre is not None and for_x is not None:
-        for_x.addmm_(gradient, weight[m.centre].T)
+        add_product(for_x, gradient, weight[m.centre].T)
     if m.centre is not None and for_weight is not None:
         torch.mm(x.T, gradient, out=for_weight[m.centre])
     return so_far
