@@ -344,8 +344,9 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     double = [t.clone().requires_grad_() for t in (x, weight)]
     monkeypatch.setattr("depthpose.pose.sparse.product.BLOCK_PRODUCTS", 8 * 5 * 16)
     monkeypatch.setitem(conv_function.__globals__, "GRID_PAIRS", -1)
-    torch.testing.assert_close(conv(*single, m), conv(*double, m).float(), rtol=1e-4, atol=1e-4)
-    mine = torch.autograd.grad(conv(*single, m), single, pull.float())
-    theirs = torch.autograd.grad(conv(*double, m), double, pull)
+    found, expected = conv(single[0], single[1], m), conv(double[0], double[1], m)
+    torch.testing.assert_close(found, expected.float(), rtol=1e-4, atol=1e-4)
+    mine = torch.autograd.grad(found, single, pull.float())
+    theirs = torch.autograd.grad(expected, double, pull)
     for gradient, wanted in zip(mine, theirs, strict=True):
         torch.testing.assert_close(gradient, wanted.float(), rtol=1e-4, atol=1e-4)

@@ -65,8 +65,10 @@ class _Convolution(torch.autograd.Function):
         gradient = gradient.contiguous()
         wanted = ctx.needs_input_grad[:2]
         if _is_narrow(features, ctx.kernel_map):
-            return *_gradients_by_table(gradient, features, weight, ctx.kernel_map), None
-        way = _gradients_by_grid if _is_gridded(features, ctx.kernel_map) else _gradients_by_offset
+            way = _gradients_by_table
+        else:
+            is_gridded = _is_gridded(features, ctx.kernel_map)
+            way = _gradients_by_grid if is_gridded else _gradients_by_offset
         return *way(gradient, features, weight, ctx.kernel_map, wanted), None
 
 
@@ -102,9 +104,12 @@ def _add_rows(out: Tensor, write: Tensor, source: tuple[Tensor, Tensor], kernel:
         out.index_add_(0, writes, multiply(x.index_select(0, reads), kernel, block))
 
 
-def _gradients_by_table(gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap) -> Gradients:
-    with_weight = (_table(x, m) @ gradient).view(weight.shape)
-    return _convolve(gradient, weight.mT, m.transposed), with_weight
+def _gradients_by_table(
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
+) -> Gradients:
+    # The first layer's input is no parameter's child: its gradient is seldom wanted and not cheap.
+    for_x = _convolve(gradient, weight.mT, m.transposed) if wanted[0] else None
+    return for_x, (_table(x, m) @ gradient).view(weight.shape) if wanted[1] else None
 
 
 def _gradients_by_grid(
