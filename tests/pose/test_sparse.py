@@ -80,7 +80,7 @@ def dense_conv(x: Tensor, weight: Tensor, stride: int, *, is_transposed: bool) -
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways of computing the same."""
     module = conv_function.__globals__
-    monkeypatch.setitem(module, "GRID_PAIRS", -1 if request.param == "by offset" else 1 << 30)
+    monkeypatch.setitem(module, "GRID_PRODUCTS", -1 if request.param == "by offset" else 1 << 30)
 
 
 CASES = [
@@ -343,7 +343,7 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     single = [t.float().requires_grad_() for t in (x, weight)]
     double = [t.clone().requires_grad_() for t in (x, weight)]
     monkeypatch.setattr("depthpose.pose.sparse.product.BLOCK_PRODUCTS", 8 * 5 * 16)
-    monkeypatch.setitem(conv_function.__globals__, "GRID_PAIRS", -1)
+    monkeypatch.setitem(conv_function.__globals__, "GRID_PRODUCTS", -1)
     found, expected = conv(single[0], single[1], m), conv(double[0], double[1], m)
     torch.testing.assert_close(found, expected.float(), rtol=1e-4, atol=1e-4)
     mine = torch.autograd.grad(found, single, pull.float())

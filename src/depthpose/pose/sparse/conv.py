@@ -14,9 +14,10 @@ from torch.autograd.function import once_differentiable
 from depthpose.pose.sparse.kernel_map import KernelMap
 from depthpose.pose.sparse.product import add_product, block_rows, multiply
 
-GRID_PAIRS = 128
-"""Kernels whose fullest offset has up to this many pairs are multiplied in one batched product,
-padded; beyond, offset by offset without padding (measured by bench/sparse_speed.py)."""
+GRID_PRODUCTS = 1 << 20
+"""Where the fullest offset takes up to this many multiplications, all offsets are one batched
+product, padded: up to twice as fast. Beyond, padding costs what fewer calls save: offset by offset
+(measured by bench/sparse_speed.py)."""
 
 NARROW = 4
 """Inputs of up to this many channels are laid out as a table: their products are too thin."""
@@ -67,7 +68,7 @@ class _Convolution(torch.autograd.Function):
         if _is_narrow(features, ctx.kernel_map):
             way = _gradients_by_table
         else:
-            is_gridded = _is_gridded(features, ctx.kernel_map)
+            is_gridded = _is_gridded(features, weight, ctx.kernel_map)
             way = _gradients_by_grid if is_gridded else _gradients_by_offset
         return *way(gradient, features, weight, ctx.kernel_map, wanted), None
 
@@ -75,7 +76,7 @@ class _Convolution(torch.autograd.Function):
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     if _is_narrow(x, m):
         return _table(x, m).T @ weight.flatten(0, 1)
-    out = _by_grid(x, weight, m) if _is_gridded(x, m) else _by_offset(x, weight, m)
+    out = _by_grid(x, weight, m) if _is_gridded(x, weight, m) else _by_offset(x, weight, m)
     return out if m.centre is None else add_product(out, x, weight[m.centre])
 
 
@@ -175,7 +176,7 @@ def _is_narrow(x: Tensor, m: KernelMap) -> bool:
     return not m.is_transposed and channels <= NARROW and elements <= TABLE_ELEMENTS
 
 
-def _is_gridded(x: Tensor, m: KernelMap) -> bool:
+def _is_gridded(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
     # CUDA adds up offset by offset in no fixed order, so only a grid is the same on each run.
     is_fixed = x.is_cuda and torch.are_deterministic_algorithms_enabled()
-    return is_fixed or m.most <= GRID_PAIRS
+    return is_fixed or m.most * weight[0].numel() <= GRID_PRODUCTS
