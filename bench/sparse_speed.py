@@ -148,9 +148,13 @@ def status_bytes(name: str) -> int:
 
 
 def measure_memory(network: ResUNet, voxels: int, engine: str) -> int:
-    """Peak growth of the resident set over a step [bytes], after a first one."""
+    """Peak growth of the resident set over a step [bytes], after one on a small cloud.
+
+    The small one makes the gradients, so that the first of its size shows what the allocator would
+    afterwards keep.
+    """
     run = engines(network, surface(voxels))[engine]
-    step(run)
+    step(engines(network, surface(50))[engine])
     before = status_bytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
     step(run)
