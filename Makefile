@@ -42,6 +42,7 @@ bench: $(READY)
 	$(BIN)/depthpose data make streets --out $(OUT)/bench/streets --number 20 --scale 0.5 --no-with-lidar
 	$(BIN)/python bench/training_speed.py --data $(OUT)/bench/streets
 	$(BIN)/python bench/voting_speed.py
+	$(BIN)/python bench/sparse_speed.py
 
 clean:
 	rm -rf .venv $(OUT) .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -18,13 +18,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from depthpose.core.files import read_cloud
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.bop import open_bop
 from depthpose.pose.mesh import read_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import prepare_surface, refine_pose
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.voting import perturb
 
 STARTS = 20
 Case = tuple[str, Tensor, Rigid, ObjectModel]

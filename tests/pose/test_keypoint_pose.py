@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.bop import open_bop
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.metrics import add_m
@@ -13,11 +13,9 @@ from depthpose.pose.refine import prepare_surface, refine_pose
 from depthpose.pose.types import Axis
 from depthpose.pose.voting import (
     consistent_keypoints,
-    cross_matrix,
     distance_errors,
     fit_pose,
     free_motions,
-    perturb,
     vote_ransac,
 )
 

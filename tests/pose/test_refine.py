@@ -8,14 +8,13 @@ import trimesh
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid, geodesic_rad, perturb
 from depthpose.pose.bop import open_bop
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import Surface, prepare_surface, refine_pose
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.voting import perturb
 
 
 @pytest.fixture(scope="module")

@@ -48,10 +48,11 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet"]],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf"]],
     file: tyro.conf.Positional[Path],
     out: Path,
-    align_corners: Literal["true", "false"],
+    align_corners: Literal["true", "false"] | None = None,
+    classes: int | None = None,
 ) -> int:
     """Turn a published checkpoint into a weights file of depthpose.
 
@@ -59,17 +60,30 @@ def import_weights(
     than tensors is refused.
 
     Args:
-        kind: the network: psmnet, the stacked hourglass.
+        kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
+            MinkowskiEngine stores it.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
-        align_corners: how the checkpoint was trained to upsample, which no file records: true for
-            the authors' first weights (2018, PyTorch 0.4), false for those of 2021 (PyTorch 1.8.1).
-            A wrong choice costs about 1 px of disparity.
+        align_corners: psmnet: how the checkpoint was trained to upsample, which no file records:
+            true for the authors' first weights (2018, PyTorch 0.4), false for those of 2021
+            (PyTorch 1.8.1). A wrong choice costs about 1 px of disparity.
+        classes: fcgf: how many objects the outputs are directions for; left out where they are
+            descriptors.
     """
-    from depthpose.depth.stereo import import_psmnet
+    if kind == "fcgf":
+        from depthpose.pose.network import import_fcgf
 
-    assert kind == "psmnet"
-    import_psmnet(file, out, align_corners=align_corners == "true")
+        import_fcgf(file, out, classes=classes)
+    else:
+        from depthpose.core.errors import InputError
+        from depthpose.depth.stereo import import_psmnet
+
+        if align_corners is None:
+            raise InputError(
+                "weights import psmnet needs --align-corners true (weights of 2018) or false "
+                "(of 2021): the file does not say, and a wrong choice costs about a pixel."
+            )
+        import_psmnet(file, out, align_corners=align_corners == "true")
     return show_weights(str(out))
 
 

@@ -47,6 +47,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
     with atomic_write(path) as temporary:
         save_file(state, temporary, metadata={**checkpoint.facts, **metadata})
+        temporary.chmod(0o644)  # safetensors makes files that nobody else may read
 
 
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:

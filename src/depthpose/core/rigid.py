@@ -76,3 +76,18 @@ def geodesic_rad(
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5
     return 2 * torch.asin(chord.clamp(max=1.0))
+
+
+def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
+    """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
+    turn = torch.linalg.matrix_exp(cross_matrix(motion[..., :3]))
+    moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
+    return Rigid(turn @ pose.R, moved_m)
+
+
+def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Give ``[v]_x``, with ``[v]_x w = v x w``."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))

@@ -7,11 +7,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.voting.pose import cross_matrix, perturb
 
 _CONVERGED = 1e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""

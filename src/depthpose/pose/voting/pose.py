@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from depthpose.core.rigid import Rigid, fit_rigid
+from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
 from depthpose.pose.types import Axis, PoseFit
 
 _STEPS = 4
@@ -55,21 +55,6 @@ def fit_pose(
         misfit=(misfit / (3 * count - 6).clamp(min=1)).to(keypoints_m),
         is_used=used,
     )
-
-
-def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
-    """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
-    turn = torch.linalg.matrix_exp(cross_matrix(motion[..., :3]))
-    moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
-    return Rigid(turn @ pose.R, moved_m)
-
-
-def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Give ``[v]_x``, with ``[v]_x w = v x w``."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:

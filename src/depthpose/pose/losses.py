@@ -1,0 +1,117 @@
+"""What the direction network is punished for."""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+DirectionMode = Literal["mse", "cosine", "l1"]
+Directions = Float[Tensor, "points keypoints 3"]
+
+CONFIDENCE_SCALE_RAD = 0.1415
+"""Angle of a vote that deserves half the trust: its cosine is 0.99, where RANSAC draws its line."""
+
+
+def unit_directions(
+    points_m: Float[Tensor, "points 3"], keypoints_m: Float[Tensor, "points keypoints 3"]
+) -> Directions:
+    """Give the true directions from each point to its object's keypoints; 0 where they coincide."""
+    return F.normalize(keypoints_m - points_m[:, None], dim=-1, eps=1e-9)
+
+
+def point_losses(
+    found: Directions, truth: Directions, mode: DirectionMode = "mse"
+) -> Float[Tensor, " points"]:
+    """Punish the raw directions of each point, averaged over keypoints.
+
+    ``mse`` and ``l1`` pull to unit length too, over the three components; ``cosine`` is
+    1 - cos of the angle and leaves the length alone.
+    """
+    if mode == "cosine":
+        return (1 - F.cosine_similarity(found, truth, dim=-1)).mean(-1)
+    difference = found - truth
+    return (difference.square() if mode == "mse" else difference.abs()).mean((-2, -1))
+
+
+def instance_means(
+    values: Float[Tensor, " points"], instance: Int[Tensor, " points"], count: int
+) -> Float[Tensor, " instances"]:
+    """Average the points of each instance; 0 for an instance without points."""
+    sums = values.new_zeros(count).index_add(0, instance, values)
+    points = torch.bincount(instance, minlength=count)
+    return sums / points.clamp(min=1).to(values.dtype)
+
+
+@torch.no_grad()
+def choose_copies(
+    found: Directions,
+    points_m: Float[Tensor, "points 3"],
+    copies_m: Float[Tensor, "instances copies keypoints 3"],
+    instance: Int[Tensor, " points"],
+    mode: DirectionMode = "mse",
+) -> Int[Tensor, " instances"]:
+    """Find for each instance the symmetric copy of its truth that its votes are nearest to.
+
+    Once for a whole instance: a choice point by point, or an average of copies, would teach votes
+    that meet at the axis of symmetry.
+    """
+    losses = [
+        instance_means(
+            point_losses(found, unit_directions(points_m, copy[instance]), mode),
+            instance,
+            len(copies_m),
+        )
+        for copy in copies_m.unbind(1)
+    ]
+    return torch.stack(losses).argmin(0)
+
+
+def direction_loss(
+    found: Directions,
+    points_m: Float[Tensor, "points 3"],
+    copies_m: Float[Tensor, "instances copies keypoints 3"],
+    instance: Int[Tensor, " points"],
+    mode: DirectionMode = "mse",
+) -> Float[Tensor, ""]:
+    """Mean over instances of the least loss that any symmetric copy of the truth gives.
+
+    It is the same whichever of the symmetric truths stands first.
+
+    Args:
+        found: raw outputs of each point's own class (``select_class``).
+        points_m: where each point lies, in the frame of the keypoints.
+        copies_m: keypoints of each instance under each of its object's symmetries; objects with
+            fewer than others repeat a copy.
+        instance: which instance each point belongs to.
+        mode: how a direction is punished.
+    """
+    if not len(found):
+        return found.sum()
+    copy = choose_copies(found, points_m, copies_m, instance, mode)
+    truth_m = copies_m[torch.arange(len(copies_m), device=copy.device), copy]
+    losses = point_losses(found, unit_directions(points_m, truth_m[instance]), mode)
+    means = instance_means(losses, instance, len(copies_m))
+    seen = torch.bincount(instance, minlength=len(copies_m)) > 0
+    return means.sum() / seen.sum()
+
+
+def confidence_target(
+    found: Directions, truth: Directions, scale_rad: float = CONFIDENCE_SCALE_RAD
+) -> Float[Tensor, "points keypoints"]:
+    """Say how far each vote deserves trust: 1 / (1 + (angle / scale)^2); no gradient."""
+    found = found.detach()
+    # atan2 keeps its digits near 0 and pi, where acos of a cosine loses half of them.
+    across = torch.linalg.cross(found, truth).norm(dim=-1)
+    angle_rad = torch.atan2(across, (found * truth).sum(-1))
+    return 1 / (1 + (angle_rad / scale_rad).square())
+
+
+def confidence_loss(
+    logits: Float[Tensor, "points keypoints"], found: Directions, truth: Directions
+) -> Float[Tensor, ""]:
+    """Binary cross entropy of the trust that the network claims against what its votes deserve."""
+    if not len(logits):
+        return logits.sum()
+    return F.binary_cross_entropy_with_logits(logits, confidence_target(found, truth))

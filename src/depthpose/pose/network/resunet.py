@@ -1,0 +1,155 @@
+"""The sparse ResUNet of FCGF (ResUNetBN2C), with or without norms: figure 3-3 of the thesis."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from depthpose.pose.network.config import ResUNetConfig
+from depthpose.pose.sparse import SparseConv, SparseConvTranspose, Voxels
+
+BRANCH_SCALE = 0.25
+"""Without norms the second convolution of each block begins this much smaller: seven blocks in a
+row then neither blow up nor drown what passes beside them (in the spirit of Fixup, Zhang 2019)."""
+
+MOMENTUM = 0.05
+"""Of batch norm, as FCGF trains."""
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over voxels, which takes a level of fewer than two of them.
+
+    One voxel has no variance; torch refuses it in training. Its running statistics serve instead.
+    """
+
+    def forward(self, input: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Normalise each channel over the voxels of all clouds."""
+        if len(input) > 1:
+            return super().forward(input)
+        statistics = (self.running_mean, self.running_var)
+        return F.batch_norm(input, *statistics, self.weight, self.bias, eps=self.eps)
+
+
+class ConvNorm(nn.Module):
+    """A convolution and, if there is one, its norm."""
+
+    def __init__(self, conv: SparseConv, config: ResUNetConfig) -> None:
+        super().__init__()
+        self.conv = conv
+        width = conv.weight.shape[2]
+        self.norm = RowNorm(width, momentum=MOMENTUM) if config.norm == "batch" else None
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        """Convolve and normalise."""
+        out = self.conv(voxels)
+        return out if self.norm is None else out.with_features(self.norm(out.features))
+
+
+class Block(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    def __init__(self, width: int, config: ResUNetConfig) -> None:
+        super().__init__()
+        self.first = _same(width, width, 3, config)
+        self.second = _same(width, width, 3, config)
+        if config.norm == "none":
+            with torch.no_grad():
+                self.second.conv.weight.mul_(BRANCH_SCALE)
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        """Add to what comes in; the answer is not negative."""
+        branch = self.second(_relu(self.first(voxels)))
+        return voxels.with_features(F.relu(branch.features + voxels.features))
+
+
+class ResUNet(nn.Module):
+    """A partial cloud to raw directions from each of its points to each keypoint.
+
+    Four levels down and up again, a residual block on each, what was seen going down beside what
+    comes up.
+    """
+
+    def __init__(self, config: ResUNetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or ResUNetConfig()
+        e, d = config.encoder, config.decoder
+        self.down = nn.ModuleList([_same(config.inputs, e[0], config.first_kernel, config)])
+        self.down.extend(_down(e[i - 1], e[i], config) for i in (1, 2, 3))
+        self.down_blocks = nn.ModuleList(Block(width, config) for width in e)
+        into = {3: e[3], 2: e[2] + d[3], 1: e[1] + d[2]}
+        self.up = nn.ModuleList(_up(into[i], d[i], config) for i in (3, 2, 1))
+        self.up_blocks = nn.ModuleList(Block(d[i], config) for i in (3, 2, 1))
+        # No norm and no neighbours: the skip of the finest level is mixed point by point.
+        self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
+        self.final = SparseConv(d[0], config.outputs, 1, has_bias=True)
+        # The answers are parts of unit vectors: begin near nothing, not twice too long.
+        with torch.no_grad():
+            self.final.weight.mul_(0.5)
+
+    def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints components"]:
+        """Give the raw directions (and logits, where the config has them) of each point given.
+
+        They are not normalised: the loss pulls them to unit length, and the vote normalises.
+        """
+        assert self.config.descriptor is None, "a network of descriptors gives no directions"
+        outputs = self.final(self._features(voxels)).at_points()
+        c = self.config
+        return outputs.view(len(outputs), c.classes, c.keypoints, c.components)
+
+    def point_features(self, voxels: Voxels) -> Float[Tensor, "points width"]:
+        """Give what the last layer sees of each point given: the features of figure 3-2."""
+        return self._features(voxels).at_points()
+
+    def descriptors(self, voxels: Voxels) -> Float[Tensor, "points outputs"]:
+        """Give the raw last layer of each point; FCGF scales its descriptors to unit length."""
+        return self.final(self._features(voxels)).at_points()
+
+    def forward_class(
+        self, voxels: Voxels, number: int
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for one class alone, without computing the other classes' outputs."""
+        assert self.final.bias is not None
+        assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
+        size = self.config.keypoints * self.config.components
+        part = slice(number * size, (number + 1) * size)
+        features = self.point_features(voxels)
+        outputs = features @ self.final.weight[0, :, part] + self.final.bias[part]
+        return outputs.view(len(outputs), self.config.keypoints, self.config.components)
+
+    def _features(self, voxels: Voxels) -> Voxels:
+        seen: list[Voxels] = []
+        for down, block in zip(self.down, self.down_blocks, strict=True):
+            voxels = block(down(voxels))
+            seen.append(voxels)
+        voxels = seen.pop()
+        for up, block in zip(self.up, self.up_blocks, strict=True):
+            voxels = _beside(block(up(voxels)), seen.pop())
+        return _relu(self.mix(voxels))
+
+
+def select_class(
+    outputs: Float[Tensor, "points classes keypoints components"],
+    class_of_point: Int[Tensor, " points"],
+) -> Float[Tensor, "points keypoints components"]:
+    """Keep the channels of each point's own class."""
+    return outputs[torch.arange(len(outputs), device=outputs.device), class_of_point]
+
+
+def _same(inputs: int, outputs: int, kernel: int, config: ResUNetConfig) -> ConvNorm:
+    return ConvNorm(SparseConv(inputs, outputs, kernel, has_bias=config.with_bias), config)
+
+
+def _down(inputs: int, outputs: int, config: ResUNetConfig) -> ConvNorm:
+    return ConvNorm(SparseConv(inputs, outputs, 3, 2, has_bias=config.with_bias), config)
+
+
+def _up(inputs: int, outputs: int, config: ResUNetConfig) -> ConvNorm:
+    return ConvNorm(SparseConvTranspose(inputs, outputs, 3, 2, has_bias=config.with_bias), config)
+
+
+def _relu(voxels: Voxels) -> Voxels:
+    return voxels.with_features(F.relu(voxels.features))
+
+
+def _beside(left: Voxels, right: Voxels) -> Voxels:
+    return left.with_features(torch.cat([left.features, right.features], 1))

@@ -1,0 +1,252 @@
+"""The sparse ResUNet: published numbers, exact folding, equal answers under renaming and order."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from depthpose.cli import main
+from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.errors import InputError
+from depthpose.pose.network import (
+    KIND,
+    NetworkWeights,
+    ResUNet,
+    ResUNetConfig,
+    fold_norms,
+    import_fcgf,
+    read_network,
+    resunet_from_published,
+    select_class,
+    write_network,
+)
+from depthpose.pose.sparse import Voxels
+
+TINY = ResUNetConfig(
+    classes=3, keypoints=4, first_kernel=3, encoder=(4, 6, 8, 10), decoder=(5, 6, 7, 8)
+)
+NORMS: tuple[Literal["batch", "none"], ...] = ("batch", "none")
+REFERENCE = "reference/minkowski_resunet/slim.npz"
+
+
+def surface(points: int = 2000, side: float = 12.0, seed: int = 0) -> Tensor:
+    """Voxels of two spheres' surfaces, clouds 0 and 1."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.randn(points, 3, generator=generator)
+    xyz = (direction / direction.norm(dim=1, keepdim=True) * side).floor().long()
+    number = torch.randint(0, 2, (points, 1), generator=generator)
+    return torch.unique(torch.cat([number, xyz], 1), dim=0)
+
+
+def tiny(**changes: object) -> ResUNet:
+    torch.manual_seed(0)
+    return ResUNet(dataclasses.replace(TINY, **changes)).eval()
+
+
+def trained(network: ResUNet) -> ResUNet:
+    """Give every norm statistics, scales and shifts that are not the ones it begins with."""
+    generator = torch.Generator().manual_seed(1)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            for tensor in (module.running_var, module.weight.data, module.bias.data):
+                assert tensor is not None
+                tensor.copy_(torch.rand(tensor.shape, generator=generator) + 0.5)
+    return network.double().eval()
+
+
+def double_voxels(coordinates: Tensor) -> Voxels:
+    return Voxels.from_points(coordinates, torch.ones(len(coordinates), 1, dtype=torch.float64))
+
+
+def published_state(network: ResUNet) -> dict[str, Tensor]:
+    """Name the weights as FCGF does."""
+    names = {}
+    for ours in network.state_dict():
+        name = ours.replace("mix.", "conv1_tr.").replace(".first.conv.", ".conv1.")
+        name = name.replace(".second.conv.", ".conv2.").replace(".first.norm.", ".norm1.bn.")
+        name = name.replace(".second.norm.", ".norm2.bn.")
+        for i in range(4):
+            name = name.replace(f"down.{i}.conv", f"conv{i + 1}")
+            name = name.replace(f"down.{i}.norm", f"norm{i + 1}.bn")
+            name = name.replace(f"down_blocks.{i}", f"block{i + 1}")
+            name = name.replace(f"up.{i}.conv", f"conv{4 - i}_tr")
+            name = name.replace(f"up.{i}.norm", f"norm{4 - i}_tr.bn")
+            name = name.replace(f"up_blocks.{i}", f"block{4 - i}_tr")
+        is_kernel = name.endswith(".weight") and ".bn." not in name
+        names[name.replace(".weight", ".kernel") if is_kernel else name] = ours
+    state = {name: network.state_dict()[ours] for name, ours in names.items()}
+    state["final.bias"] = state["final.bias"][None]
+    flat = ("conv1_tr.kernel", "final.kernel")
+    return {name: t[0] if name in flat else t for name, t in state.items()}
+
+
+def test_parameters_are_the_published_ones() -> None:
+    network = ResUNet(ResUNetConfig(norm="none"))
+    assert sum(p.numel() for p in network.parameters()) == 8_774_168
+
+
+@pytest.mark.data
+def test_reproduces_minkowski_engine(real: Path, tmp_path: Path) -> None:
+    content = np.load(real / REFERENCE)
+    state = {n[7:]: torch.from_numpy(content[n]) for n in content if n.startswith("weight.")}
+    torch.save({"state_dict": state}, tmp_path / "slim.pth")
+    out = tmp_path / "slim.safetensors"
+    assert main(["weights", "import", "fcgf", str(tmp_path / "slim.pth"), "--out", str(out),
+                 "--classes", "1"]) == 0  # fmt: skip
+    network = read_network(out).network
+    assert sum(p.numel() for p in network.parameters()) == 549_584
+    coordinates = torch.from_numpy(content["coordinates"]).long()
+    with torch.no_grad():
+        found = network(Voxels.from_points(coordinates)).flatten(1)
+    expected = torch.from_numpy(content["output"])
+    assert found.shape == expected.shape
+    assert float((found - expected).abs().max() / expected.abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("norm", ["batch", "none"])
+def test_the_importer_reads_what_fcgf_writes(norm: str, tmp_path: Path) -> None:
+    network = trained(tiny(norm=norm)).float()
+    state = {f"module.{name}": tensor for name, tensor in published_state(network).items()}
+    torch.save({"state_dict": state, "epoch": 3}, tmp_path / "f.pth")
+    import_fcgf(tmp_path / "f.pth", tmp_path / "f.safetensors", classes=3)
+    again = read_network(tmp_path / "f.safetensors")
+    assert again.network.config == network.config
+    assert again.facts["imported_from"] == "f.pth"
+    voxels = Voxels.from_points(surface())
+    torch.testing.assert_close(again.network(voxels), network(voxels), rtol=0, atol=0)
+
+
+def test_descriptors_need_no_classes() -> None:
+    network = tiny(descriptor=32)
+    again = resunet_from_published(published_state(network))
+    assert again.config.descriptor == 32
+    voxels = Voxels.from_points(surface())
+    torch.testing.assert_close(again.descriptors(voxels), network.descriptors(voxels))
+    assert again.descriptors(voxels).shape[1] == 32
+
+
+def test_other_checkpoints_are_refused() -> None:
+    state = published_state(tiny())
+    with pytest.raises(InputError, match=r"36 outputs are not 3 directions .* of 5 classes"):
+        resunet_from_published(state, classes=5)
+    with pytest.raises(InputError, match=r"conv2\.kernel is missing"):
+        resunet_from_published({k: v for k, v in state.items() if k != "conv2.kernel"})
+    with pytest.raises(InputError, match="stranger is unknown"):
+        resunet_from_published({**state, "stranger": torch.zeros(2)})
+    block = "block1.conv1.kernel"
+    with pytest.raises(InputError, match=r"down_blocks\.0\.first\.conv\.weight is .*, not"):
+        resunet_from_published({**state, block: state[block][:-1]})
+    with pytest.raises(InputError, match="are missing"):
+        resunet_from_published({})
+
+
+def test_a_checkpoint_with_a_strange_state_is_refused(tmp_path: Path) -> None:
+    torch.save({"state_dict": 3}, tmp_path / "f.pth")
+    with pytest.raises(InputError, match="'state_dict' is a int"):
+        import_fcgf(tmp_path / "f.pth", tmp_path / "f.safetensors")
+
+
+@pytest.mark.parametrize("with_bias", [False, True])
+def test_folding_the_norms_changes_no_answer(with_bias: bool) -> None:
+    network = trained(tiny(with_bias=with_bias))
+    folded = fold_norms(network)
+    assert not any(isinstance(m, nn.BatchNorm1d) for m in folded.modules())
+    assert folded.config == dataclasses.replace(network.config, norm="none", with_bias=True)
+    voxels = double_voxels(surface())
+    torch.testing.assert_close(folded(voxels), network(voxels), rtol=1e-11, atol=1e-11)
+    assert fold_norms(folded) is folded
+
+
+def test_answers_stand_by_point_in_the_order_given() -> None:
+    coordinates, network = surface(), tiny()
+    order = torch.randperm(len(coordinates), generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        straight = network(Voxels.from_points(coordinates))
+        shuffled = network(Voxels.from_points(coordinates[order]))
+    assert straight.shape == (len(coordinates), 3, 4, 3)
+    assert torch.equal(straight[order], shuffled)
+
+
+def test_moving_a_cloud_by_eight_voxels_changes_no_bit() -> None:
+    coordinates, network = surface(), tiny()
+    moved = coordinates + torch.tensor([0, -24, 8, 40])
+    assert torch.equal(network(Voxels.from_points(coordinates)), network(Voxels.from_points(moved)))
+
+
+def test_one_class_alone_answers_as_among_all() -> None:
+    network, voxels = tiny(with_confidence=True), Voxels.from_points(surface())
+    outputs = network(voxels)
+    assert outputs.shape[1:] == (3, 4, 4)
+    for number in range(3):
+        torch.testing.assert_close(network.forward_class(voxels, number), outputs[:, number])
+    each = torch.arange(len(outputs)) % 3
+    chosen = select_class(outputs, each)
+    assert torch.equal(chosen[4], outputs[4, 1])
+    assert network.point_features(voxels).shape[1] == TINY.decoder[0]
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_both_kinds_begin_with_answers_of_a_sensible_size_and_learn(
+    norm: Literal["batch", "none"],
+) -> None:
+    torch.manual_seed(0)
+    config = ResUNetConfig(classes=1, keypoints=2, norm=norm, encoder=(16, 32, 64, 64),
+                           decoder=(32, 32, 32, 64))  # fmt: skip
+    network, voxels = ResUNet(config), Voxels.from_points(surface())
+    assert 0.1 < float(network.point_features(voxels).detach().std()) < 3
+    truth = torch.nn.functional.normalize(-voxels.coordinates[:, 1:].float(), dim=1)
+    optimiser, losses = torch.optim.Adam(network.parameters(), 2e-3), []
+    for _ in range(12):
+        loss = (network(voxels) - truth[:, None, None]).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.6 * losses[0]
+
+
+@pytest.mark.parametrize("points", [0, 1, 5])
+def test_few_voxels_train_too(points: int) -> None:
+    """A level of one voxel has no variance to divide by."""
+    network = tiny().train()
+    outputs = network(Voxels.from_points(surface(5)[:points]))
+    outputs.square().sum().backward()
+    assert outputs.shape == (points, 3, 4, 3)
+    assert all(p.grad is None or bool(p.grad.isfinite().all()) for p in network.parameters())
+
+
+def test_weights_come_back_with_their_settings(tmp_path: Path) -> None:
+    network = tiny(with_confidence=True)
+    settings, facts = {"voxel_m": 0.008, "objects": ["cat"]}, {"licence": "MIT"}
+    path = tmp_path / "w.safetensors"
+    write_network(path, NetworkWeights(network=network, settings=settings, facts=facts))
+    again = read_network(path)
+    assert (again.settings, again.facts, again.network.config) == (settings, facts, network.config)
+    voxels = Voxels.from_points(surface())
+    assert torch.equal(again.network(voxels), network(voxels))
+    assert read_checkpoint(path).facts["norm_mode"] == "batch"
+
+
+def test_weights_without_a_network_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(path, Checkpoint(kind=KIND, config={}, state={"a": torch.zeros(1)}))
+    with pytest.raises(InputError, match="its config has no 'network'"):
+        read_network(path)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "text"),
+    [
+        ({"classes": 0}, "classes must be 1 or more, got 0"),
+        ({"encoder": (32, 0, 1, 1)}, "encoder must be 1 or more"),
+        ({"first_kernel": 4}, "first_kernel must be 1, 3, 5 or 7"),
+        ({"descriptor": -1}, "descriptor must be 1 or more, got -1"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(knobs: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        ResUNetConfig(**knobs)
