@@ -190,18 +190,6 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
         list(predict(net, readers, names, tmp_path / "p", {"method": "another"}))
 
 
-def test_disparity_that_is_no_depth_stays_so(tmp_path: Path) -> None:
-    found_px = torch.tensor([[0.0, -1.0, torch.nan, 8.0]])
-    pair = StereoInput(name="x", left=torch.rand(3, 1, 4), right=None, camera=rig())
-    depth_m = torch.tensor([[torch.nan, torch.nan, torch.nan, 10.0]])
-    shown = DepthEstimate(depth_m=depth_m, disparity_px=found_px, right=torch.rand(3, 1, 4))
-    write_estimate(tmp_path, pair, shown)
-    expected_px = torch.tensor([[0.0, -1.0, torch.nan, 4.0]])  # f B / depth = 80 * 0.5 / 10
-    assert torch.equal(
-        read_disparity(tmp_path, "x", rig()).nan_to_num(9), expected_px.nan_to_num(9)
-    )
-
-
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     estimate = DepthEstimate(depth_m=None, disparity_px=truth_px(0), right=torch.rand(3, H, W))
@@ -217,9 +205,8 @@ def test_an_estimate_is_read_back(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=rig())
     depth_m = depth_from_disparity(truth_px(0), rig())
     right = torch.ones(3, H, W) / 255
-    found_px = 2 * truth_px(0)  # in the view of a rig that is twice as wide
     estimate = DepthEstimate(
-        depth_m=depth_m, disparity_px=found_px, confidence=torch.rand(H, W), right=right
+        depth_m=depth_m, disparity_px=truth_px(0), confidence=torch.rand(H, W), right=right
     )
     write_estimate(tmp_path, pair, estimate)
     again = read_estimate(tmp_path, "x", None)

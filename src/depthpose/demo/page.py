@@ -27,7 +27,7 @@ from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample
 STREETS_SEED = 9
 """No weights were trained on streets of this seed."""
 
-_STREET = 2
+_STREET = 1
 _CAP_M = 80.0
 _WORST_PX = 4.0
 _FROM_ONE, _FROM_PAIR = "one image", "both images"
