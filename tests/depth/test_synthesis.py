@@ -147,3 +147,18 @@ def _warmed(network: UNetGenerator) -> UNetGenerator:
 def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         GeneratorConfig(**changes)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_side_near_a_multiple_is_not_padded() -> None:
+    """One row more than was trained must not add a whole block of mirrored rows."""
+    torch.manual_seed(0)
+    network = _warmed(small(6))
+    image = torch.nn.functional.interpolate(torch.rand(1, 3, 8, 12), (192, 192), mode="bicubic")
+    image = image.clamp(0, 1)
+    taller = torch.nn.functional.interpolate(image, (193, 192), mode="bilinear")
+    with torch.no_grad():
+        drawn = draw_right(network.eval(), image)
+        other = draw_right(network.eval(), taller)
+    assert other.shape[-2] == 193
+    back = torch.nn.functional.interpolate(other, (192, 192), mode="bilinear")
+    assert float((back - drawn).abs().mean()) < 0.01

@@ -7,6 +7,12 @@ from torch import Tensor, nn
 
 from depthpose.depth.synthesis.generator import UNetGenerator
 
+ROWS_SHARE = 0.03
+"""Rows are stretched by this at most: no disparity depends on them."""
+
+COLUMNS_SHARE = 0.01
+"""Columns are stretched by this at most: depth is off by as much."""
+
 
 class Synthesiser:
     """Draws the right view of images of any size.
@@ -32,10 +38,32 @@ class Synthesiser:
 def draw_right(
     generator: UNetGenerator, left: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 3 h w"]:
-    """Draw right views, RGB in [0, 1], padding by reflection; gradients flow."""
+    """Draw right views of any size, RGB in [0, 1]; gradients flow.
+
+    Sides close to a multiple of what the network takes are resized to it, others padded by
+    reflection. Mirrored rows move the horizon's place in the image, which tells the ground's depth:
+    193 rows padded to 256, where 192 were trained, drew views of 15 % too little disparity.
+    """
     height, width = left.shape[-2:]
-    padded = pad_to_multiple(2 * left - 1, generator.config.side_multiple_px)
-    return (generator(padded)[..., :height, :width] + 1) / 2
+    multiple = generator.config.side_multiple_px
+    rows = _near_multiple(height, multiple, ROWS_SHARE)
+    columns = _near_multiple(width, multiple, COLUMNS_SHARE)
+    padded = pad_to_multiple(2 * _resized(left, rows, columns) - 1, multiple)
+    drawn = (generator(padded)[..., :rows, :columns] + 1) / 2
+    return _resized(drawn, height, width)
+
+
+def _near_multiple(side_px: int, multiple: int, share: float) -> int:
+    nearest = max(round(side_px / multiple), 1) * multiple
+    return nearest if abs(nearest - side_px) <= share * side_px else side_px
+
+
+def _resized(
+    image: Float[Tensor, "b 3 _ _"], height: int, width: int
+) -> Float[Tensor, "b 3 {height} {width}"]:
+    if image.shape[-2:] == (height, width):
+        return image
+    return F.interpolate(image, (height, width), mode="bilinear", antialias=True).clamp(0, 1)
 
 
 def pad_to_multiple(
