@@ -226,12 +226,21 @@ def test_two_processes_equal_one_that_accumulates(tmp_path: Path) -> None:
     launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
     for folder, words in ((one, program(one, 6, 2)), (two, [*launch, *program(two, 6, 1)])):
         folder.mkdir()
-        subprocess.run([sys.executable, *words], check=True, env=environment(), capture_output=True)
+        _launch([sys.executable, *words])
     states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (one, two)]
     for network in states[0]:
         for name, tensor in states[0][network].items():
             if "running" not in name and "num_batches" not in name:
                 torch.testing.assert_close(tensor, states[1][network][name], rtol=1e-5, atol=1e-6)
+
+
+def _launch(words: list[str]) -> None:
+    """Run a training; once more where a busy machine missed the rendezvous of its processes."""
+    for attempt in range(2):
+        done = subprocess.run(words, env=environment(), capture_output=True, check=False)
+        if done.returncode == 0:
+            return
+        assert attempt == 0, done.stderr.decode()[-3000:]
 
 
 def test_a_signal_to_the_whole_job_saves_the_state(tmp_path: Path) -> None:

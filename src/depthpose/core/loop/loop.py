@@ -128,6 +128,7 @@ class _Run:
                 raise Interrupted(
                     f"stopped after step {self.step} of {self.steps}, --resume goes on from there"
                 )
+        self.accelerator.wait_for_everyone()  # none leaves while another still needs it
         self._load(self.average)  # what is exported
         self.journal.close()
 
