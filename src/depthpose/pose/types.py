@@ -54,6 +54,34 @@ class CloudSample:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class ViewInput:
+    """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from.
+
+    Attributes:
+        name: what the files made from this input are called.
+        depth_m: along the optical axis; NaN where there is no reading. May be a window of a larger
+            image.
+        mask: the object's pixels, as a segmentation gives them: not free of errors.
+        K: intrinsic matrix of this very image (a window's principal point is shifted).
+        object: name of the object.
+    """
+
+    name: str
+    depth_m: Float[Tensor, "h w"]
+    mask: Bool[Tensor, "h w"]
+    K: Float[Tensor, "3 3"]
+    object: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewSample:
+    """A view and its truth."""
+
+    input: ViewInput
+    truth: PoseTruth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Axis:
     """A continuous symmetry: every turn about this line leaves the object as it is.
 
