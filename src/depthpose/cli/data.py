@@ -117,6 +117,7 @@ def make_streets(
     """
     from tqdm import tqdm
 
+    from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.kitti import has_raw_frame
     from depthpose.depth.streets import rig_number
@@ -129,7 +130,8 @@ def make_streets(
     config = StreetsConfig(
         seed=seed, scale=scale, with_antialiasing=with_antialiasing, with_lidar=with_lidar
     )
-    _keep_settings(out, asdict(config))
+    # Seeds have drives of their own, so they may share a folder.
+    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"})
     indices = range(first, first + number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
@@ -137,25 +139,6 @@ def make_streets(
         _make_street(out, drives[index], config, index)
     print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
     return 0
-
-
-def _keep_settings(out: Path, settings: dict) -> None:
-    """Refuse to mix frames of different settings in one folder."""
-    from depthpose.core.files import read_json, write_json
-
-    path = out / "streets.json"
-    if not path.exists():
-        write_json(path, settings)
-        return
-    read = read_json(path)
-    there = read if isinstance(read, dict) else {}
-    # Seeds have drives of their own, so they may share a folder.
-    differing = [key for key in settings if key != "seed" and there.get(key) != settings[key]]
-    if differing:
-        raise InputError(
-            f"{path}: the frames here were made with other settings ({', '.join(differing)}); "
-            "write to another folder, or remove this one"
-        )
 
 
 def _drive(config: "StreetsConfig", day: int) -> str:
