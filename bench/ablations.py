@@ -158,7 +158,7 @@ class Bench:
             rule = ("--protocol", "eigen-raw-camera", "--weights", str(weights))
             assert depthpose([*real, *rule, "--out", str(folder / "real")]) == 0
             row: dict[str, Any] = json.loads((folder / "real" / "rows.json").read_text())[0]
-            kept = ("abs_rel", "rmse_m", "d1", "psnr_db", "ssim")
+            kept = ("abs_rel", "rmse", "d1", "right_l1", "right_psnr_db")
             row = {name: row[name] for name in kept if name in row} | made_quality(weights)
             write_json(folder / "row.json", row)
         found = json.loads((folder / "row.json").read_text())
