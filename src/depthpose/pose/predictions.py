@@ -1,6 +1,7 @@
 """Estimates as files: ``poses.json`` keeps everything, BOP's csv the poses."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
-from depthpose.pose.bop import BopDataset, BopResult, Instance, write_results
+from depthpose.pose.bop import BopDataset, BopResult, Instance, read_results, write_results
 from depthpose.pose.bop.parse import integer, number, read_rows
 from depthpose.pose.types import PoseEstimate, Status
 
@@ -142,6 +143,32 @@ def read_predictions(folder: Path) -> list[Prediction]:
         if name in names:
             raise InputError(f"{path}: two estimates are called {name!r}; keep one of them")
         names.add(name)
+    return found
+
+
+def read_bop_results(path: Path) -> list[Prediction]:
+    """Read anybody's BOP csv as predictions.
+
+    A row has a share of its image's time; its score is kept as the share of votes that agree.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    results = read_results(path)
+    rows_of = Counter((result.scene_id, result.image_id) for result in results)
+    found: list[Prediction] = []
+    for row, result in enumerate(results, 1):
+        place = Place(result.scene_id, result.image_id, result.object_id)
+        whole_s = result.seconds
+        estimate = PoseEstimate(
+            name=f"row {row}",
+            object=f"obj_{result.object_id:06d}",
+            status="ok",
+            camera_from_model=result.camera_from_model,
+            inlier_share=result.score,
+            seconds={} if whole_s is None else {"image": whole_s / rows_of[place[:2]]},
+        )
+        found.append(Prediction(estimate=estimate, place=place))
     return found
 
 
