@@ -39,10 +39,18 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
     path = find_weights(weights)
     checkpoint = read_checkpoint(path)
     statistics = ("running_mean", "running_var", "num_batches_tracked")
-    learnt = [t for name, t in checkpoint.state.items() if not name.endswith(statistics)]
+    learnt = [
+        tensor
+        for name, tensor in checkpoint.state.items()
+        if not name.endswith(statistics) and not name.startswith("models.")
+    ]
+    config = dict(checkpoint.config)
+    if "models" in config:
+        known = config.pop("models")
+        config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in known)
     facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
              "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
-    for name, value in {**facts, **checkpoint.facts, **checkpoint.config}.items():
+    for name, value in {**facts, **checkpoint.facts, **config}.items():
         print(f"{name}: {value}")
     return 0
 
