@@ -1,5 +1,8 @@
 """Every knob of the pose room that needs no torch: frozen dataclasses that refuse at birth."""
 
+from depthpose.pose.config.evaluation import DiameterTable as DiameterTable
+from depthpose.pose.config.evaluation import EvaluationConfig as EvaluationConfig
+from depthpose.pose.config.evaluation import SymmetryRule as SymmetryRule
 from depthpose.pose.config.geometry import METRES as METRES
 from depthpose.pose.config.geometry import CloudConfig as CloudConfig
 from depthpose.pose.config.geometry import IcpConfig as IcpConfig
