@@ -4,6 +4,7 @@ from depthpose.pose.bop.check import check_bop as check_bop
 from depthpose.pose.bop.dataset import BopDataset as BopDataset
 from depthpose.pose.bop.dataset import is_bop as is_bop
 from depthpose.pose.bop.dataset import open_bop as open_bop
+from depthpose.pose.bop.dataset import read_mask as read_mask
 from depthpose.pose.bop.detections import Detection as Detection
 from depthpose.pose.bop.detections import decode_rle as decode_rle
 from depthpose.pose.bop.detections import encode_rle as encode_rle

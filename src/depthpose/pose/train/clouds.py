@@ -121,9 +121,7 @@ class TrainingClouds:
         return _rolled(sample, angle) if self.frames.with_roll else sample
 
     def _voxelised(self, sample: CloudSample, generator: torch.Generator) -> Cloud:
-        return voxelised_cloud(
-            sample, self._class_of[sample.input.object], self.cloud, generator
-        )
+        return voxelised_cloud(sample, self._class_of[sample.input.object], self.cloud, generator)
 
 
 def voxelised_cloud(

@@ -111,9 +111,7 @@ class PoseTraining:
     """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(
-            learning_rate=2e-3, schedule="cosine", warmup_steps=50
-        )
+        default_factory=lambda: AdamConfig(learning_rate=2e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
 
