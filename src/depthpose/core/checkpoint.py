@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,10 @@ from depthpose.core.files import atomic_write
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
+
+
+class LicenceNotice(UserWarning):
+    """Weights whose terms bind whoever uses them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,6 +147,12 @@ def find_weights(name: str | Path) -> Path:
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
         f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones."
     )
+
+
+def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
+    """Warn of terms that bind whoever uses the weights, where their card has any."""
+    if terms := facts.get("terms", ""):
+        warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
 
 
 def file_sha256(path: Path) -> str:

@@ -82,7 +82,12 @@ def read_predictions(folder: Path) -> list[Prediction]:
 
 
 def score_of(estimate: PoseEstimate) -> float:
-    """Say how sure an estimate is, 0..1: the share of the votes that agree; 1 where unknown."""
+    """Say how sure an estimate is, 0..1: the chance of being right, where its risk is known.
+
+    Else the share of the votes that agree, or 1 where nothing is said.
+    """
+    if estimate.risk is not None:
+        return 1 - estimate.risk
     return 1.0 if estimate.inlier_share is None else estimate.inlier_share
 
 
@@ -96,11 +101,11 @@ def _row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    for name in ("inlier_share", "residual_m"):
+    for name in ("inlier_share", "residual_m", "risk"):
         value: float | None = getattr(estimate, name)
         # JSON has no infinity, and nothing near the surface is no distance.
         row[name] = value if value is not None and math.isfinite(value) else None
-    return row | {"seconds": dict(estimate.seconds)}
+    return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
 
 
 def _matrix(pose: Rigid) -> list[list[float]]:
@@ -130,7 +135,9 @@ def _prediction(row: dict[str, Any], source: str) -> Prediction:
         free_motions=_table(row, "free_motions", 6, source),
         inlier_share=_optional(row, "inlier_share", source),
         residual_m=_optional(row, "residual_m", source),
-        seconds=_seconds(row, source),
+        risk=_optional(row, "risk", source),
+        signals=_named(row, "signals", source),
+        seconds=_named(row, "seconds", source),
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
@@ -175,8 +182,8 @@ def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
     return None if row.get(key) is None else number(row, key, None, source)
 
 
-def _seconds(row: dict[str, Any], source: str) -> dict[str, float]:
-    spent = row.get("seconds", {})
-    if not isinstance(spent, dict):
-        raise InputError(f"{source}: seconds is {spent!r}, where stages to numbers belong")
-    return {str(stage): number(spent, stage, None, source) for stage in spent}
+def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
+    found = row.get(key, {})
+    if not isinstance(found, dict):
+        raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
+    return {str(name): number(found, name, None, source) for name in found}
