@@ -10,11 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.cli import main
-from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.pose.network import (
-    KIND,
-    NetworkWeights,
     ResUNet,
     ResUNetConfig,
     fold_norms,
@@ -97,7 +95,7 @@ def test_reproduces_minkowski_engine(real: Path, tmp_path: Path) -> None:
     out = tmp_path / "slim.safetensors"
     assert main(["weights", "import", "fcgf", str(tmp_path / "slim.pth"), "--out", str(out),
                  "--classes", "1"]) == 0  # fmt: skip
-    network = read_network(out).network
+    network = read_network(out)
     assert sum(p.numel() for p in network.parameters()) == 549_584
     coordinates = torch.from_numpy(content["coordinates"]).long()
     with torch.no_grad():
@@ -114,10 +112,10 @@ def test_the_importer_reads_what_fcgf_writes(norm: str, tmp_path: Path) -> None:
     torch.save({"state_dict": state, "epoch": 3}, tmp_path / "f.pth")
     import_fcgf(tmp_path / "f.pth", tmp_path / "f.safetensors", classes=3)
     again = read_network(tmp_path / "f.safetensors")
-    assert again.network.config == network.config
-    assert again.facts["imported_from"] == "f.pth"
+    assert again.config == network.config
+    assert read_checkpoint(tmp_path / "f.safetensors").facts["imported_from"] == "f.pth"
     voxels = Voxels.from_points(surface())
-    torch.testing.assert_close(again.network(voxels), network(voxels), rtol=0, atol=0)
+    torch.testing.assert_close(again(voxels), network(voxels), rtol=0, atol=0)
 
 
 def test_descriptors_need_no_classes() -> None:
@@ -219,23 +217,14 @@ def test_few_voxels_train_too(points: int) -> None:
     assert all(p.grad is None or bool(p.grad.isfinite().all()) for p in network.parameters())
 
 
-def test_weights_come_back_with_their_settings(tmp_path: Path) -> None:
+def test_a_bare_network_comes_back(tmp_path: Path) -> None:
     network = tiny(with_confidence=True)
-    settings, facts = {"voxel_m": 0.008, "objects": ["cat"]}, {"licence": "MIT"}
     path = tmp_path / "w.safetensors"
-    write_network(path, NetworkWeights(network=network, settings=settings, facts=facts))
-    again = read_network(path)
-    assert (again.settings, again.facts, again.network.config) == (settings, facts, network.config)
-    voxels = Voxels.from_points(surface())
-    assert torch.equal(again.network(voxels), network(voxels))
-    assert read_checkpoint(path).facts["norm_mode"] == "batch"
-
-
-def test_weights_without_a_network_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "w.safetensors"
-    save_checkpoint(path, Checkpoint(kind=KIND, config={}, state={"a": torch.zeros(1)}))
-    with pytest.raises(InputError, match="its config has no 'network'"):
-        read_network(path)
+    write_network(path, network, {"licence": "MIT"})
+    again, voxels = read_network(path), Voxels.from_points(surface())
+    assert again.config == network.config
+    assert torch.equal(again(voxels), network(voxels))
+    assert read_checkpoint(path).facts == {"licence": "MIT", "norm_mode": "batch"}
 
 
 @pytest.mark.parametrize(

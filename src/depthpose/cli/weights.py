@@ -39,16 +39,24 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
     path = find_weights(weights)
     checkpoint = read_checkpoint(path)
     statistics = ("running_mean", "running_var", "num_batches_tracked")
-    learnt = [t for name, t in checkpoint.state.items() if not name.endswith(statistics)]
+    learnt = [
+        tensor
+        for name, tensor in checkpoint.state.items()
+        if not name.endswith(statistics) and not name.startswith("models.")
+    ]
+    config = dict(checkpoint.config)
+    if "models" in config:
+        known = config.pop("models")
+        config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in known)
     facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
              "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
-    for name, value in {**facts, **checkpoint.facts, **checkpoint.config}.items():
+    for name, value in {**facts, **checkpoint.facts, **config}.items():
         print(f"{name}: {value}")
     return 0
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf"]],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18"]],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -61,7 +69,8 @@ def import_weights(
 
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
-            MinkowskiEngine stores it.
+            MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
+            can start from (.pth of tensors or .safetensors).
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample, which no file records:
@@ -74,6 +83,10 @@ def import_weights(
         from depthpose.pose.network import import_fcgf
 
         import_fcgf(file, out, classes=classes)
+    elif kind == "resnet18":
+        from depthpose.pose.resnet import import_resnet18
+
+        import_resnet18(file, out)
     else:
         from depthpose.core.errors import InputError
         from depthpose.depth.stereo import import_psmnet

@@ -202,6 +202,7 @@ class _Run:
             self.samples,  # pyright: ignore[reportArgumentType]
             batch_sampler=_Tickets(self, first),
             num_workers=self.config.workers,
+            collate_fn=getattr(self.samples, "collate", None),
             pin_memory=self.accelerator.device.type == "cuda",
             worker_init_fn=leave_signals_to_the_loop,
         )

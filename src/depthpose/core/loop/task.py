@@ -65,6 +65,9 @@ class Samples(Protocol):
 
     What ticket n gives depends on n alone, so that any process can make it at any time: this is
     what makes order, resuming and many processes one and the same thing.
+
+    Where samples differ in size, a method ``collate`` (a list of samples to a batch) may stand
+    beside these two.
     """
 
     def __len__(self) -> int:

@@ -1,6 +1,5 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
-import warnings
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -10,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
-from depthpose.core.checkpoint import find_weights
+from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
@@ -26,10 +25,6 @@ from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
 from depthpose.depth.synthesis import Synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights, read_depth_weights
-
-
-class LicenceNotice(UserWarning):
-    """Weights whose terms bind whoever uses them."""
 
 
 class FakestereoNet:
@@ -73,7 +68,7 @@ class FakestereoNet:
         found = None
         if weights is not None:
             found = read_depth_weights(find_weights(weights))
-            _say_terms(found)
+            say_terms(found.facts)
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = _choose_matcher(weights, found, matcher, config)
         if found is None or found.generator is None:
@@ -230,9 +225,3 @@ def _choose_matcher(
             "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
         )
     return PSMNetMatcher(found.matcher, run)
-
-
-def _say_terms(found: DepthWeights) -> None:
-    terms = found.facts.get("terms", "")
-    if terms:
-        warnings.warn(terms, LicenceNotice, stacklevel=3)

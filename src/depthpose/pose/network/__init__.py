@@ -4,20 +4,15 @@ from depthpose.pose.network.config import ResUNetConfig
 from depthpose.pose.network.fold import fold_norms
 from depthpose.pose.network.published import import_fcgf, resunet_from_published
 from depthpose.pose.network.resunet import ResUNet, select_class
-from depthpose.pose.network.weights import (
-    KIND,
-    NetworkWeights,
-    read_network,
-    write_network,
-)
+from depthpose.pose.network.weights import KIND, network_of, read_network, write_network
 
 __all__ = [
     "KIND",
-    "NetworkWeights",
     "ResUNet",
     "ResUNetConfig",
     "fold_norms",
     "import_fcgf",
+    "network_of",
     "read_network",
     "resunet_from_published",
     "select_class",

@@ -11,7 +11,7 @@ from depthpose.core.checkpoint import file_sha256, read_torch_file
 from depthpose.core.errors import InputError
 from depthpose.pose.network.config import ResUNetConfig
 from depthpose.pose.network.resunet import ResUNet
-from depthpose.pose.network.weights import NetworkWeights, write_network
+from depthpose.pose.network.weights import write_network
 
 _PARTS = {"kernel": "weight", "bias": "bias"}
 _CONVS = tuple(f"conv{i}" for i in (1, 2, 3, 4)) + tuple(f"conv{i}_tr" for i in (1, 2, 3, 4))
@@ -37,7 +37,7 @@ def import_fcgf(file: Path, out: Path, *, classes: int | None = None) -> None:
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     facts = {"imported_from": Path(file).name, "source_sha256": file_sha256(file)}
-    write_network(out, NetworkWeights(network=network, facts=facts))
+    write_network(out, network, facts)
 
 
 def resunet_from_published(state: Mapping[str, Tensor], *, classes: int | None = None) -> ResUNet:

@@ -1,0 +1,201 @@
+"""Random changes that keep a pose true: what hides an object, wrong masks, a sensor's errors.
+
+Each takes its chance from a generator alone. Depth is NaN where nothing is seen.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from depthpose.pose.config import SensorConfig, SensorKind
+
+Depth = Float[Tensor, "h w"]
+Mask = Bool[Tensor, "h w"]
+
+_KINECT_BASELINE_M = 0.075
+_STEPS_A_PIXEL = 8
+_STEEPEST = math.tan(math.radians(80))
+"""No sensor reads a surface that is turned farther away than 80 degrees."""
+_JUMP = 0.02
+"""Neighbours whose depths differ by more than this share lie on different surfaces."""
+
+
+def uniform(generator: torch.Generator, low: float, high: float) -> float:
+    """Draw a number of a range."""
+    return low + (high - low) * float(torch.rand((), generator=generator))
+
+
+def whole(generator: torch.Generator, count: int) -> int:
+    """Draw one of 0 .. count - 1."""
+    return int(torch.randint(count, (), generator=generator))
+
+
+def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
+    """Draw a rotation, all equally likely: a quaternion of four normal numbers, in float64."""
+    q = torch.randn(4, generator=generator, dtype=torch.float64)
+    w, x, y, z = (q / q.norm()).tolist()
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
+    """Draw a function whose lower parts are half-planes, ellipses, boxes or convex polygons.
+
+    Cut at a quantile, it hides exactly the wanted share of anything.
+    """
+    size = max(height, width)
+    angle, stretch = uniform(generator, 0.0, 2 * math.pi), uniform(generator, 0.3, 1.0)
+    row, column = uniform(generator, 0.0, float(height)), uniform(generator, 0.0, float(width))
+    v = (torch.arange(height)[:, None] - row) / size
+    u = (torch.arange(width)[None] - column) / size
+    along = math.cos(angle) * u + math.sin(angle) * v
+    across = (math.cos(angle) * v - math.sin(angle) * u) * stretch
+    match whole(generator, 4):
+        case 0:
+            return along
+        case 1:
+            return along.square() + across.square()
+        case 2:
+            return torch.maximum(along.abs(), across.abs())
+        case _:
+            return _polygon(along, across, generator)
+
+
+def hide(
+    depth_m: Depth, silhouette: Mask, share: float, generator: torch.Generator
+) -> tuple[Depth, Mask]:
+    """Stand something before the object that hides exactly a share of its silhouette.
+
+    Returns:
+        The depth with the occluder in it, and what is left of the silhouette.
+    """
+    count = round(share * int(silhouette.sum()))
+    levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
+    gap_m = uniform(generator, 0.005, 0.15)
+    if count == 0:
+        return depth_m, silhouette
+    is_hidden = levels <= levels[silhouette].kthvalue(count).values
+    # Nearer than all that it hides.
+    nearest_m = depth_m.masked_fill(~(silhouette & is_hidden), torch.inf).min()
+    occluder_m = (nearest_m - gap_m).clamp(min=0.1 * nearest_m)
+    return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
+
+
+def misjudge_mask(mask: Mask, grow_px: int) -> Mask:
+    """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
+    if grow_px == 0:
+        return mask
+    source = (mask if grow_px > 0 else ~mask).float()[None, None]
+    size = 2 * abs(grow_px) + 1
+    # A square, one axis after the other.
+    wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
+    grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
+    return grown if grow_px > 0 else ~grown
+
+
+def measure(
+    depth_m: Depth, focal_px: tuple[float, float], config: SensorConfig, generator: torch.Generator
+) -> Depth:
+    """Measure a clean depth window as a sensor would.
+
+    Args:
+        depth_m: of every pixel of the window; NaN where there is nothing.
+        focal_px: of this window, and of the sensor's full image (which says how fine its disparity
+            is).
+        config: kinds of sensor, and how bad they are.
+        generator: of the chance.
+    """
+    kind: SensorKind = config.kinds[whole(generator, len(config.kinds))]
+    noise, missing = uniform(generator, *config.noise), uniform(generator, *config.missing)
+    if kind == "none":
+        return depth_m
+    steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
+    is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
+    white = torch.randn(depth_m.shape, generator=generator) * noise
+    if kind == "structured light":
+        is_lost |= _is_shadowed(depth_m, focal_px[0])
+        read_m = _jittered(depth_m, generator)
+        # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
+        read_m = read_m + white * (0.0012 + 0.0019 * (read_m - 0.4).square())
+        scale = _STEPS_A_PIXEL * focal_px[1] * _KINECT_BASELINE_M
+        read_m = scale / (scale / read_m).round()
+    elif kind == "time of flight":
+        read_m = _mixed(depth_m, generator)
+        read_m = read_m + white * (0.001 + 0.002 * read_m.square())
+    else:
+        read_m = depth_m + 0.0005 * white
+    return torch.where(is_lost, torch.nan, read_m)
+
+
+def _polygon(along: Depth, across: Depth, generator: torch.Generator) -> Depth:
+    sides = 3 + whole(generator, 4)
+    turns = torch.rand(sides, generator=generator).cumsum(0)
+    angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
+    far = 0.5 + torch.rand(sides, generator=generator)
+    level = torch.full_like(along, -torch.inf)
+    for angle, reach in zip(angles.tolist(), far.tolist(), strict=True):
+        level = torch.maximum(level, (math.cos(angle) * along + math.sin(angle) * across) / reach)
+    return level
+
+
+def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
+    """Mark surfaces seen at a grazing angle: one pixel on, the depth changes by far too much."""
+    # A jump to another surface is steep on one side alone: the flatter side decides.
+    change = torch.zeros_like(depth_m)
+    for axis in (0, 1):
+        step = depth_m.diff(dim=axis).abs().nan_to_num(torch.inf)
+        pad = (0, 0, 1, 0) if axis == 0 else (1, 0)
+        end = (0, 0, 0, 1) if axis == 0 else (0, 1)
+        before = F.pad(step, pad, value=torch.inf)
+        after = F.pad(step, end, value=torch.inf)
+        flatter = torch.minimum(before, after)
+        change = torch.maximum(change, flatter.nan_to_num(posinf=0.0))
+    return change * focal_px > steepest * depth_m
+
+
+def _is_shadowed(depth_m: Depth, focal_px: float) -> Mask:
+    """Mark what the projector, beside the camera, cannot light: something nearer is in its way."""
+    column = torch.arange(depth_m.shape[1])
+    lit = column + (focal_px * _KINECT_BASELINE_M / depth_m).nan_to_num(-torch.inf)
+    # The projector's columns ascend along a row, but for what lies behind an edge.
+    return lit < lit.cummax(1).values - 1.5
+
+
+def _gaps(depth_m: Depth, share: float, generator: torch.Generator) -> Mask:
+    height, width = depth_m.shape
+    single = torch.rand(height, width, generator=generator) < 0.5 * share
+    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
+    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
+    # Their level is met on every fourth row and column: the share is a matter of chance anyway.
+    some = patches[::4, ::4].flatten()
+    count = round(0.5 * share * len(some))
+    return single | (patches <= some.kthvalue(count).values) if count else single
+
+
+def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
+    """Read each pixel at one that is a pixel or none away: structured light blurs edges."""
+    height, width = depth_m.shape
+    moves = torch.tensor([-1, 0, 0, 1])
+    dv, du = moves[torch.randint(4, (2, height, width), generator=generator)]
+    row = (torch.arange(height)[:, None] + dv).clamp_(0, height - 1)
+    column = (torch.arange(width) + du).clamp_(0, width - 1)
+    index: Int64[Tensor, "h w"] = row * width + column
+    return depth_m.reshape(-1)[index]
+
+
+def _mixed(depth_m: Depth, generator: torch.Generator) -> Depth:
+    """Mix what a pixel sees with its right or lower neighbour where depth jumps."""
+    share = torch.rand(depth_m.shape, generator=generator)
+    right, lower = depth_m.roll(-1, 1), depth_m.roll(-1, 0)
+    right[:, -1], lower[-1] = depth_m[:, -1], depth_m[-1]
+    for other in (right, lower):
+        is_jump = (other - depth_m).abs() > _JUMP * depth_m
+        depth_m = torch.where(is_jump, torch.lerp(depth_m, other, share), depth_m)
+    return depth_m

@@ -1,0 +1,109 @@
+"""Knobs of made views: how they look, and the errors of the sensor that sees them."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from depthpose.core.errors import InputError
+
+SensorKind = Literal["structured light", "time of flight", "laser", "none"]
+"""What measures depth, and so what its errors look like."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorConfig:
+    """The errors of a depth sensor. Ranges are of what each sample draws."""
+
+    kinds: tuple[SensorKind, ...] = ("structured light",)
+    """One of these measures each sample. ``structured light``: disparity in steps of 1/8 px, noise
+    that grows with the squared distance (Nguyen et al. 2012), the projector's shadow. ``time of
+    flight``: mixed readings where depth jumps. ``laser``: little noise. ``none``: no error."""
+
+    noise: tuple[float, float] = (0.5, 1.5)
+    """Times the noise of the kind."""
+
+    missing: tuple[float, float] = (0.0, 0.1)
+    """Share of readings lost beside those of shadows and grazing surfaces; half in patches."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown kinds and empty ranges."""
+        known = ("structured light", "time of flight", "laser", "none")
+        if not self.kinds or any(kind not in known for kind in self.kinds):
+            raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
+        _refuse_range("noise", self.noise, (0.0, 20.0), "(0.5, 1.5)")
+        _refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectsConfig:
+    """Made views of known objects. Ranges are of what each sample draws."""
+
+    number: int = 1000
+    """Samples; sample i shows object i modulo their number."""
+
+    seed: int = 0
+    """Another seed, other samples."""
+
+    views: int | None = 2000
+    """Renderings of each object, made when first drawn and then kept; a sample turns the camera of
+    one of them at random, which shows the same surface. None: each sample is a rendering of its
+    own, for evaluation."""
+
+    distance_m: tuple[float, float] = (0.6, 1.1)
+    """From the camera to the middle of the object."""
+
+    image_px: tuple[int, int] = (640, 480)
+    """Width and height of the sensor's image; the object lies somewhere in it."""
+
+    focal_px: tuple[float, float] = (572.4114, 573.57043)
+    """fx and fy; LineMOD's Kinect."""
+
+    centre_px: tuple[float, float] = (325.2611, 242.04899)
+    """Principal point."""
+
+    resolution: tuple[float, float] = (0.5, 1.0)
+    """The image is so many times as large: coarser pictures are faster made."""
+
+    occluded_share: float = 0.6
+    """Share of samples in which something stands before the object."""
+
+    occlusion: tuple[float, float] = (0.0, 0.4)
+    """Share of the silhouette that it hides."""
+
+    with_background: bool = True
+    """Whether there is something behind and beside the object, which wrong masks take in."""
+
+    mask_error_px: int = 3
+    """The mask is grown or shrunk by up to so many pixels of the full image."""
+
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    """What measures the depth."""
+
+    def __post_init__(self) -> None:
+        """Refuse counts of nothing, shares beyond one and empty ranges."""
+        if self.number < 1 or (self.views is not None and self.views < 1):
+            raise InputError(f"number is {self.number} and views {self.views}; both are 1 or more")
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}; take 0 or more")
+        if min(*self.image_px, *self.focal_px) <= 0:
+            raise InputError(
+                f"image_px is {self.image_px} and focal_px {self.focal_px}; both are positive "
+                "pixels, as (640, 480) and (572.4114, 573.57043)"
+            )
+        if not 0 <= self.occluded_share <= 1:
+            raise InputError(f"occluded_share is {self.occluded_share}, but a share is 0 to 1")
+        if not 0 <= self.mask_error_px <= 20:
+            raise InputError(f"mask_error_px is {self.mask_error_px}; take 0 to 20, usually 3")
+        _refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
+        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.5, 1.0)")
+        _refuse_range("occlusion", self.occlusion, (0.0, 0.95), "(0.0, 0.4)")
+
+
+def _refuse_range(
+    name: str, given: tuple[float, float], limits: tuple[float, float], usual: str
+) -> None:
+    low, high = given
+    if not limits[0] <= low <= high <= limits[1]:
+        raise InputError(
+            f"{name} is {given}, but it is a range within {limits[0]} to {limits[1]}, the lower "
+            f"end first; usual is {usual}"
+        )

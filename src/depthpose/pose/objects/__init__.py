@@ -1,0 +1,5 @@
+"""Made views of known objects: partial clouds and depth windows, and whole frames."""
+
+from depthpose.pose.objects.dataset import Objects as Objects
+from depthpose.pose.objects.surface import drawn_triangles as drawn_triangles
+from depthpose.pose.objects.surface import surfel_triangles as surfel_triangles

@@ -1,0 +1,186 @@
+"""Partial clouds by ticket, made or of real frames, and their batches."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.loop import shuffled_index, ticket_generator
+from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import BopDataset, open_bop
+from depthpose.pose.cloud import refusal_of, sample_points, voxelise
+from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.objects import Objects
+from depthpose.pose.train.config import FramesConfig
+from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
+
+_TRIES = 20
+
+
+class Cloud(NamedTuple):
+    """One training sample: the points that were kept, and the truth."""
+
+    points_m: Float[Tensor, "n 3"]
+    coordinates: Int[Tensor, "n 3"]
+    class_number: int
+    R: Float[Tensor, "3 3"]
+    t_m: Float[Tensor, "3"]
+
+
+class CloudBatch(NamedTuple):
+    """Several clouds, one after the other.
+
+    Attributes:
+        points_m: of all clouds, in their cameras' frames.
+        coordinates: (cloud, x, y, z) of each point's voxel.
+        class_of: class of each cloud.
+        R: rotation of each cloud's pose.
+        t_m: translation.
+    """
+
+    points_m: Float[Tensor, "points 3"]
+    coordinates: Int[Tensor, "points 4"]
+    class_of: Int[Tensor, " clouds"]
+    R: Float[Tensor, "clouds 3 3"]
+    t_m: Float[Tensor, "clouds 3"]
+
+    @property
+    def instance(self) -> Int[Tensor, " points"]:
+        """Which cloud each point belongs to."""
+        return self.coordinates[:, 0].long()
+
+
+class TrainingClouds:
+    """Each ticket a cloud, made or of a frame.
+
+    Args:
+        models: the objects; class k is ``models[k]``.
+        made: how made views look; None: frames alone.
+        frames: real frames, and their share.
+        cloud: points and voxels.
+        seed: of the order of frames and of the choice of points.
+
+    Raises:
+        InputError: neither views nor frames, or frames of other objects.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        made: ObjectsConfig,
+        frames: FramesConfig | None,
+        cloud: CloudConfig,
+        seed: int,
+    ) -> None:
+        self.cloud, self.seed, self.frames = cloud, seed, frames
+        self.made = Objects(models, made, cloud)
+        self._class_of = {model.name: k for k, model in enumerate(models)}
+        self._real = None if frames is None else _open_frames(frames, models, cloud)
+
+    def __len__(self) -> int:
+        """Tickets of an epoch: each frame comes once, or as many as views are made."""
+        if self._real is None or self.frames is None:
+            return len(self.made)
+        return max(1, round(len(self._real) / self.frames.share))
+
+    def __getitem__(self, ticket: int) -> Cloud:
+        """Make the sample of a ticket; one with too few points gives way to another.
+
+        Raises:
+            InputError: so many in a row have too few points that the config must be wrong.
+        """
+        generator = ticket_generator(ticket, self.seed)
+        for attempt in range(_TRIES):
+            # Far beyond any training, and the same object.
+            sample = self._sample(ticket + attempt * len(self._class_of) * 2**32, generator)
+            points = sample.input.points_m
+            if refusal_of(points, self.cloud) is None:
+                return self._voxelised(sample, generator)
+        raise InputError(
+            f"{_TRIES} samples of {sample.input.object!r} in a row have fewer than "
+            f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
+            "min_points"
+        )
+
+    @staticmethod
+    def collate(clouds: Sequence[Cloud]) -> CloudBatch:
+        """Put clouds one after the other."""
+        return collate_clouds(clouds)
+
+    def _sample(self, ticket: int, generator: torch.Generator) -> CloudSample:
+        if self._real is None or self.frames is None:
+            return self.made.sample(ticket)
+        if float(torch.rand((), generator=generator)) >= self.frames.share:
+            return self.made.sample(ticket)
+        sample = self._real[shuffled_index(ticket, len(self._real), self.seed)]
+        angle = 2 * math.pi * float(torch.rand((), generator=generator))
+        return _rolled(sample, angle) if self.frames.with_roll else sample
+
+    def _voxelised(self, sample: CloudSample, generator: torch.Generator) -> Cloud:
+        return voxelised_cloud(sample, self._class_of[sample.input.object], self.cloud, generator)
+
+
+def voxelised_cloud(
+    sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
+) -> Cloud:
+    """Take points of a sample and put them on the grid, as an estimate would."""
+    points = sample_points(sample.input.points_m, config.max_points, generator)
+    voxels = voxelise(points, config.voxel_m)
+    pose = sample.truth.camera_from_model
+    return Cloud(
+        points_m=points[voxels.kept].float(),
+        coordinates=voxels.coordinates,
+        class_number=class_number,
+        R=pose.R.float(),
+        t_m=pose.t_m.float(),
+    )
+
+
+def collate_clouds(clouds: Sequence[Cloud]) -> CloudBatch:
+    """Put clouds one after the other."""
+    numbers = [torch.full((len(c.points_m), 1), k) for k, c in enumerate(clouds)]
+    return CloudBatch(
+        points_m=torch.cat([c.points_m for c in clouds]),
+        coordinates=torch.cat(
+            [torch.cat([n, c.coordinates], 1) for n, c in zip(numbers, clouds, strict=True)]
+        ),
+        class_of=torch.tensor([c.class_number for c in clouds]),
+        R=torch.stack([c.R for c in clouds]),
+        t_m=torch.stack([c.t_m for c in clouds]),
+    )
+
+
+def _open_frames(
+    frames: FramesConfig, models: Sequence[ObjectModel], cloud: CloudConfig
+) -> BopDataset:
+    dataset = open_bop(frames.folder, frames.split, cloud=cloud)
+    dataset = dataset.of_objects(*(model.number for model in models))
+    known = {model.number: model.name for model in models}
+    for number, found in dataset.objects.items():
+        if known[number] != found.name:
+            raise InputError(
+                f"{frames.folder}: object {number} is called {found.name!r} there, and "
+                f"{known[number]!r} here; take the models from this folder (models: bop)"
+            )
+    return dataset
+
+
+def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
+    """Turn the camera about its optical axis: cloud and pose turn with it."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    given, pose = sample.input, sample.truth.camera_from_model
+    points_m = given.points_m.float() @ turn.mT
+    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
+    return CloudSample(
+        input=CloudInput(name=given.name, points_m=points_m, object=given.object),
+        truth=PoseTruth(
+            camera_from_model=turned,
+            visible_fraction=sample.truth.visible_fraction,
+            is_measured=sample.truth.is_measured,
+        ),
+    )

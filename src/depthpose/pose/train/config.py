@@ -1,0 +1,129 @@
+"""Knobs of a training of the direction network."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from depthpose.core.errors import InputError
+from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
+from depthpose.pose.network import ResUNetConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelsConfig:
+    """The objects that are learnt: CAD files, or models of a folder in BOP's layout."""
+
+    cad: tuple[str, ...] = ()
+    """Model files; each object is called as its file."""
+
+    unit: Unit = "mm"
+    """Of the numbers in the CAD files."""
+
+    bop: str | None = None
+    """Folder of a data set, whose models are taken in place of CAD files."""
+
+    objects: tuple[int, ...] = ()
+    """Numbers of the data set's objects; none: all."""
+
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """Keypoints of each."""
+
+    with_found_symmetries: bool = False
+    """Look for symmetries of CAD files, and count the copies as right."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig:
+    """Annotated real frames among the made views."""
+
+    folder: str = ""
+    """Of a data set in BOP's or LineMOD's layout."""
+
+    split: str = "train"
+    """Which part of it."""
+
+    share: float = 1.0
+    """Of the samples; the others are made."""
+
+    with_roll: bool = True
+    """Turn the camera of a frame about its optical axis at random, which is as true as the frame."""
+
+    def __post_init__(self) -> None:
+        """Refuse no folder, and shares that are none."""
+        if not self.folder:
+            raise InputError("frames has no folder; name a data set, or leave frames out")
+        if not 0 < self.share <= 1:
+            raise InputError(f"share is {self.share}, but it is above 0 and at most 1; take 1.0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutConfig:
+    """Made views that validation looks at; no training sees one."""
+
+    number: int = 25
+    """Of each object at each occlusion."""
+
+    occlusions: tuple[float, ...] = (0.0, 0.3)
+    """Shares of the silhouette that are hidden."""
+
+    with_ransac: bool = True
+    """Vote by RANSAC too."""
+
+    def __post_init__(self) -> None:
+        """Refuse a validation of nothing."""
+        if self.number < 1 or not self.occlusions:
+            raise InputError(
+                f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
+                "looked at; take 25 and (0.0, 0.3)"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTraining:
+    """The direction network learns to point at keypoints."""
+
+    models: ModelsConfig = field(default_factory=ModelsConfig)
+    """What is learnt."""
+
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    """Made views to learn from."""
+
+    frames: FramesConfig | None = None
+    """Real frames to learn from, beside them."""
+
+    cloud: CloudConfig = field(default_factory=lambda: CloudConfig(max_points=1000))
+    """Voxel size, and points of a cloud."""
+
+    network: ResUNetConfig = field(
+        default_factory=lambda: ResUNetConfig(
+            first_kernel=5, encoder=(16, 32, 64, 128), decoder=(32, 32, 32, 64)
+        )
+    )
+    """The network; its classes and keypoints follow from the models."""
+
+    start: str | None = None
+    """Weights to begin with."""
+
+    loss: Literal["mse", "cosine", "l1"] = "mse"
+    """How a direction is punished."""
+
+    confidence_weight: float = 0.1
+    """Of the loss of the confidences, where the network has them."""
+
+    adam: AdamConfig = field(
+        default_factory=lambda: AdamConfig(learning_rate=2e-3, schedule="cosine", warmup_steps=50)
+    )
+    """The optimiser."""
+
+    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    """What validation looks at."""
+
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(
+            steps=10000, batch_size=8, clip_norm=1.0, ema_decay=0.999, save_every_steps=500
+        )
+    )
+    """How long."""
+
+    with_half: bool = False
+    """Write the weights in 16 bits."""

@@ -1,0 +1,118 @@
+"""Held-out made views: how often does the network as it stands find the pose?"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.loop import Evidence, ticket_generator
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import refusal_of
+from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.network import ResUNet, select_class
+from depthpose.pose.objects import Objects
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.train.clouds import Cloud, collate_clouds, voxelised_cloud
+from depthpose.pose.train.config import HeldOutConfig
+from depthpose.pose.types import ObjectModel, Vote
+from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
+
+HELD_OUT_SEED = 0x4E1D
+"""Added to the seed of the views that are trained on."""
+_TOGETHER = 8
+_SURFACE = 1000
+
+
+class HeldOut:
+    """Clouds that are made once, and looked at again and again.
+
+    Each is a rendering of its own at the full resolution; so many of each object stand at each
+    occlusion.
+
+    Args:
+        models: the objects; class k is ``models[k]``.
+        made: how the views of the training look.
+        cloud: points and voxels.
+        config: how many.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        made: ObjectsConfig,
+        cloud: CloudConfig,
+        config: HeldOutConfig,
+    ) -> None:
+        self.models, self.config = models, config
+        self._surfaces = [sample_surface(model, _SURFACE)[0] for model in models]
+        self._made, self._cloud = made, cloud
+        self._clouds: dict[float, list[Cloud]] = {}
+
+    @torch.no_grad()
+    def look(self, network: ResUNet) -> Evidence:
+        """Share of ADD(-S) below a tenth of the diameter, and the median in percent of it."""
+        numbers: dict[str, float] = {}
+        for occlusion in self.config.occlusions:
+            for method, errors in self._errors(network, occlusion).items():
+                place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
+                numbers[f"{place}_add_10"] = float((errors < 0.1).float().mean())
+                numbers[f"{place}_median"] = float(errors.median())
+        return Evidence(numbers=numbers)
+
+    def _errors(self, network: ResUNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
+        methods = ["lines", "ransac"] if self.config.with_ransac else ["lines"]
+        found: dict[str, list[float]] = {method: [] for method in methods}
+        for cloud, directions in self._directions(network, self._of(occlusion)):
+            points = cloud.points_m.to(directions)
+            found["lines"].append(self._error(meet_lines(points, directions), cloud))
+            if self.config.with_ransac:
+                found["ransac"].append(self._error(vote_ransac(points, directions), cloud))
+        return {method: torch.tensor(errors) for method, errors in found.items()}
+
+    def _error(self, vote: Vote, cloud: Cloud) -> float:
+        """ADD, or ADD-S of a symmetric object, in diameters."""
+        model = self.models[cloud.class_number]
+        fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
+        measure = add_m if model.symmetries.is_none else adds_m
+        truth, points = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
+        return float(measure(fit.camera_from_model, truth, points)) / model.diameter_m
+
+    def _directions(
+        self, network: ResUNet, clouds: Sequence[Cloud]
+    ) -> Iterator[tuple[Cloud, Float[Tensor, "n k 3"]]]:
+        device = next(network.parameters()).device
+        for start in range(0, len(clouds), _TOGETHER):
+            part = clouds[start : start + _TOGETHER]
+            batch = collate_clouds(part)
+            voxels = Voxels.from_points(batch.coordinates.to(device))
+            classes = batch.class_of[batch.instance].to(device)
+            outputs = select_class(network(voxels), classes).float()[..., :3]
+            sizes = [len(cloud.points_m) for cloud in part]
+            yield from zip(part, outputs.split(sizes), strict=True)
+
+    def _of(self, occlusion: float) -> list[Cloud]:
+        if occlusion not in self._clouds:
+            config = dataclasses.replace(
+                self._made,
+                number=self.config.number * len(self.models),
+                seed=self._made.seed + HELD_OUT_SEED,
+                views=None,
+                resolution=(1.0, 1.0),
+                occluded_share=1.0,
+                occlusion=(occlusion, occlusion),
+            )
+            objects = Objects(self.models, config, self._cloud)
+            self._clouds[occlusion] = list(self._voxelised(objects))
+        return self._clouds[occlusion]
+
+    def _voxelised(self, objects: Objects) -> Iterator[Cloud]:
+        for index in range(len(objects)):
+            sample = objects[index]
+            if refusal_of(sample.input.points_m, self._cloud) is None:
+                generator = ticket_generator(index, HELD_OUT_SEED)
+                number = index % len(self.models)
+                yield voxelised_cloud(sample, number, self._cloud, generator)

@@ -1,0 +1,81 @@
+"""The objects of a training, from CAD files or a data set."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from depthpose.core.errors import InputError
+from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
+from depthpose.pose.mesh import (
+    propose_symmetries,
+    read_model,
+    symmetries_from_proposals,
+)
+from depthpose.pose.train.config import ModelsConfig
+from depthpose.pose.types import ObjectModel
+
+
+def read_models(
+    config: ModelsConfig, tell: Callable[[str], None] | None = None
+) -> tuple[ObjectModel, ...]:
+    """Read the models that a training names.
+
+    Args:
+        config: which.
+        tell: told of symmetries that were found in CAD files, taken or not.
+
+    Raises:
+        InputError: none is named, both kinds are, two have one name, or a file is damaged.
+    """
+    if config.cad and config.bop:
+        raise InputError("cad and bop are both given; take the models from one of them")
+    if config.bop:
+        return _from_bop(Path(config.bop), config)
+    if not config.cad:
+        raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
+    models = tuple(
+        read_model(path, config.unit, number=number, config=config.mesh)
+        for number, path in enumerate(config.cad, start=1)
+    )
+    names = [model.name for model in models]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"two CAD files are called {twice[0]!r}, and an object is known by its name; rename one"
+        )
+    return tuple(_with_symmetries(model, config, tell) for model in models)
+
+
+def _from_bop(folder: Path, config: ModelsConfig) -> tuple[ObjectModel, ...]:
+    numbers: Sequence[int] = config.objects or _numbers(models_folder(folder))
+    models = read_bop_models(folder, numbers, config.mesh)
+    return tuple(models[number] for number in sorted(models))
+
+
+def _numbers(home: Path) -> list[int]:
+    known = read_models_info(home)
+    files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
+    found = sorted({int(name) for name in files if name.isdigit()} | set(known))
+    if not found:
+        raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
+    return found
+
+
+def _with_symmetries(
+    model: ObjectModel, config: ModelsConfig, tell: Callable[[str], None] | None
+) -> ObjectModel:
+    if not len(model.faces):
+        return model
+    found = symmetries_from_proposals(propose_symmetries(model))
+    if found.is_none:
+        return model
+    turns = 0 if found.discrete is None else len(found.discrete.R)
+    what = f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes"
+    if tell is not None and config.with_found_symmetries:
+        tell(f"{what}; each copy counts as right")
+    elif tell is not None:
+        tell(
+            f"{what}; if that is so, start with --symmetries found: no network can tell the "
+            "copies apart, and this training would fail"
+        )
+    return replace(model, symmetries=found) if config.with_found_symmetries else model

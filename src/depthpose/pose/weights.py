@@ -1,0 +1,173 @@
+"""Weights of the pose room on disk: one network, and every object that it knows, in one file."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.config import config_from_dict, config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.mesh import symmetries_from_bop, symmetries_to_bop
+from depthpose.pose.network import ResUNet, network_of
+from depthpose.pose.types import ObjectModel
+
+KIND = "geoposenet"
+_TENSORS = ("vertices_m", "faces", "normals", "keypoints_m")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseWeights:
+    """What a weights file of this room holds: enough to pose an object without its CAD file.
+
+    Attributes:
+        network: partial cloud to directions, in eval mode where it was read.
+        models: the objects; class k of the network is ``models[k]``.
+        cloud: how the clouds were made that the network was trained on.
+        refusal: when its estimates are withheld.
+        facts: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
+    """
+
+    network: ResUNet
+    models: tuple[ObjectModel, ...]
+    cloud: CloudConfig
+    refusal: RefusalConfig
+    facts: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        config = self.network.config
+        if len(self.models) != config.classes:
+            raise InputError(
+                f"the network knows {config.classes} classes, but {len(self.models)} models are "
+                "given; class k is models[k]. Give one model for each."
+            )
+        for model in self.models:
+            if len(model.keypoints_m) != config.keypoints:
+                raise InputError(
+                    f"the network points at {config.keypoints} keypoints, but object "
+                    f"{model.name!r} has {len(model.keypoints_m)}. Make the model with as many."
+                )
+        names = [model.name for model in self.models]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(
+                f"two models are called {twice[0]!r}; an object is found by its name. Rename one."
+            )
+
+
+def write_pose_weights(path: Path, weights: PoseWeights, *, with_half: bool = False) -> None:
+    """Write a network and its objects to one ``.safetensors`` file.
+
+    Args:
+        path: the file.
+        weights: what to write.
+        with_half: store the network's numbers with 16 bits: half the size. Models stay exact.
+    """
+    network = weights.network
+    state = {f"network.{name}": _half(t, with_half) for name, t in network.state_dict().items()}
+    for k, model in enumerate(weights.models):
+        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _TENSORS}
+    config = {
+        "network": config_to_dict(network.config),
+        "cloud": config_to_dict(weights.cloud),
+        "refusal": config_to_dict(weights.refusal),
+        "models": [_record_of(model) for model in weights.models],
+    }
+    facts = {**weights.facts, "norm_mode": network.config.norm}
+    save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=facts))
+
+
+def read_pose_weights(path: Path) -> PoseWeights:
+    """Read what :func:`write_pose_weights` wrote; 16-bit weights come back as 32-bit.
+
+    Raises:
+        InputError: no such weights, a part that is missing, or weights that do not fit their own
+            config.
+    """
+    checkpoint = read_checkpoint(path, KIND)
+    source = str(path)
+    parts = {name: _part(checkpoint, name, source) for name in ("network", "cloud", "refusal")}
+    records = checkpoint.config.get("models")
+    if not isinstance(records, list) or not records:
+        raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
+    network = dataclasses.replace(
+        checkpoint, config=parts["network"], state=_under(checkpoint, "network.")
+    )
+    models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
+    _refuse_strays(checkpoint, len(models), source)
+    return PoseWeights(
+        network=network_of(network, source),
+        models=models,
+        cloud=config_from_dict(parts["cloud"], CloudConfig, source=source),
+        refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
+        facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
+    )
+
+
+def _record_of(model: ObjectModel) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "number": model.number,
+        "diameter_m": model.diameter_m,
+        **symmetries_to_bop(model.symmetries),
+    }
+
+
+def _read_model(checkpoint: Checkpoint, k: int, source: str) -> ObjectModel:
+    record, state = checkpoint.config["models"][k], _under(checkpoint, f"models.{k}.")
+    lost = [name for name in _TENSORS if name not in state]
+    lost += [name for name in ("name", "number", "diameter_m") if name not in record]
+    if lost:
+        raise InputError(f"{source}: model {k} has no {lost[0]!r}; the file is of another version.")
+    vertices, faces = state["vertices_m"], state["faces"].long()
+    shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
+    if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
+        raise InputError(f"{source}: model {k} has tensors of shapes {shapes}; each is (n, 3).")
+    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+        raise InputError(
+            f"{source}: a face of model {k} names vertex {int(faces.max())} of {len(vertices)}; "
+            "the file is damaged."
+        )
+    return ObjectModel(
+        name=str(record["name"]),
+        number=int(record["number"]),
+        vertices_m=vertices,
+        faces=faces,
+        normals=state["normals"],
+        diameter_m=float(record["diameter_m"]),
+        keypoints_m=state["keypoints_m"],
+        symmetries=symmetries_from_bop(record, source=f"{source}: model {k}"),
+    )
+
+
+def _part(checkpoint: Checkpoint, name: str, source: str) -> Mapping[str, Any]:
+    part = checkpoint.config.get(name)
+    if not isinstance(part, Mapping):
+        raise InputError(f"{source}: its config has no {name!r}; the file is of another version.")
+    return part
+
+
+def _refuse_strays(checkpoint: Checkpoint, models: int, source: str) -> None:
+    known = ("network.", *(f"models.{k}." for k in range(models)))
+    strays = [name for name in checkpoint.state if not name.startswith(known)]
+    if strays:
+        raise InputError(f"{source}: tensor {strays[0]!r} is unexpected; it belongs to no part.")
+
+
+def _under(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
+    found = checkpoint.state.items()
+    return {name.removeprefix(prefix): t for name, t in found if name.startswith(prefix)}
+
+
+def _half(tensor: Tensor, with_half: bool) -> Tensor:
+    return tensor.to(torch.float16) if with_half and tensor.is_floating_point() else tensor
+
+
+def _small(tensor: Tensor) -> Tensor:
+    # A copy: two models may be made of the same tensor, which safetensors refuses to write.
+    return tensor.clone() if tensor.is_floating_point() else tensor.to(torch.int32, copy=True)

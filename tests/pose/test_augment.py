@@ -1,0 +1,185 @@
+"""Random changes that keep a pose true."""
+
+import pytest
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.pose.augment import (
+    hide,
+    measure,
+    misjudge_mask,
+    random_levels,
+    random_rotation,
+    whole,
+)
+from depthpose.pose.config import ObjectsConfig, SensorConfig
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_rotations_are_rotations_and_cover_the_sphere_evenly() -> None:
+    generator = _generator()
+    R = torch.stack([random_rotation(generator) for _ in range(2000)])
+    assert torch.allclose(R @ R.mT, torch.eye(3).double().expand(2000, 3, 3), atol=1e-12)
+    assert torch.allclose(torch.linalg.det(R), torch.ones(2000).double())
+    # A uniform rotation has mean 0 and every entry the variance 1/3.
+    assert R.mean(0).abs().max() < 0.05
+    assert (R.square().mean(0) - 1 / 3).abs().max() < 0.03
+
+
+def test_an_occluder_hides_exactly_its_share_and_stands_nearer() -> None:
+    silhouette = random_levels(60, 80, _generator(9)) < 0.3
+    depth_m = torch.where(silhouette, 0.8 + 0.1 * torch.rand(60, 80), 1.5)
+    for seed in range(40):
+        hidden_m, visible = hide(depth_m, silhouette, 0.3, _generator(seed))
+        everything = int(silhouette.sum())
+        # A wide pixel of equal level may be hidden with the last one.
+        assert abs(1 - int(visible.sum()) / everything - 0.3) < 0.02
+        assert not (visible & ~silhouette).any()
+        assert torch.equal(hidden_m[visible], depth_m[visible])
+        gone = silhouette & ~visible
+        assert bool((hidden_m[gone] < depth_m[gone]).all())
+
+
+def test_nothing_is_hidden_by_no_share() -> None:
+    silhouette = torch.ones(5, 6, dtype=torch.bool)
+    depth_m, visible = hide(torch.ones(5, 6), silhouette, 0.0, _generator())
+    assert torch.equal(depth_m, torch.ones(5, 6))
+    assert torch.equal(visible, silhouette)
+
+
+def test_a_mask_grows_and_shrinks_by_pixels() -> None:
+    mask = torch.zeros(20, 20, dtype=torch.bool)
+    mask[8:12, 8:12] = True
+    grown, shrunk = misjudge_mask(mask, 2), misjudge_mask(mask, -1)
+    assert int(grown.sum()) == 8 * 8
+    assert bool(grown[6:14, 6:14].all())
+    assert int(shrunk.sum()) == 2 * 2
+    assert bool(shrunk[9:11, 9:11].all())
+    assert torch.equal(misjudge_mask(mask, 0), mask)
+
+
+def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SensorConfig:
+    return SensorConfig(kinds=(kind,), noise=(noise, noise), missing=(missing, missing))  # pyright: ignore[reportArgumentType]
+
+
+def test_structured_light_reads_whole_steps_of_disparity() -> None:
+    wall_m = torch.full((50, 60), 1.1)
+    read_m = measure(wall_m, (572.0, 572.0), _sensor("structured light"), _generator())
+    steps = 8 * 572.0 * 0.075 / read_m
+    assert torch.allclose(steps, steps.round(), atol=1e-3)
+    assert len(torch.unique(read_m)) > 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "at_1_m", "at_2_m"),
+    [
+        ("structured light", 0.0012 + 0.0019 * 0.36, 0.0012 + 0.0019 * 2.56),
+        ("time of flight", 0.003, 0.009),
+        ("laser", 0.0005, 0.0005),
+    ],
+)
+def test_noise_is_that_of_the_sensor(kind: str, at_1_m: float, at_2_m: float) -> None:
+    for distance_m, sigma_m in ((1.0, at_1_m), (2.0, at_2_m)):
+        wall_m = torch.full((200, 200), distance_m)
+        # Fine steps of disparity, so that they add nothing to speak of.
+        read_m = measure(wall_m, (572.0, 1e6), _sensor(kind), _generator(3))
+        assert abs(float(read_m.std()) / sigma_m - 1) < 0.03
+        assert abs(float(read_m.mean()) - distance_m) < 3 * sigma_m / 200
+
+
+def test_no_sensor_changes_nothing() -> None:
+    depth_m = torch.rand(9, 9) + 0.5
+    assert torch.equal(measure(depth_m, (50.0, 50.0), _sensor("none"), _generator()), depth_m)
+
+
+def test_the_projector_leaves_a_shadow_beside_what_is_near() -> None:
+    depth_m = torch.full((20, 200), 1.0)
+    depth_m[:, 60:80] = 0.7
+    read_m = measure(depth_m, (572.0, 572.0), _sensor("structured light", 0.0), _generator())
+    lost = read_m.isnan()
+    # f b (1/0.7 - 1/1.0) = 18.4 px, less the tolerance; where the step itself is is not counted.
+    width = 572.0 * 0.075 * (1 / 0.7 - 1)
+    assert bool(lost[:, 82 : 80 + int(width) - 2].all())
+    assert not lost[:, 110:].any()
+    assert not lost[:, :58].any()
+
+
+def test_time_of_flight_mixes_depths_at_edges_alone() -> None:
+    depth_m = torch.full((40, 40), 1.0)
+    depth_m[:, 20:] = 2.0
+    read_m = measure(depth_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator())
+    assert bool(((read_m[:, 19] > 1) & (read_m[:, 19] < 2)).all())
+    assert torch.equal(read_m[:, :19], depth_m[:, :19])
+    assert torch.equal(read_m[:, 20:], depth_m[:, 20:])
+
+
+def test_grazing_surfaces_are_not_read_but_edges_are() -> None:
+    # z grows by 20 mm a pixel of 1/572 m at 1 m: 85 degrees.
+    ramp_m = 1.0 + 0.02 * torch.arange(1, 31.0).expand(10, 30)
+    assert bool(
+        measure(ramp_m, (572.0, 572.0), _sensor("laser", 0.0), _generator()).isfinite().all()
+    )
+    lost = measure(ramp_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator()).isnan()
+    assert bool(lost[:, :10].all())
+    step_m = torch.where(torch.arange(30) < 15, 1.0, 1.5).expand(10, 30)
+    read_m = measure(step_m, (572.0, 572.0), _sensor("laser", 0.0), _generator())
+    assert torch.equal(read_m, step_m)
+
+
+def test_readings_go_missing_at_about_the_share() -> None:
+    wall_m = torch.full((400, 400), 1.0)
+    shares = [
+        float(
+            measure(wall_m, (572.0, 572.0), _sensor("laser", 1.0, 0.2), _generator(seed))
+            .isnan()
+            .float()
+            .mean()
+        )
+        for seed in range(10)
+    ]
+    assert 0.15 < sum(shares) / 10 < 0.25
+
+
+def test_whole_numbers_stay_below_their_count() -> None:
+    generator = _generator()
+    assert {whole(generator, 3) for _ in range(50)} == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("knobs", "text"),
+    [
+        ({"number": 0}, "number is 0 and views 2000; both are 1 or more"),
+        ({"seed": -1}, "seed is -1; take 0 or more"),
+        ({"image_px": (0, 480)}, "image_px is (0, 480)"),
+        ({"occluded_share": 1.5}, "occluded_share is 1.5, but a share is 0 to 1"),
+        ({"mask_error_px": -1}, "mask_error_px is -1; take 0 to 20, usually 3"),
+        ({"distance_m": (1.1, 0.6)}, "the lower end first; usual is (0.6, 1.1), in metres"),
+        ({"distance_m": (600.0, 1100.0)}, "distance_m is (600.0, 1100.0), but it is a range"),
+        ({"resolution": (0.0, 1.0)}, "resolution is (0.0, 1.0), but it is a range within 0.05"),
+        (
+            {"occlusion": (0.0, 1.0)},
+            "occlusion is (0.0, 1.0), but it is a range within 0.0 to 0.95",
+        ),
+    ],
+)
+def test_bad_knobs_of_objects_are_refused(knobs: dict, text: str) -> None:
+    with pytest.raises(InputError) as error:
+        ObjectsConfig(**knobs)
+    assert text in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "text"),
+    [
+        ({"kinds": ()}, "kinds is (); name one or more of structured light, time of flight"),
+        ({"noise": (2.0, 1.0)}, "noise is (2.0, 1.0), but it is a range within 0.0 to 20.0"),
+        ({"missing": (0.0, 1.0)}, "missing is (0.0, 1.0), but it is a range within 0.0 to 0.9"),
+    ],
+)
+def test_bad_knobs_of_a_sensor_are_refused(knobs: dict, text: str) -> None:
+    with pytest.raises(InputError) as error:
+        SensorConfig(**knobs)
+    assert text in str(error.value)

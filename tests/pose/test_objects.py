@@ -1,0 +1,184 @@
+"""Made views: exact, reproducible, and what the knobs say."""
+
+import dataclasses
+
+import pytest
+import torch
+import trimesh
+
+from depthpose.core.errors import InputError
+from depthpose.core.raster import rasterize
+from depthpose.pose.augment import random_rotation
+from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.mesh import make_model
+from depthpose.pose.objects import Objects, surfel_triangles
+from depthpose.pose.objects.views import draw_view, gaze, make_shape, pose_of_middle, turn_view
+from depthpose.pose.types import ObjectModel, ViewSample
+
+_K = torch.tensor([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]], dtype=torch.float64)
+_CLEAN = {
+    "occluded_share": 0.0,
+    "with_background": False,
+    "mask_error_px": 0,
+    "sensor": SensorConfig(kinds=("none",)),
+}
+
+
+def _model(name: str = "part", shift_m: float = 0.0) -> ObjectModel:
+    """A box with a ball on a corner: no symmetry, and its origin is not its middle."""
+    box = trimesh.creation.box((0.10, 0.06, 0.03)).subdivide().subdivide()
+    ball = trimesh.creation.icosphere(2, 0.025)
+    ball.apply_translation((0.05, 0.03, 0.02))
+    both = trimesh.util.concatenate([box, ball])
+    assert isinstance(both, trimesh.Trimesh)
+    vertices = torch.tensor(both.vertices) + torch.tensor([shift_m, 0.02, 0.0])
+    return make_model(vertices, torch.tensor(both.faces), name=name)
+
+
+def _drawn_again(view: ViewSample, model: ObjectModel) -> torch.Tensor:
+    pose, given = view.truth.camera_from_model, view.input
+    height, width = given.depth_m.shape
+    return rasterize(pose.apply(model.triangles_m), given.K, width, height).depth_m
+
+
+@pytest.mark.parametrize("views", [None, 3])
+def test_a_clean_view_is_what_its_truth_looks_like(views: int | None) -> None:
+    model = _model(shift_m=0.1)
+    objects = Objects([model], ObjectsConfig(views=views, **_CLEAN))
+    for index in range(6):
+        view = objects.view(index)
+        again_m = _drawn_again(view, model)
+        assert torch.equal(view.input.mask, view.input.depth_m.isfinite())
+        differs = view.input.mask ^ again_m.isfinite()
+        # A turned view knows its silhouette to a pixel.
+        assert int(differs.sum()) <= (0 if views is None else 0.06 * int(view.input.mask.sum()))
+        error_m = (view.input.depth_m - again_m).abs()
+        error_m = error_m[error_m.isfinite()]
+        assert float(error_m.median()) < (1e-6 if views is None else 1e-4)
+        assert float(error_m.mean()) < (1e-6 if views is None else 5e-4)
+
+
+def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:
+    # Inverse depth is linear in the picture of a plane.
+    corners = torch.tensor([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0.0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    shape = make_shape(make_model(corners, faces, name="plate"))
+    tilt = gaze(torch.tensor([0.5, 0.3, 1.0], dtype=torch.float64), 0.4)
+    pose = pose_of_middle(shape, tilt, torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64))
+    turn = gaze(torch.tensor([-0.2, 0.3, 1.0], dtype=torch.float64), 2.0)
+    turned = turn_view(draw_view(shape, pose, _K), turn, shape, _K)
+    error_m = (turned.depth_m - draw_view(shape, turned.camera_from_model, _K).depth_m).abs()
+    inside = error_m[error_m.isfinite()]
+    assert len(inside) > 10000
+    # Beside the rim the nearest pixel is taken.
+    assert float(inside.quantile(0.9)) < 2e-6
+
+
+def test_gaze_turns_the_axis_to_the_direction() -> None:
+    for direction in ([0.0, 0.0, 1.0], [0.4, -0.2, 1.0], [-3.0, 1.0, 0.5]):
+        towards = torch.tensor(direction, dtype=torch.float64)
+        R = gaze(towards, 0.7)
+        assert torch.allclose(R[:, 2], towards / towards.norm(), atol=1e-12)
+        assert torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-12)
+        assert float(torch.linalg.det(R)) > 0
+
+
+def test_a_clean_cloud_lies_on_the_surface() -> None:
+    model = _model()
+    tree = trimesh.proximity.ProximityQuery(
+        trimesh.Trimesh(model.vertices_m.numpy(), model.faces.numpy(), process=False)
+    )
+    objects = Objects([model], ObjectsConfig(views=None, **_CLEAN))
+    sample = objects[0]
+    on_model = sample.truth.camera_from_model.inverse().apply(sample.input.points_m)
+    near = trimesh.points.PointCloud(on_model.numpy()[::20])
+    _, distance, _ = trimesh.proximity.closest_point_naive(tree._mesh, near.vertices)
+    assert float(distance.max()) < 2e-6
+
+
+def test_a_sample_depends_on_seed_and_index_alone() -> None:
+    models = [_model("first"), _model("second", 0.03)]
+    config = ObjectsConfig(views=2, number=20)
+    ahead, alone = Objects(models, config), Objects(models, config)
+    for index in range(12):
+        ahead.view(index)
+    first, second = ahead.view(7), alone.view(7)
+    assert torch.equal(first.input.mask, second.input.mask)
+    assert torch.equal(first.input.depth_m.nan_to_num(), second.input.depth_m.nan_to_num())
+    assert first.input.name == "second_0_000007"
+    assert first.input.object == "second"
+    other = Objects(models, dataclasses.replace(config, seed=1)).view(7)
+    assert not torch.equal(first.truth.camera_from_model.R, other.truth.camera_from_model.R)
+    assert torch.equal(alone[7].input.points_m, ahead.sample(7).input.points_m)
+
+
+def test_the_number_of_samples_is_kept() -> None:
+    objects = Objects([_model()], ObjectsConfig(number=2, views=1))
+    assert len(objects) == 2
+    with pytest.raises(IndexError, match="sample 2 of 2"):
+        objects[2]
+    assert len(objects.sample(2).input.points_m) > 0
+
+
+def test_visible_fractions_fill_their_range() -> None:
+    config = ObjectsConfig(views=4, occluded_share=1.0, occlusion=(0.2, 0.5))
+    objects = Objects([_model()], config)
+    found = [objects.view(i).truth.visible_fraction for i in range(30)]
+    given = [share for share in found if share is not None]
+    assert len(given) == 30
+    assert 0.48 < min(given) < 0.6
+    assert 0.7 < max(given) < 0.82
+
+
+def test_grown_masks_hold_what_is_behind() -> None:
+    knobs = {**_CLEAN, "with_background": True, "mask_error_px": 3, "resolution": (1.0, 1.0)}
+    model = _model()
+    objects = Objects([model], ObjectsConfig(views=None, **knobs))
+    grown = 0
+    for index in range(12):
+        view = objects.view(index)
+        shape = _drawn_again(view, model).isfinite()
+        grown += bool((view.input.mask & ~shape & view.input.depth_m.isfinite()).any())
+        is_object = shape & view.input.mask
+        error_m = view.input.depth_m[is_object] - _drawn_again(view, model)[is_object]
+        assert float(error_m.abs().max()) < 1e-6
+    assert grown >= 3
+
+
+def test_the_object_lies_whole_in_the_image() -> None:
+    config = ObjectsConfig(views=2, resolution=(1.0, 1.0))
+    objects = Objects([_model()], config)
+    for index in range(10):
+        view = objects.view(index)
+        pose = view.truth.camera_from_model
+        points = pose.apply(objects.models[0].vertices_m).double()
+        K = objects.intrinsics()
+        pixels = (points @ K.mT)[:, :2] / points[:, 2:]
+        assert float(pixels.min()) > 0
+        assert bool((pixels.amax(0) < torch.tensor([640, 480])).all())
+        assert 0.5 < float(pose.t_m.norm()) < 1.2
+
+
+def test_discs_stand_for_the_surface_that_points_were_taken_from() -> None:
+    ball = trimesh.creation.icosphere(4, 0.05)
+    mesh = make_model(torch.tensor(ball.vertices), torch.tensor(ball.faces), name="ball")
+    points = make_model(mesh.vertices_m, torch.empty(0, 3), name="points")
+    R = random_rotation(torch.Generator().manual_seed(1))
+    pose = pose_of_middle(make_shape(mesh), R, torch.tensor([0, 0, 0.5]).double())
+    drawn = [
+        rasterize((triangles.double() @ pose.R.mT + pose.t_m).float(), _K, 640, 480).depth_m
+        for triangles in (mesh.triangles_m, surfel_triangles(points))
+    ]
+    shapes = [depth.isfinite() for depth in drawn]
+    union, both = (shapes[0] | shapes[1]).sum(), (shapes[0] & shapes[1]).sum()
+    assert float(both / union) > 0.95
+    assert float((drawn[0] - drawn[1])[shapes[0] & shapes[1]].abs().median()) < 5e-4
+
+
+def test_errors_say_what_to_do() -> None:
+    with pytest.raises(InputError, match="there is no object to show; give one model at least"):
+        Objects([])
+    with pytest.raises(
+        InputError, match=r"the camera would stand in it\. Begin at 0\.[0-9]+ or farther"
+    ):
+        Objects([_model()], ObjectsConfig(distance_m=(0.06, 1.0)))

@@ -1,0 +1,152 @@
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_object import FACTS, bottle, bracket, tiny_weights
+
+from depthpose.cli import main
+from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+
+
+def assert_same_model(one: ObjectModel, other: ObjectModel) -> None:
+    assert (one.name, one.number, one.diameter_m) == (other.name, other.number, other.diameter_m)
+    for name in ("vertices_m", "faces", "normals", "keypoints_m"):
+        mine, theirs = getattr(one, name), getattr(other, name)
+        assert mine.dtype == theirs.dtype
+        assert torch.equal(mine, theirs)
+
+
+def turned() -> ObjectModel:
+    """Declare half a turn about z, which nothing here checks."""
+    half = Rigid(torch.diag(torch.tensor([-1.0, -1, 1]))[None], torch.tensor([[0.01, 0, 0]]))
+    return dataclasses.replace(bracket("turned"), symmetries=Symmetries(discrete=half))
+
+
+def test_network_and_objects_come_back_exactly(tmp_path: Path) -> None:
+    cloud = CloudConfig(voxel_m=0.005, max_points=None)
+    refusal = RefusalConfig(max_risk=0.2, bias=-1.5, slopes={"misfit": 2.0})
+    weights = tiny_weights(bracket(), bottle(), turned(), cloud=cloud, refusal=refusal)
+    write_pose_weights(tmp_path / "w.safetensors", weights)
+    again = read_pose_weights(tmp_path / "w.safetensors")
+    assert (again.cloud, again.refusal, again.facts) == (cloud, refusal, FACTS)
+    assert again.network.config == weights.network.config
+    assert not again.network.training
+    for name, tensor in weights.network.state_dict().items():
+        assert torch.equal(again.network.state_dict()[name], tensor)
+    for mine, theirs in zip(again.models, weights.models, strict=True):
+        assert_same_model(mine, theirs)
+    assert again.models[0].symmetries.is_none
+    assert again.models[1].symmetries.continuous[0].direction.tolist() == [0, 0, 1]
+    discrete = again.models[2].symmetries.discrete
+    assert discrete is not None
+    assert discrete.t_m.tolist() == [pytest.approx([0.01, 0, 0])]
+
+
+def test_half_precision_halves_the_network_and_keeps_models_exact(tmp_path: Path) -> None:
+    weights = tiny_weights(bracket())
+    for name, half in (("full", False), ("half", True)):
+        write_pose_weights(tmp_path / f"{name}.safetensors", weights, with_half=half)
+    again = read_pose_weights(tmp_path / "half.safetensors")
+    assert_same_model(again.models[0], weights.models[0])
+    state = again.network.state_dict()
+    for name, tensor in weights.network.state_dict().items():
+        assert state[name].dtype == tensor.dtype
+        torch.testing.assert_close(state[name], tensor, rtol=1e-3, atol=1e-4)
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("full", "half")]
+    numbers = sum(t.numel() for t in weights.network.parameters())
+    assert sizes[0] - sizes[1] == pytest.approx(2 * numbers, rel=0.05)
+
+
+def test_many_objects_stay_small(tmp_path: Path) -> None:
+    """21 models of 2,600 points and 4 meshes of 10,000 vertices, beside any network."""
+    few = tiny_weights(bracket()).models[0]
+    points = few.vertices_m.new_zeros(2600, 3)
+    cloud = dataclasses.replace(few, vertices_m=points, normals=points, faces=few.faces[:0])
+    vertices, faces = points.new_zeros(10_000, 3), torch.zeros(20_000, 3, dtype=torch.long)
+    mesh = dataclasses.replace(few, vertices_m=vertices, normals=vertices, faces=faces)
+    every = [dataclasses.replace(m, name=str(k)) for k, m in enumerate([cloud] * 21 + [mesh] * 4)]
+    path = tmp_path / "w.safetensors"
+    write_pose_weights(path, tiny_weights(*every))
+    assert path.stat().st_size < 4e6
+
+
+def test_the_command_line_knows_the_kind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_pose_weights(tmp_path / "mine.safetensors", tiny_weights(bracket(), bottle()))
+    assert main(["weights", "list", "--folder", str(tmp_path)]) == 0
+    assert "geoposenet" in capsys.readouterr().out
+    assert main(["weights", "show", str(tmp_path / "mine.safetensors")]) == 0
+    said = capsys.readouterr().out
+    assert "objects: bracket (7), bottle (0)" in said
+    assert "licence: MIT" in said
+    parameters = sum(p.numel() for p in tiny_weights(bracket(), bottle()).network.parameters())
+    assert f"parameters: {parameters}\n" in said
+
+
+def without(content: dict, name: str) -> dict:
+    return {key: value for key, value in content.items() if key != name}
+
+
+CHANGES: dict[str, Callable[[dict, dict], tuple[dict, dict]]] = {
+    "no network": lambda config, state: (without(config, "network"), state),
+    "no cloud": lambda config, state: (without(config, "cloud"), state),
+    "no models": lambda config, state: ({**config, "models": []}, state),
+    "no name": lambda config, state: ({**config, "models": [{"number": 1}]}, state),
+    "no faces": lambda config, state: (config, without(state, "models.0.faces")),
+    "wild face": lambda config, state: (
+        config, {**state, "models.0.faces": state["models.0.faces"] + 1000}),
+    "flat": lambda config, state: (
+        config, {**state, "models.0.keypoints_m": state["models.0.keypoints_m"][:, :2]}),
+    "stray": lambda config, state: (
+        config, {**state, "models.1.faces": state["models.0.faces"].clone()}),
+    "lost weight": lambda config, state: (config, without(state, "network.final.bias")),
+    "other cloud": lambda config, state: ({**config, "cloud": {"voxels_m": 1.0}}, state),
+}  # fmt: skip
+
+
+def broken(path: Path, change: str) -> Path:
+    """Write weights with one thing wrong."""
+    write_pose_weights(path, tiny_weights(bracket()))
+    found = read_checkpoint(path)
+    config, state = CHANGES[change](dict(found.config), dict(found.state))
+    save_checkpoint(path, Checkpoint(kind=found.kind, config=config, state=state))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ("no network", "its config has no 'network'"),
+        ("no cloud", "its config has no 'cloud'"),
+        ("no models", "its config lists no 'models'"),
+        ("no name", "model 0 has no 'name'"),
+        ("no faces", "model 0 has no 'faces'"),
+        ("wild face", "a face of model 0 names vertex 10"),
+        ("flat", "model 0 has tensors of shapes"),
+        ("stray", "tensor 'models.1.faces' is unexpected"),
+        ("lost weight", "final.bias is missing"),
+        ("other cloud", "unknown key 'voxels_m'"),
+    ],
+)
+def test_a_file_that_is_not_whole_is_refused(tmp_path: Path, change: str, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        read_pose_weights(broken(tmp_path / "w.safetensors", change))
+
+
+def test_objects_and_classes_must_agree() -> None:
+    weights = tiny_weights(bracket())
+    parts = {name: getattr(weights, name) for name in ("network", "cloud", "refusal", "facts")}
+    with pytest.raises(InputError, match="knows 1 classes, but 2 models"):
+        PoseWeights(models=(bracket(), bottle()), **parts)
+    with pytest.raises(InputError, match="8 keypoints, but object 'bracket' has 5"):
+        PoseWeights(models=(bracket(keypoints=5),), **parts)
+    with pytest.raises(InputError, match="two models are called 'bracket'"):
+        tiny_weights(bracket(), bracket())
