@@ -39,6 +39,8 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
         free_motions=torch.randn(1, 6, generator=generator),
         inlier_share=0.75,
         residual_m=0.002,
+        risk=0.125,
+        signals={"gap": 0.01, "far": 0.2},
         seconds={"network": 0.015, "voting": 0.007},
     )
 
@@ -75,19 +77,20 @@ def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> Non
 
 
 def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
+    by_votes = replace(answer("c", 1), seconds={}, risk=None)
     slow = replace(refusal(), seconds={"segmentation": 0.1})
     sent = [
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
         Prediction(estimate=slow, place=Place(1, 20, 5)),
-        Prediction(estimate=replace(answer("c", 1), seconds={}), place=Place(2, 0, 6)),
+        Prediction(estimate=by_votes, place=Place(2, 0, 6)),
     ]
     path = tmp_path / "ours_lm-test.csv"
     write_bop_results(path, sent)
     first, second = read_results(path)
     assert (first.scene_id, first.image_id, first.object_id) == (1, 20, 6)
     assert first.seconds == pytest.approx(0.122)
-    assert first.score == 0.75
-    assert second.seconds is None
+    assert first.score == 0.875
+    assert (second.seconds, second.score) == (None, 0.75)
     assert torch.allclose(first.camera_from_model.t_m, some_pose(0).t_m.double(), atol=1e-7)
     with pytest.raises(InputError, match="a: belongs to no scene of a BOP data set"):
         write_bop_results(path, [Prediction(estimate=answer())])
@@ -126,7 +129,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         ({"camera_from_model": None}, "an estimate that is ok has a camera_from_model"),
         ({"camera_from_model": flipped}, "camera_from_model is no rigid transform; write 4 rows"),
         ({"covariance": [[1.0, "x"]]}, "covariance is not rows of 6 numbers"),
-        ({"seconds": [0.1]}, "where stages to numbers belong"),
+        ({"seconds": [0.1]}, "where names to numbers belong"),
         ({"im_id": None}, "im_id is None, where a number of 0 or more belongs"),
     ):
         path.write_text(json.dumps([row | change]))

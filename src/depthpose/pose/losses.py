@@ -150,6 +150,7 @@ def model_point_loss(
     """
     moved = found.apply(points_m)
     # T_true S p for each symmetry S: (b, c, n, 3)
-    same = copies.apply(points_m[:, None])
-    wanted = Rigid(truth.R[:, None], truth.t_m[:, None]).apply(same)
+    every = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
+    true = Rigid(truth.R[:, None].expand_as(copies.R), truth.t_m[:, None].expand_as(copies.t_m))
+    wanted = true.apply(copies.apply(every))
     return (moved[:, None] - wanted).norm(dim=-1).mean(-1).amin(-1)

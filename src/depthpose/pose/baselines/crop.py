@@ -56,12 +56,13 @@ def cut_depth(
     mean_m = depth_m[is_seen].mean()
     relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
     relief = torch.where(is_seen, relief, EMPTY)
-    ray = torch.linalg.solve(view.K, torch.cat([middle_px, torch.ones(1)]).to(view.K))
+    K = view.K.to(depth_m)
+    ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
     return DepthCrop(
         image=_window(relief, middle_px, side_px, config.crop_px)[None],
         R=turn_onto(ray),
         middle_m=ray * mean_m,
-        side_m=side_px * mean_m / view.K[0, 0],
+        side_m=side_px * mean_m / K[0, 0],
     )
 
 

@@ -90,7 +90,13 @@ class FpfhRegistration:
         return cloud, features
 
     def _ransac(self, source: Any, features: Any) -> Any:  # noqa: ANN401
-        self._open3d.utility.random.seed(self.config.seed)
+        o3d = self._open3d
+        o3d.utility.random.seed(self.config.seed)
+        # It prints a line for each cloud of which few features are mutually nearest.
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return self._search(source, features)
+
+    def _search(self, source: Any, features: Any) -> Any:  # noqa: ANN401
         r = self._open3d.pipelines.registration
         limit_m = self.config.distance_voxels * self._voxel_m
         return r.registration_ransac_based_on_feature_matching(

@@ -28,6 +28,7 @@ from depthpose.pose.metrics import (
     translation_error_m,
     vsd,
 )
+from depthpose.pose.objects import drawn_triangles
 from depthpose.pose.types import ObjectModel
 
 BOP_WIDTH_PX = 640
@@ -43,6 +44,7 @@ class Ruler:
         diameter_m: of the table that was asked for.
         symmetries: motions of the model that leave it as it is, the identity first.
         is_adds: whether ADD-S decides a success.
+        triangles_m: what of it VSD draws; a model of points is drawn as discs.
         vsd_delta_m: see ``EvaluationConfig``; None: VSD is not measured.
     """
 
@@ -50,12 +52,8 @@ class Ruler:
     diameter_m: float
     symmetries: Rigid
     is_adds: bool
+    triangles_m: Float[Tensor, "f 3 3"]
     vsd_delta_m: float | None
-
-    @property
-    def can_draw(self) -> bool:
-        """Whether VSD is measured: a model of points has no surface to draw."""
-        return self.vsd_delta_m is not None and len(self.model.faces) > 0
 
 
 def make_ruler(
@@ -67,6 +65,7 @@ def make_ruler(
         diameter_m=diameter_m,
         symmetries=symmetry_transforms(model.symmetries),
         is_adds=is_adds,
+        triangles_m=drawn_triangles(model).double(),
         vsd_delta_m=vsd_delta_m,
     )
 
@@ -87,8 +86,8 @@ def measure(
     """
     if estimated is None:
         names = ("error_m", "adds_m", "mssd_m", "mspd_px", "rotation_deg", "translation_m")
-        nothing = torch.ones(10, dtype=torch.float64) if ruler.can_draw else None
-        return dict.fromkeys(names, math.inf), nothing
+        nothing = torch.ones(10, dtype=torch.float64)
+        return dict.fromkeys(names, math.inf), None if ruler.vsd_delta_m is None else nothing
     true, points = instance.camera_from_model, ruler.model.vertices_m
     adds = float(adds_m(estimated, true, points))
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
@@ -102,7 +101,9 @@ def measure(
         "rotation_deg": rotation_deg,
         "translation_m": translation,
     }
-    return row, _vsd(estimated, instance, ruler, depth_m) if ruler.can_draw else None
+    if ruler.vsd_delta_m is None:
+        return row, None
+    return row, _vsd(estimated, instance, ruler, depth_m)
 
 
 def _nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> tuple[float, float]:
@@ -120,44 +121,46 @@ def _vsd(
 ) -> Float[Tensor, "10"]:
     assert ruler.vsd_delta_m is not None
     poses = (estimated, instance.camera_from_model)
-    left, top, right, bottom = _window(poses, instance.K, ruler.model, depth_m)
+    left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
     # What neither pose covers has no say: only the window about both is drawn.
     K = instance.K.double().clone()
     K[0, 2] -= left
     K[1, 2] -= top
     window = depth_m[top:bottom, left:right]
-    view = View(depth_m=window, K=K, render=_renderer(ruler.model, K, window))
+    view = View(depth_m=window, K=K, render=_renderer(ruler.triangles_m, K, window))
     taus_m = [share * ruler.diameter_m for share in BOP_SHARES]
     return vsd(*poses, view, taus_m, ruler.vsd_delta_m)
 
 
 def _renderer(
-    model: ObjectModel, K: Float[Tensor, "3 3"], window: Float[Tensor, "h w"]
+    triangles_m: Float[Tensor, "f 3 3"], K: Float[Tensor, "3 3"], window: Float[Tensor, "h w"]
 ) -> Callable[[Rigid], Float[Tensor, "h w"]]:
     height, width = window.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
-        moved = Rigid(pose.R.double(), pose.t_m.double()).apply(model.vertices_m.double())
-        return rasterize(moved[model.faces], K, width, height, with_barycentric=False).depth_m
+        moved = _apply(pose, triangles_m)
+        return rasterize(moved, K, width, height, with_barycentric=False).depth_m
 
     return render
 
 
 def _window(
-    poses: tuple[Rigid, Rigid], K: Tensor, model: ObjectModel, depth_m: Float[Tensor, "h w"]
+    poses: tuple[Rigid, Rigid], K: Tensor, triangles_m: Tensor, depth_m: Float[Tensor, "h w"]
 ) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of what either pose covers; everything behind the camera."""
     height, width = depth_m.shape
-    points = [
-        Rigid(pose.R.double(), pose.t_m.double()).apply(model.vertices_m.double()) for pose in poses
-    ]
-    pixels = torch.cat([project(some, K.double()) for some in points])
+    points = torch.cat([_apply(pose, triangles_m).reshape(-1, 3) for pose in poses])
+    pixels = project(points, K.double())
     if not bool(pixels.isfinite().all()):
         return 0, 0, width, height
     low, high = pixels.amin(0) - _MARGIN_PX, pixels.amax(0) + _MARGIN_PX + 1
     left, top = (int(low[i].clamp(0, size - 1)) for i, size in enumerate((width, height)))
     right, bottom = (int(high[i].clamp(1, size)) for i, size in enumerate((width, height)))
     return left, top, max(right, left + 1), max(bottom, top + 1)
+
+
+def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:
+    return triangles_m @ pose.R.double().mT + pose.t_m.double()
 
 
 @lru_cache(maxsize=4)

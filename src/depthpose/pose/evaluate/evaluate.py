@@ -78,12 +78,12 @@ def evaluate(
     config = EvaluationConfig() if config is None else config
     found = match(dataset.instances, predictions, dataset.objects)
     _refuse_strangers(dataset, predictions, found)
-    rulers = _rulers(dataset, config)
+    rulers, stages = _rulers(dataset, config), _stages_of(predictions)
     rows: list[Row] = []
     vsd: dict[str, Float[Tensor, 10]] = {}
     for instance in progress(dataset.instances):
         estimate = found.get(instance.name)
-        row, errors = _instance_row(instance, estimate, rulers[instance.object_id])
+        row, errors = _instance_row(instance, estimate, rulers[instance.object_id], stages)
         rows.append(row)
         if errors is not None:
             vsd[instance.name] = errors
@@ -109,7 +109,7 @@ def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
 
 
 def _instance_row(
-    instance: Instance, estimate: PoseEstimate | None, ruler: Ruler
+    instance: Instance, estimate: PoseEstimate | None, ruler: Ruler, stages: list[str]
 ) -> tuple[Row, Float[Tensor, "10"] | None]:
     pose = None if estimate is None else estimate.camera_from_model
     errors, vsd = measure(pose, instance, ruler)
@@ -127,11 +127,17 @@ def _instance_row(
     row |= errors
     row["vsd"] = None if vsd is None else float(vsd.mean())
     seconds = {} if estimate is None else estimate.seconds
-    for stage in STAGES:
+    for stage in stages:
         row[f"ms_{stage}"] = 1000 * seconds[stage] if stage in seconds else None
     row["ms_total"] = 1000 * sum(seconds.values()) if seconds else None
     row["reason"] = "" if estimate is None else estimate.reason
     return row, vsd
+
+
+def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
+    """Stages in the order of work; what a method of its own calls otherwise comes last."""
+    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
+    return [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
 
 
 def _finite(value: object) -> object:

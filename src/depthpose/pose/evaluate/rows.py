@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.pose.metrics import BOP_PIXELS, BOP_SHARES, auc, average_recall
-from depthpose.pose.predictions import STAGES
 
 Row = dict[str, Any]
 _COUNTS = ("instances", "annotated")
@@ -104,9 +103,9 @@ def _recalls(rows: Sequence[Row], vsd: Mapping[str, Float[Tensor, "10"]]) -> Row
 def _times(rows: Sequence[Row]) -> Row:
     """Mean milliseconds of each stage over the instances that went through it, and of all."""
     found: Row = {}
-    for stage in (*STAGES, "total"):
-        values = [row[f"ms_{stage}"] for row in rows if row.get(f"ms_{stage}") is not None]
-        found[f"ms_{stage}"] = sum(values) / len(values) if values else None
+    for name in (name for name in rows[0] if name.startswith("ms_")):
+        values = [row[name] for row in rows if row[name] is not None]
+        found[name] = sum(values) / len(values) if values else None
     return found
 
 

@@ -1,11 +1,10 @@
-"""Estimates as files: ``poses.json`` keeps everything, BOP's csv the poses."""
+"""``poses.json``: every estimate and refusal with all that is known of it."""
 
 import math
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import torch
 from torch import Tensor
@@ -13,20 +12,16 @@ from torch import Tensor
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import claim_folder
-from depthpose.pose.bop import BopDataset, BopResult, Instance, read_results, write_results
+from depthpose.pose.bop import Instance
 from depthpose.pose.bop.parse import integer, number, read_rows
 from depthpose.pose.types import PoseEstimate, Status
 
 POSES = "poses.json"
-STAGES = ("segmentation", "network", "voting", "svd", "icp")
+STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
-_SAVE_EVERY = 200
 _ROTATION_SLACK = 1e-4
 _PLACE = ("scene_id", "im_id", "obj_id")
-
-Input = TypeVar("Input")
 
 
 class Place(NamedTuple):
@@ -50,69 +45,9 @@ class Prediction:
     place: Place | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Job(Generic[Input]):
-    """One thing to estimate: what it is called, where it belongs, and how its input is read.
-
-    Attributes:
-        name: that of the input: unique in a run.
-        read: gives the input; called only where the estimate is not there yet.
-        place: as :class:`Prediction` has it.
-    """
-
-    name: str
-    read: Callable[[], Input]
-    place: Place | None = None
-
-
 def place_of(instance: Instance) -> Place:
     """Say where an annotated object belongs."""
     return Place(instance.scene_id, instance.image_id, instance.object_id)
-
-
-def results_name(dataset: BopDataset) -> str:
-    """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
-    return f"depthpose_{dataset.folder.resolve().name}-{dataset.split}.csv"
-
-
-def predict(
-    estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
-    jobs: Iterable[Job[Input]],
-    folder: Path,
-    settings: dict[str, Any],
-    batch: int = 1,
-) -> Generator[str, None, None]:
-    """Estimate what is not finished yet, and yield each name; ``poses.json`` grows as it goes.
-
-    What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
-
-    Args:
-        estimate_many: gives an estimate for each input, of the same name.
-        jobs: all that there are to do, the finished ones too.
-        folder: where ``poses.json`` goes; refused if other settings made what it holds.
-        settings: what decides the results.
-        batch: how many inputs are handed over at once. Each then takes an equal share of the time.
-    """
-    claim_folder(folder, settings)
-    wanted = list(jobs)
-    done = {p.estimate.name: p for p in read_predictions(folder)} if is_started(folder) else {}
-    yield from (job.name for job in wanted if job.name in done)
-    left = [job for job in wanted if job.name not in done]
-    saved = len(done)
-    try:
-        for start in range(0, len(left), batch):
-            some = left[start : start + batch]
-            estimates = estimate_many([job.read() for job in some])
-            for job, estimate in zip(some, estimates, strict=True):
-                assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
-                done[job.name] = Prediction(estimate=estimate, place=job.place)
-                yield job.name
-            if len(done) >= saved + _SAVE_EVERY:
-                write_predictions(folder, done.values())
-                saved = len(done)
-    finally:
-        if len(done) > saved or not is_started(folder):
-            write_predictions(folder, done.values())
 
 
 def is_started(folder: Path) -> bool:
@@ -146,70 +81,14 @@ def read_predictions(folder: Path) -> list[Prediction]:
     return found
 
 
-def read_bop_results(path: Path) -> list[Prediction]:
-    """Read anybody's BOP csv as predictions.
-
-    A row has a share of its image's time; its score is kept as the share of votes that agree.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
-    results = read_results(path)
-    rows_of = Counter((result.scene_id, result.image_id) for result in results)
-    found: list[Prediction] = []
-    for row, result in enumerate(results, 1):
-        place = Place(result.scene_id, result.image_id, result.object_id)
-        whole_s = result.seconds
-        estimate = PoseEstimate(
-            name=f"row {row}",
-            object=f"obj_{result.object_id:06d}",
-            status="ok",
-            camera_from_model=result.camera_from_model,
-            inlier_share=result.score,
-            seconds={} if whole_s is None else {"image": whole_s / rows_of[place[:2]]},
-        )
-        found.append(Prediction(estimate=estimate, place=place))
-    return found
-
-
-def write_bop_results(path: Path, predictions: Iterable[Prediction]) -> None:
-    """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
-
-    Raises:
-        InputError: a pose belongs to no scene, or the disk refuses.
-    """
-    known = list(predictions)
-    seconds: dict[tuple[int, int], float] = {}
-    for prediction in known:
-        if prediction.place is not None:
-            image = prediction.place[:2]
-            spent = sum(prediction.estimate.seconds.values())
-            seconds[image] = seconds.get(image, 0.0) + spent
-    write_results(path, [_result(p, seconds) for p in known if p.estimate.is_ok])
-
-
 def score_of(estimate: PoseEstimate) -> float:
-    """Say how sure an estimate is, 0..1: the share of the votes that agree; 1 where unknown."""
+    """Say how sure an estimate is, 0..1: the chance of being right, where its risk is known.
+
+    Else the share of the votes that agree, or 1 where nothing is said.
+    """
+    if estimate.risk is not None:
+        return 1 - estimate.risk
     return 1.0 if estimate.inlier_share is None else estimate.inlier_share
-
-
-def _result(prediction: Prediction, seconds: dict[tuple[int, int], float]) -> BopResult:
-    pose, place = prediction.estimate.camera_from_model, prediction.place
-    if place is None:
-        raise InputError(
-            f"{prediction.estimate.name}: belongs to no scene of a BOP data set, and its csv is of "
-            "such; leave it out"
-        )
-    assert pose is not None
-    spent_s = seconds[place[:2]]
-    return BopResult(
-        scene_id=place.scene_id,
-        image_id=place.image_id,
-        object_id=place.object_id,
-        score=score_of(prediction.estimate),
-        camera_from_model=pose,
-        seconds=spent_s if spent_s > 0 else None,
-    )
 
 
 def _row(prediction: Prediction) -> dict[str, Any]:
@@ -222,11 +101,11 @@ def _row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    for name in ("inlier_share", "residual_m"):
+    for name in ("inlier_share", "residual_m", "risk"):
         value: float | None = getattr(estimate, name)
         # JSON has no infinity, and nothing near the surface is no distance.
         row[name] = value if value is not None and math.isfinite(value) else None
-    return row | {"seconds": dict(estimate.seconds)}
+    return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
 
 
 def _matrix(pose: Rigid) -> list[list[float]]:
@@ -256,7 +135,9 @@ def _prediction(row: dict[str, Any], source: str) -> Prediction:
         free_motions=_table(row, "free_motions", 6, source),
         inlier_share=_optional(row, "inlier_share", source),
         residual_m=_optional(row, "residual_m", source),
-        seconds=_seconds(row, source),
+        risk=_optional(row, "risk", source),
+        signals=_named(row, "signals", source),
+        seconds=_named(row, "seconds", source),
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
@@ -301,8 +182,8 @@ def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
     return None if row.get(key) is None else number(row, key, None, source)
 
 
-def _seconds(row: dict[str, Any], source: str) -> dict[str, float]:
-    spent = row.get("seconds", {})
-    if not isinstance(spent, dict):
-        raise InputError(f"{source}: seconds is {spent!r}, where stages to numbers belong")
-    return {str(stage): number(spent, stage, None, source) for stage in spent}
+def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
+    found = row.get(key, {})
+    if not isinstance(found, dict):
+        raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
+    return {str(name): number(found, name, None, source) for name in found}
