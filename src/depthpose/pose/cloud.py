@@ -45,17 +45,26 @@ def cloud_from_depth(
     Raises:
         InputError: mask and depth differ in size.
     """
-    if depth_m.shape != mask.shape:
-        raise InputError(
-            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
-            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
-        )
+    refuse_other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     points_m = back_project(depth_m, K)[is_read]
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+
+
+def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
+    """Refuse a mask that is not of this depth image.
+
+    Raises:
+        InputError: mask and depth differ in size.
+    """
+    if depth_m.shape != mask.shape:
+        raise InputError(
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+        )
 
 
 def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:

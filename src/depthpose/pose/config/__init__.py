@@ -2,6 +2,9 @@
 
 from depthpose.pose.config.estimate import EstimateConfig as EstimateConfig
 from depthpose.pose.config.estimate import RefusalConfig as RefusalConfig
+from depthpose.pose.config.evaluation import DiameterTable as DiameterTable
+from depthpose.pose.config.evaluation import EvaluationConfig as EvaluationConfig
+from depthpose.pose.config.evaluation import SymmetryRule as SymmetryRule
 from depthpose.pose.config.geometry import METRES as METRES
 from depthpose.pose.config.geometry import CloudConfig as CloudConfig
 from depthpose.pose.config.geometry import IcpConfig as IcpConfig
