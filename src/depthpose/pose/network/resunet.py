@@ -121,6 +121,21 @@ class ResUNet(nn.Module):
             answers[mine] = self._answer(features[mine], number)
         return answers
 
+    def directions(
+        self,
+        points_m: Float[Tensor, "points 3"],  # noqa: ARG002 - the grid says where they are
+        coordinates: Int[Tensor, "points 4"],
+        class_of_point: Int[Tensor, " points"],
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers.
+
+        Args:
+            points_m: of all clouds, one cloud after the other.
+            coordinates: (cloud, x, y, z) of each point's voxel.
+            class_of_point: which object each point belongs to.
+        """
+        return self.forward_classes(Voxels.from_points(coordinates), class_of_point)
+
     def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints components"]:
         assert self.final.bias is not None
         assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
