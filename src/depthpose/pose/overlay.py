@@ -40,10 +40,12 @@ def draw_pose(
         is_true: draw the box alone, green and dashed, as the truth beside an estimate; an estimate
             is blue.
     """
-    ends_px = project(pose.apply(box_edges(model).flatten(0, 1)), K).unflatten(0, (12, 2))
+    pose = Rigid(pose.R.double(), pose.t_m.double())
+    ends_m = pose.apply(box_edges(model).double().flatten(0, 1))
+    ends_px = project(ends_m, K).unflatten(0, (12, 2))
     if is_true:
         return draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
-    triangles = drawn_triangles(model).to(pose.R)
+    triangles = drawn_triangles(model).double()
     moved = pose.apply(triangles.flatten(0, 1)).unflatten(0, (-1, 3))
     seen = rasterize(moved, K, image.shape[2], image.shape[1], with_barycentric=False)
     return draw_lines(draw_outline(image, seen.depth_m.isfinite(), FOUND), ends_px, FOUND)
