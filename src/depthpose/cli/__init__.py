@@ -31,6 +31,8 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose evaluate": ("pose_measures:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of the thesis: published rows, ours, difference"),
     "figure": ("reproduce:figure", "a figure of the thesis from your frames and weights"),
 }
