@@ -101,7 +101,7 @@ class TrainingClouds:
             if refusal_of(points, self.cloud) is None:
                 return self._voxelised(sample, generator)
         raise InputError(
-            f"{_TRIES} samples of {sample.input.object!r} in a row have fewer than "
+            f"ticket {ticket}: {_TRIES} samples in a row have fewer than "
             f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
@@ -121,9 +121,7 @@ class TrainingClouds:
         return _rolled(sample, angle) if self.frames.with_roll else sample
 
     def _voxelised(self, sample: CloudSample, generator: torch.Generator) -> Cloud:
-        return voxelised_cloud(
-            sample, self._class_of[sample.input.object], self.cloud, generator
-        )
+        return voxelised_cloud(sample, self._class_of[sample.input.object], self.cloud, generator)
 
 
 def voxelised_cloud(

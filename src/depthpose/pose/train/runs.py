@@ -48,9 +48,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.tell)
     config = dataclasses.replace(config, network=_sized(config.network, config, models))
-    clouds = TrainingClouds(
-        models, config.objects, config.frames, config.cloud, config.loop.seed
-    )
+    clouds = TrainingClouds(models, config.objects, config.frames, config.cloud, config.loop.seed)
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
     network = ResUNet(config.network)
     if config.start is not None:
@@ -68,9 +66,7 @@ STAGES = {"pose": (PoseTraining, train_pose)}
 def _sized(
     network: ResUNetConfig, config: PoseTraining, models: tuple[ObjectModel, ...]
 ) -> ResUNetConfig:
-    return dataclasses.replace(
-        network, classes=len(models), keypoints=config.models.mesh.keypoints
-    )
+    return dataclasses.replace(network, classes=len(models), keypoints=config.models.mesh.keypoints)
 
 
 def _claim(config: PoseTraining, run: Run) -> None:
