@@ -14,13 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from real_poses import bunny_cases, lm_cases
 from torch import Tensor
 
-from depthpose.core.files import read_cloud
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.bop import open_bop
-from depthpose.pose.mesh import read_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import prepare_surface, refine_pose
 from depthpose.pose.types import ObjectModel
@@ -31,20 +28,12 @@ Case = tuple[str, Tensor, Rigid, ObjectModel]
 
 def cases_in(folder: Path) -> list[Case]:
     """The two instances of LineMOD and three scans of the bunny, with their poses."""
-    data = open_bop(folder / "lm")
     cases: list[Case] = []
-    for sample, instance in zip((data[0], data[1]), data.instances, strict=True):
-        model = data.objects[instance.object_id]
-        cases.append((model.name, sample.input.points_m, sample.truth.camera_from_model, model))
-    bunny = read_model(folder / "bunny/model/bun_zipper_res2.ply", "m")
-    for line in (folder / "bunny/bun.conf").read_text().splitlines():
-        words = line.split()
-        if words[:1] == ["bmesh"] and words[1] in ("bun000.ply", "bun045.ply", "bun180.ply"):
-            t, q = np.array(words[2:5], float), np.array(words[5:9], float)
-            R = Rotation.from_quat(q).as_matrix()
-            true = Rigid(torch.from_numpy(R), torch.from_numpy(-R @ t))
-            cloud = read_cloud(folder / "bunny/scans" / words[1]).points[::20]
-            cases.append((words[1], cloud, true, bunny))
+    for case in (*lm_cases(folder), *bunny_cases(folder, every=20)):
+        if not case.name.endswith(("090", "270")):
+            pose = case.sample.truth.camera_from_model
+            pose = Rigid(pose.R.double(), pose.t_m.double())
+            cases.append((case.name, case.sample.input.points_m, pose, case.model))
     return cases
 
 

@@ -5,11 +5,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from depthpose.depth.estimator import FakestereoNet as FakestereoNet
+    from depthpose.pose.estimator import GeoPoseNet as GeoPoseNet
 
 __version__ = "0.1.0"
-__all__ = ["FakestereoNet", "__version__"]
+__all__ = ["FakestereoNet", "GeoPoseNet", "__version__"]
 
-_HOMES = {"FakestereoNet": "depthpose.depth.estimator"}
+_HOMES = {
+    "FakestereoNet": "depthpose.depth.estimator",
+    "GeoPoseNet": "depthpose.pose.estimator",
+}
 
 
 def __getattr__(name: str) -> object:

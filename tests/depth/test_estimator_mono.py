@@ -8,10 +8,11 @@ from torch import Tensor
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import LicenceNotice, resize_image
+from depthpose.depth.estimator import resize_image
 from depthpose.depth.stereo import CallableMatcher, PSMNet
 from depthpose.depth.synthesis import Synthesiser, UNetGenerator
 from depthpose.depth.weights import write_depth_weights

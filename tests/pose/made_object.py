@@ -1,9 +1,16 @@
 """An object whose sides all differ, its views, and a network that answers what a test says."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from depthpose.core.camera import back_project
+from depthpose.core.raster import rasterize
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.prepare import Prepared
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
@@ -21,7 +28,7 @@ def box_faces() -> tuple[Tensor, Tensor]:
 
 
 def bracket(name: str = "bracket", keypoints: int = 8) -> ObjectModel:
-    """Three boxes of different lengths that meet in a corner, 20 cm long: no two sides are alike."""
+    """Three boxes of different lengths that meet in a corner, 20 cm long, of no two equal sides."""
     corners, faces = box_faces()
     parts = [((0.2, 0.06, 0.05), (0.0, 0.0, 0.0)), ((0.05, 0.12, 0.04), (-0.075, 0.07, 0.0)),
              ((0.04, 0.05, 0.09), (0.06, 0.0, 0.06))]  # fmt: skip
@@ -49,11 +56,70 @@ def bottle(name: str = "bottle") -> ObjectModel:
     )
 
 
-def tiny_weights(*models: ObjectModel, **changes: object) -> PoseWeights:
+def tiny_weights(*models: ObjectModel, **changes: Any) -> PoseWeights:  # noqa: ANN401
     """A network of a few numbers that has learnt nothing, with its objects."""
     torch.manual_seed(0)
-    widths = {"encoder": (4, 6, 8, 10), "decoder": (5, 6, 7, 8)}
-    sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m), "first_kernel": 3}
-    network = ResUNet(ResUNetConfig(**widths, **sizes)).eval()
+    config = ResUNetConfig(
+        classes=len(models),
+        keypoints=len(models[0].keypoints_m),
+        first_kernel=3,
+        encoder=(4, 6, 8, 10),
+        decoder=(5, 6, 7, 8),
+    )
     parts = {"cloud": CloudConfig(), "refusal": RefusalConfig(), "facts": FACTS, **changes}
-    return PoseWeights(network=network, models=models, **parts)  # pyright: ignore[reportArgumentType]
+    return PoseWeights(network=ResUNet(config).eval(), models=models, **parts)
+
+
+K = torch.tensor([[500.0, 0, 160], [0, 500, 120], [0, 0, 1]], dtype=torch.float64)
+"""Of the views here: 320 x 240 pixels."""
+
+
+def pose_at(x_m: float = 0.0, z_m: float = 0.8, seed: int = 0) -> Rigid:
+    """A pose before the camera, turned by chance."""
+    generator = torch.Generator().manual_seed(seed)
+    q, r = torch.linalg.qr(torch.randn(3, 3, generator=generator))
+    R = q * r.diagonal().sign()
+    R = R * torch.linalg.det(R).sign()
+    return Rigid(R, torch.tensor([x_m, 0.0, z_m]))
+
+
+def view_of(model: ObjectModel, *poses: Rigid) -> tuple[Tensor, Tensor]:
+    """Depth image [m, NaN where nothing is] and mask of some instances of one object."""
+    triangles = torch.cat([pose.apply(model.vertices_m)[model.faces] for pose in poses])
+    depth_m = rasterize(triangles, K, 320, 240).depth_m
+    return depth_m, depth_m.isfinite()
+
+
+def cloud_of(model: ObjectModel, pose: Rigid) -> Tensor:
+    """What a camera sees of one object, without noise."""
+    depth_m, mask = view_of(model, pose)
+    return back_project(depth_m, K)[mask]
+
+
+class Oracle(GeoPoseNet):
+    """The estimator with true directions in place of the network's: off by noise, some wrong.
+
+    The truth of a cloud is the pose whose origin is nearest to it.
+    """
+
+    def __init__(self, weights: PoseWeights, truths: list[Rigid], **changes: Any) -> None:  # noqa: ANN401
+        super().__init__(weights, changes.get("config"))
+        self.truths = truths
+        self.noise = changes.get("noise", 0.0)
+        self.wrong = changes.get("wrong", 0.0)
+        self.calls: list[int] = []
+
+    def _directions(self, clouds: list[Prepared], numbers: list[int]) -> tuple[list[Tensor], float]:
+        self.calls.append(len(clouds))
+        return [self._true(c.points_m, n) for c, n in zip(clouds, numbers, strict=True)], 0.01
+
+    def _true(self, points_m: Tensor, number: int) -> Tensor:
+        middle = points_m.mean(0)
+        pose = min(self.truths, key=lambda truth: float((truth.t_m - middle).norm()))
+        keypoints_m = pose.apply(self.weights.models[number].keypoints_m)
+        directions = keypoints_m[None] - points_m[:, None]
+        directions = directions / directions.norm(dim=-1, keepdim=True)
+        generator = torch.Generator().manual_seed(1)
+        noise = torch.randn(directions.shape, generator=generator)
+        is_wrong = torch.rand(len(points_m), generator=generator) < self.wrong
+        return torch.where(is_wrong[:, None, None], noise, directions + self.noise * noise)

@@ -10,11 +10,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import (
     BopResult,
+    Detection,
     decode_rle,
     encode_rle,
     read_detections,
     read_results,
     read_targets,
+    write_detections,
     write_results,
 )
 from depthpose.pose.bop.dataset import read_mask
@@ -83,6 +85,20 @@ def test_run_lengths_are_coco_s(tmp_path: Path) -> None:
         (found,) = read_detections(tmp_path / "d.json")
         assert torch.equal(found.mask, mask)
         assert (found.object_id, found.seconds) == (3, 0.1)
+
+
+def test_written_detections_come_back(tmp_path: Path) -> None:
+    mask = torch.zeros(5, 7, dtype=torch.bool)
+    mask[1:3, 2:6] = True
+    empty = Detection(scene_id=1, image_id=2, object_id=5, score=0.1,
+                      segmentation=encode_rle(mask & False))  # fmt: skip
+    given = Detection(scene_id=3, image_id=4, object_id=6, score=0.75,
+                      segmentation=encode_rle(mask), seconds=0.5)  # fmt: skip
+    write_detections(tmp_path / "d.json", [given, empty])
+    found = read_detections(tmp_path / "d.json")
+    assert [vars(d) for d in found] == [vars(given), vars(empty)]
+    boxes = [row["bbox"] for row in json.loads((tmp_path / "d.json").read_text())]
+    assert boxes == [[2, 1, 4, 2], [-1, -1, -1, -1]]
 
 
 def test_damaged_detections_are_refused(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf"]],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18"]],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -69,7 +69,8 @@ def import_weights(
 
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
-            MinkowskiEngine stores it.
+            MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
+            can start from (.pth of tensors or .safetensors).
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample, which no file records:
@@ -82,6 +83,10 @@ def import_weights(
         from depthpose.pose.network import import_fcgf
 
         import_fcgf(file, out, classes=classes)
+    elif kind == "resnet18":
+        from depthpose.pose.resnet import import_resnet18
+
+        import_resnet18(file, out)
     else:
         from depthpose.core.errors import InputError
         from depthpose.depth.stereo import import_psmnet

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,10 @@ from depthpose.core.files import atomic_write
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
+
+
+class LicenceNotice(UserWarning):
+    """Weights whose terms bind whoever uses them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,17 +66,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
         InputError: missing, truncated, not safetensors, without our metadata, or of another kind.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such weights file.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = dict(file.metadata() or {})
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
-        raise InputError(
-            f"{path}: not a readable safetensors file ({error}). A published checkpoint is brought "
-            "in by 'depthpose weights import'."
-        ) from error
+    state, metadata = _read_safetensors(path)
     return _interpreted(path, metadata, state, kind)
 
 
@@ -126,6 +121,16 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
     return content
 
 
+def read_published(path: Path) -> Mapping[str, Any]:
+    """Read somebody else's checkpoint by its ending: safetensors, or else a PyTorch file.
+
+    Raises:
+        InputError: missing, damaged, or holding pickled code.
+    """
+    path = Path(path)
+    return _read_safetensors(path)[0] if path.suffix == ".safetensors" else read_torch_file(path)
+
+
 def find_weights(name: str | Path) -> Path:
     """Find a weights file by its path, or by the name of weights that came with the package.
 
@@ -144,10 +149,30 @@ def find_weights(name: str | Path) -> Path:
     )
 
 
+def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
+    """Warn of terms that bind whoever uses the weights, where their card has any."""
+    if terms := facts.get("terms", ""):
+        warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
+
+
 def file_sha256(path: Path) -> str:
     """Fingerprint a file; it stands beside every number that the file made."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such weights file.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = dict(file.metadata() or {})
+            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{path}: not a readable safetensors file ({error}). A published checkpoint is brought "
+            "in by 'depthpose weights import'."
+        ) from error
 
 
 def _interpreted(

@@ -1,6 +1,5 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from depthpose.core.camera import (
     check_rectified,
     read_camera,
 )
-from depthpose.core.checkpoint import find_weights
+from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.config import MatcherConfig, SGBMConfig
@@ -32,10 +31,6 @@ from depthpose.depth.weights import DepthWeights, read_depth_weights
 
 Picture = str | Path | Float[Tensor, "3 _ _"] | UInt8[np.ndarray, "_ _ 3"]
 """A file, a tensor of RGB in [0, 1], or an array of 8-bit RGB."""
-
-
-class LicenceNotice(UserWarning):
-    """Weights whose terms bind whoever uses them."""
 
 
 class FakestereoNet:
@@ -79,7 +74,7 @@ class FakestereoNet:
         found = None
         if weights is not None:
             found = read_depth_weights(find_weights(weights))
-            _say_terms(found)
+            say_terms(found.facts)
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = _choose_matcher(weights, found, matcher, config)
         if found is None or found.generator is None:
@@ -261,12 +256,6 @@ def _choose_matcher(
             "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
         )
     return PSMNetMatcher(found.matcher, run)
-
-
-def _say_terms(found: DepthWeights) -> None:
-    terms = found.facts.get("terms", "")
-    if terms:
-        warnings.warn(terms, LicenceNotice, stacklevel=3)
 
 
 def _usable_right(pair: StereoInput) -> Float[Tensor, "3 h w"]:

@@ -44,11 +44,7 @@ def cloud_from_depth(
     Raises:
         InputError: mask and depth differ in size.
     """
-    if depth_m.shape != mask.shape:
-        raise InputError(
-            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
-            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
-        )
+    refuse_other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     points_m = _lifted(depth_m, is_read, K)
     if diameter_m is None or len(points_m) == 0:
@@ -66,6 +62,19 @@ def _lifted(
     y = (v.to(depth_m) - cy) / fy
     x = (u.to(depth_m) - cx - skew * y) / fx
     return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
+
+
+def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
+    """Refuse a mask that is not of this depth image.
+
+    Raises:
+        InputError: mask and depth differ in size.
+    """
+    if depth_m.shape != mask.shape:
+        raise InputError(
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
+            f"{depth_m.shape[1]}x{depth_m.shape[0]}; give the mask of this very image"
+        )
 
 
 def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:

@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from depthpose.core.rigid import Rigid
+
 DirectionMode = Literal["mse", "cosine", "l1"]
 Directions = Float[Tensor, "points keypoints 3"]
 
@@ -115,3 +117,40 @@ def confidence_loss(
     if not len(logits):
         return logits.sum()
     return F.binary_cross_entropy_with_logits(logits, confidence_target(found, truth))
+
+
+def mask_loss(
+    logits: Float[Tensor, "b classes h w"], labels: Int[Tensor, "b h w"], object_weight: float
+) -> Float[Tensor, ""]:
+    """Cross entropy of each pixel; one of an object weighs ``object_weight`` times the background.
+
+    Args:
+        logits: class 0 is the background.
+        labels: the true class of each pixel.
+        object_weight: objects cover a few percent of an image; 1 lets the background rule.
+    """
+    weight = logits.new_full((logits.shape[1],), object_weight)
+    weight[0] = 1.0
+    return F.cross_entropy(logits, labels, weight)
+
+
+def model_point_loss(
+    found: Rigid, truth: Rigid, points_m: Float[Tensor, "b n 3"], copies: Rigid
+) -> Float[Tensor, " b"]:
+    """ADD [m] of each pose against the nearest symmetric copy of its truth.
+
+    The mean distance of model points, differentiable in the found pose. The copy is chosen once an
+    instance.
+
+    Args:
+        found: ``camera_from_model``, a batch.
+        truth: the same, annotated.
+        points_m: of each one's model.
+        copies: ``model_from_model`` of each one's object (b, c), the identity among them.
+    """
+    moved = found.apply(points_m)
+    # T_true S p for each symmetry S: (b, c, n, 3)
+    every = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
+    true = Rigid(truth.R[:, None].expand_as(copies.R), truth.t_m[:, None].expand_as(copies.t_m))
+    wanted = true.apply(copies.apply(every))
+    return (moved[:, None] - wanted).norm(dim=-1).mean(-1).amin(-1)

@@ -10,9 +10,15 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 
 Status = Literal[
-    "ok", "too few points", "votes do not meet", "keypoints do not fit", "not observable"
+    "ok",
+    "unusable input",
+    "too few points",
+    "votes do not meet",
+    "keypoints do not fit",
+    "not observable",
+    "doubtful",
 ]
-"""An answer, or why there is none."""
+"""An answer, or why there is none. Doubtful: nothing plainly wrong, but the risk is too great."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,6 +212,8 @@ class PoseEstimate:
             symmetry makes the variance infinite; no row where there is none.
         inlier_share: share of the votes that agree, 0..1.
         residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
+        risk: chance of being wrong, as the weights' refusal was calibrated; None where none was.
+        signals: what the risk is made of, by name; kept for refusals too.
         seconds: time of each stage.
     """
 
@@ -219,6 +227,8 @@ class PoseEstimate:
     free_motions: Float[Tensor, "m 6"] | None = None
     inlier_share: float | None = None
     residual_m: float | None = None
+    risk: float | None = None
+    signals: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -21,9 +21,16 @@ from depthpose.pose.bop.models import (
     read_bop_models,
     read_models_info,
 )
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth, refuse_other_size
 from depthpose.pose.config import CloudConfig, MeshConfig
-from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
+from depthpose.pose.types import (
+    CloudInput,
+    CloudSample,
+    ObjectModel,
+    PoseTruth,
+    ViewInput,
+    ViewSample,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,12 +83,39 @@ class BopDataset:
         Raises:
             InputError: a file is missing or damaged, or the mask does not fit the depth.
         """
-        model = self.objects[instance.object_id]
-        mask = read_instance_mask(instance) if mask is None else mask
-        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
-        points_m = cloud_from_depth(depth_m, mask, instance.K, model.diameter_m, self.cloud_config)
+        model, view = self.objects[instance.object_id], self.view(instance, mask)
+        given = view.input
+        points_m = cloud_from_depth(
+            given.depth_m, given.mask, given.K, model.diameter_m, self.cloud_config
+        )
         return CloudSample(
             input=CloudInput(name=instance.name, points_m=points_m, object=model.name),
+            truth=view.truth,
+        )
+
+    def view(
+        self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
+    ) -> ViewSample:
+        """Read the whole depth image of an instance, and its mask.
+
+        Args:
+            instance: one of ``instances``.
+            mask: predicted; None: the annotated one.
+
+        Raises:
+            InputError: a file is missing or damaged, or the mask does not fit the depth.
+        """
+        mask = read_instance_mask(instance) if mask is None else mask
+        depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
+        refuse_other_size(mask, depth_m)
+        return ViewSample(
+            input=ViewInput(
+                name=instance.name,
+                depth_m=depth_m,
+                mask=mask,
+                K=instance.K,
+                object=self.objects[instance.object_id].name,
+            ),
             truth=PoseTruth(
                 camera_from_model=instance.camera_from_model,
                 visible_fraction=instance.visible_fraction,

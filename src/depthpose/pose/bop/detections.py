@@ -1,5 +1,6 @@
 """Predicted masks as BOP shares them: a JSON list with COCO's run lengths."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -10,6 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.core.files import write_json
 from depthpose.core.files.images import MAX_PIXELS
 from depthpose.pose.bop.parse import integer, number, read_rows
 
@@ -50,6 +52,15 @@ def read_detections(path: str | Path) -> list[Detection]:
     return [_read(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
 
 
+def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
+    """Write detections as BOP shares them, run lengths as plain numbers.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    write_json(Path(path), [_row(detection) for detection in detections])
+
+
 def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
     """Turn run lengths, column by column and beginning with the background, into a mask."""
     values = np.arange(len(counts)) % 2 == 1
@@ -64,6 +75,28 @@ def encode_rle(mask: Bool[Tensor, "h w"]) -> tuple[tuple[int, ...], int, int]:
     runs = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
     starts_on_object = flat.size > 0 and bool(flat[0])
     return tuple([0, *runs] if starts_on_object else runs), mask.shape[0], mask.shape[1]
+
+
+def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
+    """Left, top, width and height; BOP writes -1 four times where there is nothing."""
+    rows, columns = mask.nonzero(as_tuple=True)
+    if len(rows) == 0:
+        return [-1] * 4
+    left, top = int(columns.min()), int(rows.min())
+    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]
+
+
+def _row(detection: Detection) -> dict[str, Any]:
+    counts, height, width = detection.segmentation
+    return {
+        "scene_id": detection.scene_id,
+        "image_id": detection.image_id,
+        "category_id": detection.object_id,
+        "score": detection.score,
+        "bbox": mask_box(detection.mask),
+        "segmentation": {"size": [height, width], "counts": list(counts)},
+        "time": -1.0 if detection.seconds is None else detection.seconds,
+    }
 
 
 def _read(row: dict[str, Any], source: str) -> Detection:

@@ -14,6 +14,7 @@ from torch import Tensor
 from depthpose.core.files import write_depth_png, write_image, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.rigid import Rigid
+from depthpose.pose.bop.detections import mask_box
 from depthpose.pose.mesh import symmetries_to_bop
 from depthpose.pose.types import ObjectModel
 
@@ -145,19 +146,10 @@ def _truth(shown: BopObject) -> dict[str, Any]:
 def _info(shown: BopObject, depth_m: Float[Tensor, "h w"]) -> dict[str, Any]:
     everything, visible = int(shown.silhouette.sum()), int(shown.visible.sum())
     return {
-        "bbox_obj": _box(shown.silhouette),
-        "bbox_visib": _box(shown.visible),
+        "bbox_obj": mask_box(shown.silhouette),
+        "bbox_visib": mask_box(shown.visible),
         "px_count_all": everything,
         "px_count_valid": int((shown.silhouette & depth_m.isfinite()).sum()),
         "px_count_visib": visible,
         "visib_fract": visible / everything if everything else 0.0,
     }
-
-
-def _box(mask: Bool[Tensor, "h w"]) -> list[int]:
-    """Left, top, width and height; BOP writes -1 four times where there is nothing."""
-    rows, columns = mask.nonzero(as_tuple=True)
-    if len(rows) == 0:
-        return [-1] * 4
-    left, top = int(columns.min()), int(rows.min())
-    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]

@@ -1,11 +1,15 @@
 """Every knob of the pose room that needs no torch: frozen dataclasses that refuse at birth."""
 
+from depthpose.pose.config.estimate import EstimateConfig as EstimateConfig
+from depthpose.pose.config.estimate import RefusalConfig as RefusalConfig
+from depthpose.pose.config.evaluation import DiameterTable as DiameterTable
+from depthpose.pose.config.evaluation import EvaluationConfig as EvaluationConfig
+from depthpose.pose.config.evaluation import SymmetryRule as SymmetryRule
 from depthpose.pose.config.geometry import METRES as METRES
 from depthpose.pose.config.geometry import CloudConfig as CloudConfig
 from depthpose.pose.config.geometry import IcpConfig as IcpConfig
 from depthpose.pose.config.geometry import InlierTest as InlierTest
 from depthpose.pose.config.geometry import MeshConfig as MeshConfig
-from depthpose.pose.config.geometry import RefusalConfig as RefusalConfig
 from depthpose.pose.config.geometry import Unit as Unit
 from depthpose.pose.config.geometry import VotingConfig as VotingConfig
 from depthpose.pose.config.geometry import VotingMethod as VotingMethod

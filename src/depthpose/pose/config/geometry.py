@@ -1,6 +1,6 @@
 """Every knob of the pose room's geometry: frozen dataclasses that refuse a value at birth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from depthpose.core.errors import InputError
@@ -162,35 +162,4 @@ class IcpConfig:
                 f"the distances go from {self.start_distance_diameters} to "
                 f"{self.end_distance_diameters} diameters, but the limit shrinks and stays "
                 "positive; take 0.1 and 0.05"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefusalConfig:
-    """When an estimate is withheld: one risk of being wrong, from signals that need no truth."""
-
-    max_risk: float = 0.5
-    """An estimate of a larger risk is refused; chosen on data by ``calibrate_refusal``."""
-
-    bias: float = 0.0
-    """Log odds of being wrong where every signal is 0."""
-
-    slopes: dict[str, float] = field(default_factory=dict)
-    """How much each signal adds to the log odds; none: no estimate is refused for its risk."""
-
-    max_sway_diameters: float = 0.15
-    """How far a point of the object may move, in diameters, at one standard deviation of the
-    direction that the cloud fixes least (declared symmetries apart); beyond, it is not observable.
-    """
-
-    def __post_init__(self) -> None:
-        """Refuse a risk that is no probability, and limits that refuse everything."""
-        if not 0 <= self.max_risk <= 1:
-            raise InputError(
-                f"max_risk is {self.max_risk}, but a risk lies between 0 and 1; 0.5 refuses "
-                "what is more likely wrong than right"
-            )
-        if not self.max_sway_diameters > 0:
-            raise InputError(
-                f"max_sway_diameters is {self.max_sway_diameters}, but no pose is exact; take 0.15"
             )

@@ -9,6 +9,8 @@ _LARGEST_SHARE = 1.5
 """A cloud is part of its object; noise and a grown mask may make it somewhat larger."""
 _SMALLEST_SHARE = 0.1
 """What is hidden to less than a tenth of the diameter cannot be posed anyway."""
+_LIKELY_SHARE = 0.3
+"""A cloud that is too large is taken for one of another unit if that makes it as long as this."""
 
 
 def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
@@ -33,7 +35,8 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     for factor, unit in _FACTORS.items():
         if _SMALLEST_SHARE <= share * factor <= _LARGEST_SHARE:
             return f"your model is {1 / share:.0f} times larger than the cloud: is it in {unit}?"
-        if _SMALLEST_SHARE <= share / factor <= _LARGEST_SHARE:
+        # Five times too large is a mask of more than the object sooner than a sliver in inches.
+        if _LIKELY_SHARE <= share / factor <= _LARGEST_SHARE:
             return f"your cloud is {share:.0f} times larger than the model: is it in {unit}?"
     relation = "larger" if share > 1 else "smaller"
     return (

@@ -108,11 +108,39 @@ class ResUNet(nn.Module):
         self, voxels: Voxels, number: int
     ) -> Float[Tensor, "points keypoints components"]:
         """Answer for one class alone, without computing the other classes' outputs."""
+        return self._answer(self.point_features(voxels), number)
+
+    def forward_classes(
+        self, voxels: Voxels, class_of_point: Int[Tensor, " points"]
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: several objects in one call."""
+        features = self.point_features(voxels)
+        answers = features.new_empty(len(features), self.config.keypoints, self.config.components)
+        for number in class_of_point.unique().tolist():
+            mine = class_of_point == number
+            answers[mine] = self._answer(features[mine], number)
+        return answers
+
+    def directions(
+        self,
+        points_m: Float[Tensor, "points 3"],  # noqa: ARG002 - the grid says where they are
+        coordinates: Int[Tensor, "points 4"],
+        class_of_point: Int[Tensor, " points"],
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers.
+
+        Args:
+            points_m: of all clouds, one cloud after the other.
+            coordinates: (cloud, x, y, z) of each point's voxel.
+            class_of_point: which object each point belongs to.
+        """
+        return self.forward_classes(Voxels.from_points(coordinates), class_of_point)
+
+    def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints components"]:
         assert self.final.bias is not None
         assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
         size = self.config.keypoints * self.config.components
         part = slice(number * size, (number + 1) * size)
-        features = self.point_features(voxels)
         outputs = features @ self.final.weight[0, :, part] + self.final.bias[part]
         return outputs.view(len(outputs), self.config.keypoints, self.config.components)
 

@@ -1,0 +1,115 @@
+"""Real instances of known pose: ours beside Open3D's FPFH + RANSAC + ICP, in one run.
+
+    python bench/pose_peers.py $DEPTHPOSE_DATA/pose --seeds 5 [--weights W.safetensors ...]
+
+``pip install 'depthpose[open3d]'`` first. Ours runs on the objects that the weights know. Seconds
+are of the wall, one thread each (``OMP_NUM_THREADS=1``); a model's preparation is not among them.
+Success is ADD (ADD-S where the table says so) below 10 % of the diameter; what is answered beyond
+is wrong, what is not answered refused.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from real_poses import RealCase, real_cases
+
+from depthpose.core.report import markdown_table, write_table
+from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
+from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.types import CloudInput, PoseEstimate
+
+POINTS = 2000
+Row = dict[str, Any]
+Method = Callable[[CloudInput], PoseEstimate]
+
+
+def judge(case: RealCase, estimate: PoseEstimate) -> Row:
+    """Errors of one estimate in diameters, and what they mean."""
+    row: Row = {
+        "metric": "ADD-S" if case.is_symmetric else "ADD",
+        "add": None, "adds": None, "success": False, "refused": not estimate.is_ok, "wrong": False,
+    }  # fmt: skip
+    if estimate.camera_from_model is None:
+        return row
+    step = max(1, len(case.model.vertices_m) // POINTS)
+    points_m = case.model.vertices_m[::step]
+    pair = (estimate.camera_from_model, case.sample.truth.camera_from_model, points_m)
+    row["add"] = float(add_m(*pair)) / case.model.diameter_m
+    row["adds"] = float(adds_m(*pair)) / case.model.diameter_m
+    row["success"] = row["adds" if case.is_symmetric else "add"] < 0.1
+    return row | {"wrong": not row["success"]}
+
+
+def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
+    """The classical peer for one model."""
+    icp = 0.0 if words.no_icp else FpfhConfig.icp_voxels
+    config = FpfhConfig(seed=seed, icp_voxels=icp, voxel_diameters=words.voxel)
+    return FpfhRegistration(case.model, config).estimate
+
+
+def run_method(
+    name: str, cases: Sequence[RealCase], make: Callable[[RealCase, int], Method], seeds: int
+) -> list[Row]:
+    """Pose every case with every seed."""
+    rows = []
+    for case in cases:
+        for seed in range(seeds):
+            method = make(case, seed)
+            began = time.perf_counter()
+            estimate = method(case.sample.input)
+            seconds = time.perf_counter() - began
+            row = {"instance": case.name, "method": name, "seed": seed, **judge(case, estimate)}
+            rows.append(row | {"seconds": seconds})
+    return rows
+
+
+def summary(rows: list[Row]) -> list[Row]:
+    """One row for each instance and method, over its seeds."""
+    groups: dict[tuple[object, object], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["instance"], row["method"]), []).append(row)
+    table = []
+    for (instance, method), group in groups.items():
+        shares = {
+            name: sum(bool(r[name]) for r in group) for name in ("success", "refused", "wrong")
+        }
+        key = "adds" if group[0]["metric"] == "ADD-S" else "add"
+        errors = sorted(float(r[key]) for r in group if r[key] is not None)
+        seconds = sorted(float(r["seconds"]) for r in group)
+        table.append({
+            "instance": instance, "method": method, "metric": group[0]["metric"],
+            "of": len(group), **shares,
+            "median error [diameters]": round(errors[len(errors) // 2], 4) if errors else None,
+            "median s": round(seconds[len(seconds) // 2], 3),
+        })  # fmt: skip
+    return table
+
+
+def main() -> None:
+    """Run the methods on the cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    default = Path(os.environ.get("DEPTHPOSE_DATA", ".")) / "pose"
+    parser.add_argument("samples", type=Path, nargs="?", default=default)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--only", default="", help="instances whose name contains this")
+    parser.add_argument("--voxel", type=float, default=FpfhConfig.voxel_diameters)
+    parser.add_argument("--no-icp", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("out/pose_peers"))
+    words = parser.parse_args()
+    torch.set_num_threads(1)
+    cases = [case for case in real_cases(words.samples) if words.only in case.name]
+    rows = run_method(
+        "Open3D FPFH + RANSAC" + ("" if words.no_icp else " + ICP"), cases,
+        lambda case, seed: open3d_method(case, seed, words), words.seeds,
+    )  # fmt: skip
+    write_table(words.out, rows)
+    print(markdown_table(summary(rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Every knob of the baselines."""
+
+from dataclasses import dataclass
+
+from depthpose.core.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImageConfig:
+    """A masked crop of the depth image, regressed to a pose."""
+
+    classes: int = 1
+    """Objects that one network knows."""
+
+    crop_px: int = 128
+    """Side of the crop that the network sees."""
+
+    margin: float = 1.1
+    """The crop is so many times as wide as the object's box."""
+
+    contrast: float = 0.1
+    """The crop is divided by its mean depth; this much more or less than the mean is 1 or -1."""
+
+    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    """Channels of the encoder's stages: those of ResNet-18."""
+
+    min_points: int = 16
+    """Fewer masked pixels with a depth are refused, not posed."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if self.classes < 1 or min(self.widths) < 1 or self.min_points < 1:
+            raise InputError(
+                f"classes is {self.classes}, widths {self.widths} and min_points "
+                f"{self.min_points}; all are 1 or more"
+            )
+        if self.crop_px < 32:
+            raise InputError(
+                f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take 128"
+            )
+        if not (self.margin >= 1 and self.contrast > 0):
+            raise InputError(
+                f"margin is {self.margin} and contrast {self.contrast}; take 1.1 and 0.1"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointNetConfig:
+    """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
+
+    classes: int = 13
+    """Objects that one network knows."""
+
+    keypoints: int = 8
+    """Keypoints of each object."""
+
+    with_transforms: bool = True
+    """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
+
+    with_confidence: bool = False
+    """A fourth output beside each direction: the logit of how far to trust it."""
+
+    unit_m: float = 0.1
+    """Points are given to the network in units of so many metres: of order one for an object."""
+
+    local: tuple[int, int] = (64, 64)
+    """Channels of a point by itself."""
+
+    pooled: tuple[int, int, int] = (64, 128, 1024)
+    """Channels on the way to the maximum over all points."""
+
+    head: tuple[int, int, int] = (512, 256, 128)
+    """Channels of a point beside that maximum."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if min(self.classes, self.keypoints, *self.local, *self.pooled, *self.head) < 1:
+            raise InputError(
+                f"classes {self.classes}, keypoints {self.keypoints} and channels {self.local}, "
+                f"{self.pooled}, {self.head} are all 1 or more"
+            )
+        if not self.unit_m > 0:
+            raise InputError(f"unit_m is {self.unit_m}; take 0.1")
+
+    @property
+    def components(self) -> int:
+        """Numbers for each point and keypoint: a direction, and maybe a logit."""
+        return 4 if self.with_confidence else 3
+
+    @property
+    def outputs(self) -> int:
+        """Channels of the last layer."""
+        return self.classes * self.keypoints * self.components
+
+
+@dataclass(frozen=True, kw_only=True)
+class FpfhConfig:
+    """FPFH features, RANSAC and ICP of Open3D. Lengths are in voxels, as its tutorial has them."""
+
+    voxel_diameters: float = 0.03
+    """Side of a voxel in diameters of the object."""
+
+    normal_voxels: float = 2.0
+    """Radius for normals."""
+
+    feature_voxels: float = 5.0
+    """Radius for features (FPFH, Rusu et al. 2009)."""
+
+    distance_voxels: float = 1.5
+    """A correspondence of RANSAC is right where its points lie so near."""
+
+    icp_voxels: float = 0.4
+    """Reach of the point-to-plane ICP that follows; 0: none."""
+
+    iterations: int = 100_000
+    """Of RANSAC, at most."""
+
+    model_points: int = 20_000
+    """Points of the model's surface."""
+
+    seed: int = 0
+    """Of RANSAC."""
+
+    def __post_init__(self) -> None:
+        """Refuse lengths and counts of nothing."""
+        lengths = (self.voxel_diameters, self.normal_voxels, self.feature_voxels)
+        if min(*lengths, self.distance_voxels) <= 0 or self.icp_voxels < 0:
+            raise InputError(
+                f"voxel_diameters, normal_voxels, feature_voxels and distance_voxels are "
+                f"{(*lengths, self.distance_voxels)}; all are positive, and icp_voxels "
+                f"({self.icp_voxels}) is not negative"
+            )
+        if self.iterations < 1 or self.model_points < 100:
+            raise InputError(
+                f"iterations is {self.iterations} and model_points {self.model_points}; take 1 "
+                "and 100 at least"
+            )

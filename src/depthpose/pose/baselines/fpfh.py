@@ -1,0 +1,130 @@
+"""FPFH features, RANSAC and ICP of Open3D: the classical peer, which needs no training."""
+
+import time
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.errors import MissingExtraError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.baselines.config import FpfhConfig
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+
+_LEAST = 3
+"""Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
+
+
+class FpfhRegistration:
+    """Poses of one object: its model is prepared once.
+
+    Args:
+        model: the object.
+        config: lengths and counts.
+
+    Raises:
+        MissingExtraError: Open3D is not installed.
+    """
+
+    def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
+        self.model, self.config = model, config or FpfhConfig()
+        self._open3d = _import_open3d()
+        points_m, normals = sample_surface(model, self.config.model_points)
+        cloud = self._cloud(points_m)
+        cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
+        self._target, self._target_features = self._prepare(cloud)
+
+    def estimate(self, given: CloudInput) -> PoseEstimate:
+        """Pose a cloud; RANSAC that finds nothing is a refusal."""
+        began = time.perf_counter()
+        if len(given.points_m) < _LEAST:
+            reason = f"the cloud has {len(given.points_m)} points, and a pose takes {_LEAST}"
+            return PoseEstimate(
+                name=given.name, object=given.object, status="too few points", reason=reason
+            )
+        source, features = self._prepare(self._cloud(given.points_m))
+        found = self._ransac(source, features)
+        if self.config.icp_voxels and len(found.correspondence_set):
+            found = self._icp(source, found.transformation)
+        seconds = {"registration": time.perf_counter() - began}
+        if not len(found.correspondence_set):
+            reason = "RANSAC found no pose that any correspondence of features agrees with"
+            return PoseEstimate(
+                name=given.name, object=given.object, status="votes do not meet",
+                reason=reason, seconds=seconds,
+            )  # fmt: skip
+        return PoseEstimate(
+            name=given.name,
+            object=given.object,
+            status="ok",
+            camera_from_model=_inverse_of(found.transformation, given.points_m),
+            inlier_share=float(found.fitness),
+            residual_m=float(found.inlier_rmse),
+            seconds=seconds,
+        )
+
+    @property
+    def _voxel_m(self) -> float:
+        return self.config.voxel_diameters * self.model.diameter_m
+
+    def _cloud(self, points_m: Float[Tensor, "n 3"]) -> Any:  # noqa: ANN401 - Open3D has no types
+        cloud = self._open3d.geometry.PointCloud()
+        cloud.points = self._open3d.utility.Vector3dVector(points_m.double().cpu().numpy())
+        return cloud
+
+    def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
+        """Thin a cloud to voxels; normals of a measured one look at the camera."""
+        o3d, voxel_m, config = self._open3d, self._voxel_m, self.config
+        cloud = cloud.voxel_down_sample(voxel_m)
+        near = o3d.geometry.KDTreeSearchParamHybrid
+        if not cloud.has_normals():
+            cloud.estimate_normals(near(radius=config.normal_voxels * voxel_m, max_nn=30))
+            cloud.orient_normals_towards_camera_location(np.zeros(3))
+        features = o3d.pipelines.registration.compute_fpfh_feature(
+            cloud, near(radius=config.feature_voxels * voxel_m, max_nn=100)
+        )
+        return cloud, features
+
+    def _ransac(self, source: Any, features: Any) -> Any:  # noqa: ANN401
+        o3d = self._open3d
+        o3d.utility.random.seed(self.config.seed)
+        # It prints a line for each cloud of which few features are mutually nearest.
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return self._search(source, features)
+
+    def _search(self, source: Any, features: Any) -> Any:  # noqa: ANN401
+        r = self._open3d.pipelines.registration
+        limit_m = self.config.distance_voxels * self._voxel_m
+        return r.registration_ransac_based_on_feature_matching(
+            source, self._target, features, self._target_features, True, limit_m,
+            r.TransformationEstimationPointToPoint(False), 3,
+            [
+                r.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                r.CorrespondenceCheckerBasedOnDistance(limit_m),
+            ],
+            r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
+        )  # fmt: skip
+
+    def _icp(self, source: Any, model_from_camera: np.ndarray) -> Any:  # noqa: ANN401
+        r = self._open3d.pipelines.registration
+        return r.registration_icp(
+            source, self._target, self.config.icp_voxels * self._voxel_m, model_from_camera,
+            r.TransformationEstimationPointToPlane(),
+        )  # fmt: skip
+
+
+def _inverse_of(model_from_camera: np.ndarray, like: Tensor) -> Rigid:
+    T = torch.from_numpy(np.array(model_from_camera))
+    pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
+    return Rigid(pose.R.to(like), pose.t_m.to(like))
+
+
+def _import_open3d() -> Any:  # noqa: ANN401
+    try:
+        return import_module("open3d")
+    except ImportError as error:
+        raise MissingExtraError("open3d", "open3d", "registration by FPFH") from error

@@ -1,0 +1,69 @@
+"""Every knob of an estimate: how a cloud becomes a pose, and when the pose is withheld."""
+
+from dataclasses import dataclass, field
+
+from depthpose.core.errors import InputError
+from depthpose.pose.config.geometry import IcpConfig, VotingConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusalConfig:
+    """When an estimate is withheld: one risk of being wrong, from signals that need no truth."""
+
+    max_risk: float = 0.5
+    """An estimate of a larger risk is refused; chosen on data by ``calibrate_refusal``."""
+
+    bias: float = 0.0
+    """Log odds of being wrong where every signal is 0."""
+
+    slopes: dict[str, float] = field(default_factory=dict)
+    """How much each signal adds to the log odds; none: no estimate is refused for its risk."""
+
+    min_hold: float = 0.02
+    """A motion that no declared symmetry excuses must carry the seen surface across itself by this
+    share of what it moves the object's points; one that only slides it along itself (a plane, a
+    ball) is not observable."""
+
+    def __post_init__(self) -> None:
+        """Refuse a risk that is no probability, and limits that refuse everything."""
+        if not 0 <= self.max_risk <= 1:
+            raise InputError(
+                f"max_risk is {self.max_risk}, but a risk lies between 0 and 1; 0.5 refuses "
+                "what is more likely wrong than right"
+            )
+        if not 0 <= self.min_hold < 1:
+            raise InputError(
+                f"min_hold is {self.min_hold}, but it is a share from 0 (refuse no view for its "
+                "shape) to 1; take 0.02"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateConfig:
+    """How a cloud becomes a pose."""
+
+    voting: VotingConfig = field(default_factory=VotingConfig)
+    """Directions to keypoints."""
+
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    """How the voted pose slides onto the cloud."""
+
+    with_icp: bool = True
+    """Whether it does; without, the voted pose is the answer."""
+
+    max_cloud_points: int = 100_000
+    """Of a larger cloud so many points are taken, evenly in their order, before anything else."""
+
+    batch_voxels: int = 20_000
+    """Voxels in one call of the network: many clouds at once, in bounded memory."""
+
+    device: str = "cpu"
+    """Where the network runs: cpu, cuda, cuda:1, ..."""
+
+    def __post_init__(self) -> None:
+        """Refuse counts of nothing."""
+        if self.max_cloud_points < 100 or self.batch_voxels < 1:
+            raise InputError(
+                f"max_cloud_points is {self.max_cloud_points} and batch_voxels "
+                f"{self.batch_voxels}; take 100 and 1 at least"
+            )

@@ -1,0 +1,233 @@
+"""GeoPoseNet: clouds and depth images of known objects to poses."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.pose.baselines import DepthImageNet
+from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.estimator.given import (
+    AnyArray,
+    AnyCamera,
+    cloud_input,
+    split_instances,
+    view_input,
+)
+from depthpose.pose.estimator.pose import Voted, pose_from_directions
+from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.refine import Surface, prepare_surface
+from depthpose.pose.types import PoseEstimate
+from depthpose.pose.weights import PoseWeights, read_pose_weights
+
+_NAME = "input"
+"""What an input is called that came without a name."""
+
+
+class GeoPoseNet:
+    """The 6-DoF pose of a known object from its partial cloud, or the reason why there is none.
+
+    Example::
+
+        net = GeoPoseNet.load("default")
+        found = net.estimate(cloud="part.ply", unit="mm", object="part")
+        print(found.camera_from_model if found.is_ok else found.reason)
+
+    Args:
+        weights: the network and the objects that it knows.
+        config: voting, ICP, limits, device.
+    """
+
+    def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
+        self.config = EstimateConfig() if config is None else config
+        self.weights = weights
+        if isinstance(weights.network, DepthImageNet):
+            raise InputError(
+                "these weights regress a depth image and cast no votes; load them as "
+                "DepthImageRegressor"
+            )
+        self._network = weights.network.to(self.config.device).eval()
+        self._numbers = {model.name: k for k, model in enumerate(weights.models)}
+        self._surfaces: dict[int, Surface] = {}
+
+    @classmethod
+    def load(cls, weights: str | Path, config: EstimateConfig | None = None) -> "GeoPoseNet":
+        """Build an estimator from weights, by file or by name.
+
+        Weights whose terms bind the user say so (:class:`LicenceNotice`).
+
+        Raises:
+            InputError: no such weights, or none of a pose network.
+        """
+        found = read_pose_weights(find_weights(weights))
+        say_terms(found.facts)
+        return cls(found, config)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects that the weights know."""
+        return tuple(self._numbers)
+
+    def estimate(
+        self,
+        *,
+        cloud: AnyArray | None = None,
+        unit: Unit = "m",
+        depth: AnyArray | None = None,
+        mask: AnyArray | None = None,
+        camera: AnyCamera | None = None,
+        object: str | None = None,
+    ) -> PoseEstimate:
+        """Estimate one pose, from a cloud or from a depth image with a mask.
+
+        Args:
+            cloud: points of the object alone, in the camera frame (x right, y down, z forward).
+            unit: of the cloud.
+            depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
+            mask: the object's pixels; not 0 is the object.
+            camera: of the depth image.
+            object: which one; None where the weights know one alone.
+
+        Raises:
+            InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
+                the data themselves lack is no error but a refusal.
+        """
+        which = self._object(object)
+        if cloud is not None and depth is None and mask is None:
+            return self.estimate_many([cloud_input(cloud, unit, which, _NAME)])[0]
+        if cloud is not None or depth is None or mask is None or camera is None:
+            raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
+        return self.estimate_many([view_input(depth, mask, camera, which, _NAME)])[0]
+
+    def estimate_instances(
+        self,
+        *,
+        depth: AnyArray,
+        mask: AnyArray,
+        camera: AnyCamera,
+        object: str | None = None,
+    ) -> list[PoseEstimate]:
+        """Estimate every instance of one object in one mask, the largest piece first.
+
+        The mask is split into connected pieces; instances that touch in the image stay one piece.
+
+        Args:
+            depth: as for :meth:`estimate`.
+            mask: of all instances.
+            camera: of the depth image.
+            object: which one; None where the weights know one alone.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        view = view_input(depth, mask, camera, self._object(object), _NAME)
+        pieces = split_instances(view.mask) or [view.mask]
+        views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
+        return self.estimate_many(views)
+
+    @torch.inference_mode()
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate many at once, of any objects: the network is called for all of them together.
+
+        The answer for an input does not depend on those beside it, but for the rounding of the
+        network's sums.
+
+        Raises:
+            InputError: an unknown object, or a mask that does not fit its depth image.
+        """
+        estimates: dict[int, PoseEstimate] = {}
+        ready: list[tuple[int, Prepared, float]] = []
+        for k, given in enumerate(inputs):
+            start = time.perf_counter()
+            model = self.weights.models[self._number(given.object)]
+            prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
+            spent_s = time.perf_counter() - start
+            if isinstance(prepared, Refusal):
+                estimates[k] = _refused(given, prepared, {"cloud": spent_s})
+            else:
+                ready.append((k, prepared, spent_s))
+        for some in _batches(ready, self.config.batch_voxels):
+            numbers = [self._number(inputs[k].object) for k, _, _ in some]
+            directions, network_s = self._directions([p for _, p, _ in some], numbers)
+            total = sum(map(len, directions))
+            for (k, prepared, spent_s), outputs, number in zip(
+                some, directions, numbers, strict=True
+            ):
+                share_s = network_s * len(outputs) / total
+                seconds = {"cloud": spent_s, "network": share_s}
+                estimates[k] = self._pose(inputs[k], number, Voted(prepared, outputs), seconds)
+        return [estimates[k] for k in range(len(inputs))]
+
+    def _directions(
+        self, clouds: list[Prepared], numbers: list[int]
+    ) -> tuple[list[Float[Tensor, "n k c"]], float]:
+        start = time.perf_counter()
+        counts = [len(cloud.points_m) for cloud in clouds]
+        cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
+        coordinates = torch.cat([cloud.coordinates for cloud in clouds])
+        rows = torch.cat([cloud_of_point[:, None], coordinates], 1).to(self.config.device)
+        class_of_point = torch.tensor(numbers)[cloud_of_point].to(self.config.device)
+        points_m = torch.cat([cloud.points_m for cloud in clouds]).to(self.config.device)
+        outputs = self._network.directions(points_m, rows, class_of_point)
+        return list(outputs.float().cpu().split(counts)), time.perf_counter() - start
+
+    def _pose(
+        self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
+    ) -> PoseEstimate:
+        model = self.weights.models[number]
+        if number not in self._surfaces:
+            self._surfaces[number] = prepare_surface(model, self.config.icp)
+        found = pose_from_directions(
+            voted, model, self._surfaces[number], self.weights.refusal, self.config
+        )
+        return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+
+    def _object(self, name: str | None) -> str:
+        if name is None and len(self._numbers) == 1:
+            return self.objects[0]
+        if name is None:
+            raise InputError(
+                f"estimate: the weights know {', '.join(self.objects)}; say which by object="
+            )
+        self._number(name)
+        return name
+
+    def _number(self, name: str) -> int:
+        if name not in self._numbers:
+            raise InputError(
+                f"object {name!r}: the weights do not know it; {nearest_name(name, self.objects)}"
+            )
+        return self._numbers[name]
+
+
+def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status=refusal.status,
+        reason=refusal.reason,
+        seconds=seconds,
+    )
+
+
+def _batches(
+    ready: list[tuple[int, Prepared, float]], most: int
+) -> Iterator[list[tuple[int, Prepared, float]]]:
+    """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
+    group: list[tuple[int, Prepared, float]] = []
+    total = 0
+    for item in ready:
+        count = len(item[1].points_m)
+        if group and total + count > most:
+            yield group
+            group, total = [], 0
+        group.append(item)
+        total += count
+    if group:
+        yield group

@@ -1,0 +1,215 @@
+"""Directions of one cloud to its pose: vote, outvote, fit, slide, judge."""
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
+from depthpose.pose.estimator.evidence import (
+    hold_of,
+    surface_signals,
+    vote_signals,
+    without_motions,
+)
+from depthpose.pose.estimator.prepare import Prepared, Refusal
+from depthpose.pose.estimator.refusal import reason_of, risk_of
+from depthpose.pose.refine import Surface, refine_pose
+from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.voting import (
+    consistent_keypoints,
+    fit_pose,
+    free_motions,
+    meet_lines,
+    vote_ransac,
+)
+
+_LEAST = 4
+"""Keypoints that must agree: three fix a pose with nothing left to contradict it."""
+
+
+class Voted(NamedTuple):
+    """A cloud and the network's outputs for its points."""
+
+    cloud: Prepared
+    outputs: Float[Tensor, "n k c"]
+
+
+@dataclass
+class _Clock:
+    """Seconds of each stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    last: float = field(default_factory=time.perf_counter)
+
+    def note(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self.last
+        self.last = now
+
+
+class _Found(NamedTuple):
+    """A pose, its covariance and residual, and what speaks for it."""
+
+    pose: Rigid
+    covariance: Float[Tensor, "6 6"]
+    residual_m: float
+    signals: dict[str, float]
+
+
+def pose_from_directions(
+    voted: Voted,
+    model: ObjectModel,
+    surface: Surface,
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+) -> PoseEstimate:
+    """Vote for the keypoints, fit the pose, refine and judge it.
+
+    Args:
+        voted: the cloud and the network's directions (a fourth component is the logit of how far
+            to trust each).
+        model: the object.
+        surface: of the same object.
+        refusal: when the answer is withheld.
+        config: voting and ICP.
+    """
+    clock = _Clock()
+    vote = cast_votes(voted, config.voting)
+    clock.note("voting")
+    used = _agreeing(vote, model, config.voting)
+    if isinstance(used, Refusal):
+        return _withheld(model, used, clock)
+    fit = fit_pose(vote.keypoints_m, vote.covariance_m2, model.keypoints_m, used)
+    clock.note("svd")
+    found = _refine(voted.cloud.cloud_m, vote, fit, surface, config)
+    if config.with_icp:
+        clock.note("icp")
+    free = free_motions(model.symmetries.continuous, found.pose)
+    answer = _answer(model, vote, found, free)
+    reason = _doubt(voted.cloud, found, surface, refusal, free)
+    clock.note("check")
+    risk = risk_of(found.signals, refusal)
+    if reason is not None:
+        return _withheld(model, reason, clock, answer, risk)
+    return PoseEstimate(**{**vars(answer), "risk": risk, "seconds": clock.seconds})
+
+
+def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
+    """Let the directions vote, by RANSAC or least squares, in float64."""
+    points = voted.cloud.points_m.double()
+    directions = voted.outputs[..., :3].double()
+    weight = voted.outputs[..., 3].double().sigmoid() if voted.outputs.shape[-1] == 4 else None
+    if config.method == "ransac":
+        return vote_ransac(points, directions, weight, config)
+    return meet_lines(points, directions, weight, config.refinements)
+
+
+def _agreeing(vote: Vote, model: ObjectModel, config: VotingConfig) -> Bool[Tensor, " k"] | Refusal:
+    found = (vote.condition <= config.max_condition) & (vote.inlier_share > 0)
+    total = len(found)
+    if int(found.sum()) < _LEAST:
+        return Refusal(
+            status="votes do not meet",
+            reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
+            "are needed: too few points, or not the object that the mask promises",
+        )
+    limit_m = config.rigidity_diameters * model.diameter_m
+    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
+    if int(used.sum()) < _LEAST:
+        return Refusal(
+            status="keypoints do not fit",
+            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
+            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it hidden",
+        )
+    return used
+
+
+def _refine(
+    cloud_m: Float[Tensor, "n 3"],
+    vote: Vote,
+    fit: PoseFit,
+    surface: Surface,
+    config: EstimateConfig,
+) -> _Found:
+    pose, covariance, residual_m = fit.camera_from_model, fit.covariance, float(fit.residual_m)
+    signals = vote_signals(vote, fit, surface.diameter_m)
+    moved = 0.0
+    if config.with_icp:
+        refined = refine_pose(cloud_m.double(), pose, surface, config.icp)
+        if float(refined.inlier_share) > 0:
+            shift_m = refined.camera_from_model.apply(surface.points_m)
+            shift_m = (shift_m - pose.apply(surface.points_m)).norm(dim=-1).mean()
+            moved = float(shift_m) / surface.diameter_m
+            pose, covariance = refined.camera_from_model, refined.covariance
+            residual_m = float(refined.residual_m)
+    signals |= {"moved": moved, **surface_signals(cloud_m, pose, surface)}
+    return _Found(pose, covariance, residual_m, signals)
+
+
+def _answer(
+    model: ObjectModel, vote: Vote, found: _Found, free: Float[Tensor, "m 6"]
+) -> PoseEstimate:
+    # Worked out in float64, given as points and models come: in float32.
+    return PoseEstimate(
+        name="",
+        object=model.name,
+        status="ok",
+        camera_from_model=Rigid(found.pose.R.float(), found.pose.t_m.float()),
+        keypoints_m=vote.keypoints_m.float(),
+        covariance=without_motions(found.covariance, free).float(),
+        free_motions=free.float(),
+        inlier_share=float(vote.inlier_share.mean()),
+        residual_m=found.residual_m,
+        signals=found.signals,
+    )
+
+
+def _doubt(
+    cloud: Prepared,
+    found: _Found,
+    surface: Surface,
+    config: RefusalConfig,
+    free: Float[Tensor, "m 6"],
+) -> Refusal | None:
+    risk = risk_of(found.signals, config)
+    if risk is not None and risk > config.max_risk:
+        return Refusal(status="doubtful", reason=reason_of(found.signals, risk, config))
+    hold, motion = hold_of(cloud.cloud_m, found.pose, surface, free)
+    if hold >= config.min_hold:
+        return None
+    turn = float(motion[:3].norm())
+    what = "turn" if turn > math.sqrt(0.5) else "slide"
+    return Refusal(
+        status="not observable",
+        reason=f"the seen part of the object may {what} along itself: that moves its surface "
+        f"across itself by {hold:.1%} of the motion alone, and no declared symmetry allows it. "
+        "Declare the symmetry, or look from a side that shows more",
+    )
+
+
+def _withheld(
+    model: ObjectModel,
+    refusal: Refusal,
+    clock: _Clock,
+    answer: PoseEstimate | None = None,
+    risk: float | None = None,
+) -> PoseEstimate:
+    """Keep what was found out but the pose: a refusal cannot be taken for an answer."""
+    known = answer is not None
+    return PoseEstimate(
+        name="",
+        object=model.name,
+        status=refusal.status,
+        reason=refusal.reason,
+        keypoints_m=answer.keypoints_m if known else None,
+        inlier_share=answer.inlier_share if known else None,
+        residual_m=answer.residual_m if known else None,
+        risk=risk,
+        signals=answer.signals if known else {},
+        seconds=clock.seconds,
+    )

@@ -1,0 +1,131 @@
+"""From signals to one risk, and the risk beyond which an answer is withheld: chosen on data."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from depthpose.core.errors import InputError
+from depthpose.pose.config import RefusalConfig
+from depthpose.pose.estimator.evidence import SIGNALS
+from depthpose.pose.types import PoseEstimate
+
+_FOLDS = 5
+_RIDGE = 1.0
+"""Of the slopes in units of each signal's spread: as if one answer spoke against each."""
+
+
+def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None:
+    """Chance of being wrong: ``1 / (1 + exp(-(bias + sum slope signal)))``; None where no slope is.
+
+    Raises:
+        InputError: a slope is of a signal that there is not.
+    """
+    if not config.slopes:
+        return None
+    unknown = sorted(config.slopes.keys() - signals.keys())
+    if unknown:
+        raise InputError(
+            f"the refusal weighs {unknown[0]!r}, but the signals are {', '.join(signals)}; the "
+            "weights are of another version: calibrate them again"
+        )
+    odds = config.bias + sum(slope * signals[name] for name, slope in config.slopes.items())
+    return 1 / (1 + math.exp(-max(-700.0, min(700.0, odds))))
+
+
+def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) -> str:
+    """Say in a sentence what makes an answer doubtful most."""
+    worst = max(config.slopes, key=lambda name: config.slopes[name] * signals[name])
+    return (
+        f"{SIGNALS[worst].format(signals[worst])}: the risk of a wrong pose is {risk:.2g}, above "
+        f"the {config.max_risk:.2g} that was settled"
+    )
+
+
+def calibrate_refusal(
+    estimates: Sequence[PoseEstimate],
+    is_right: Sequence[bool],
+    max_wrong_share: float = 0.01,
+) -> RefusalConfig:
+    """Learn the risk from estimates whose truth is known, and choose its limit.
+
+    The risk is a logistic regression on :data:`SIGNALS` with slopes that are not negative (more of
+    a bad sign is never better) and a ridge. The limit is chosen by risks that each fifth of the
+    data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is still
+    ``max_wrong_share`` at most; where the data are too few for that, the largest at which nothing
+    is wrong.
+
+    Args:
+        estimates: made with a :class:`RefusalConfig` without slopes, so that nothing was withheld
+            for its risk; on views that training has not seen, the hard ones too.
+        is_right: whether each is right; what was refused anyhow does not count.
+        max_wrong_share: of the answers that are given.
+
+    Raises:
+        InputError: numbers that differ, a share that is none, or no answer at all.
+    """
+    if len(estimates) != len(is_right) or not 0 < max_wrong_share < 1:
+        raise InputError(
+            f"calibrate_refusal: {len(estimates)} estimates, {len(is_right)} verdicts and a share "
+            f"of {max_wrong_share}; give a verdict for each, and a share between 0 and 1"
+        )
+    answered = [(e, ok) for e, ok in zip(estimates, is_right, strict=True) if e.is_ok]
+    if not answered:
+        raise InputError(
+            "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
+            "longer, or show easier views"
+        )
+    x = np.array([[e.signals[name] for name in SIGNALS] for e, _ in answered])
+    wrong = np.array([not ok for _, ok in answered], dtype=float)
+    fold = np.arange(len(x)) % _FOLDS
+    risks = np.empty(len(x))
+    for k in range(_FOLDS):
+        bias, slopes = _fit(x[fold != k], wrong[fold != k])
+        risks[fold == k] = _sigmoid(bias + x[fold == k] @ slopes)
+    bias, slopes = _fit(x, wrong)
+    return RefusalConfig(
+        max_risk=_choose_limit(risks, wrong, max_wrong_share),
+        bias=float(bias),
+        slopes=dict(zip(SIGNALS, slopes.tolist(), strict=True)),
+    )
+
+
+def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
+    """Fit bias and slopes, the latter not negative, by penalised likelihood."""
+    if len(x) == 0:
+        return 0.0, np.zeros(len(SIGNALS))
+    middle, spread = x.mean(0), np.maximum(x.std(0), 1e-3)
+    z = (x - middle) / spread
+
+    def loss(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        odds = theta[0] + z @ theta[1:]
+        value = np.logaddexp(0, odds).sum() - wrong @ odds
+        value += 0.5 * _RIDGE * (theta[1:] @ theta[1:])
+        pull = _sigmoid(odds) - wrong
+        return value, np.concatenate([[pull.sum()], z.T @ pull + _RIDGE * theta[1:]])
+
+    # A bias beyond e^-12 would need more answers than anybody calibrates with.
+    bounds = [(-12.0, 12.0), *[(0.0, None)] * z.shape[1]]
+    found = minimize(loss, np.zeros(1 + z.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B")
+    slopes = found.x[1:] / spread
+    return float(found.x[0] - middle @ slopes), slopes
+
+
+def _choose_limit(risks: np.ndarray, wrong: np.ndarray, share: float) -> float:
+    order = np.argsort(risks, kind="stable")
+    mistakes = np.cumsum(wrong[order])
+    bound = (mistakes + 1) / (np.arange(len(order)) + 2)
+    good = np.flatnonzero(bound <= share)
+    if len(good) == 0:
+        good = np.flatnonzero(mistakes == 0)
+    if len(good) == 0:
+        return 0.0
+    last = int(good[-1])
+    # Halfway to the next one, which is refused; where all are good, as far beyond as below 1.
+    after = 1.0 if last + 1 == len(order) else float(risks[order[last + 1]])
+    return (float(risks[order[last]]) + after) / 2
+
+
+def _sigmoid(odds: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.clip(odds, -700, 700)))

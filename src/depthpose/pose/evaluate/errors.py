@@ -1,0 +1,169 @@
+"""The errors of one estimate, as a row."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import project
+from depthpose.core.files import read_depth_png
+from depthpose.core.raster import rasterize
+from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import Instance
+from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.metrics import (
+    BOP_SHARES,
+    View,
+    add_m,
+    adds_m,
+    mspd_px,
+    mssd_m,
+    rotation_error_rad,
+    translation_error_m,
+    vsd,
+)
+from depthpose.pose.objects import drawn_triangles
+from depthpose.pose.types import ObjectModel
+
+BOP_WIDTH_PX = 640
+_MARGIN_PX = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ruler:
+    """What of an object its errors are measured with; made once.
+
+    Attributes:
+        model: the object.
+        diameter_m: of the table that was asked for.
+        symmetries: motions of the model that leave it as it is, the identity first.
+        is_adds: whether ADD-S decides a success.
+        triangles_m: what of it VSD draws; a model of points is drawn as discs.
+        vsd_delta_m: see ``EvaluationConfig``; None: VSD is not measured.
+    """
+
+    model: ObjectModel
+    diameter_m: float
+    symmetries: Rigid
+    is_adds: bool
+    triangles_m: Float[Tensor, "f 3 3"]
+    vsd_delta_m: float | None
+
+
+def make_ruler(
+    model: ObjectModel, diameter_m: float, *, is_adds: bool, vsd_delta_m: float | None
+) -> Ruler:
+    """Prepare the errors of an object."""
+    return Ruler(
+        model=model,
+        diameter_m=diameter_m,
+        symmetries=symmetry_transforms(model.symmetries),
+        is_adds=is_adds,
+        triangles_m=drawn_triangles(model).double(),
+        vsd_delta_m=vsd_delta_m,
+    )
+
+
+def measure(
+    estimated: Rigid | None, instance: Instance, ruler: Ruler
+) -> tuple[dict[str, Any], Float[Tensor, "10"] | None]:
+    """Measure one estimate by every error.
+
+    Args:
+        estimated: ``camera_from_model``; None where there is no answer: every error is infinite.
+        instance: with its truth.
+        ruler: of its object.
+
+    Returns:
+        Errors by name (``mspd_px`` scaled to an image 640 wide, rotation and translation against
+        the nearest symmetric truth), and VSD at BOP's ten taus, or None where it is not measured.
+    """
+    if estimated is None:
+        names = ("error_m", "adds_m", "mssd_m", "mspd_px", "rotation_deg", "translation_m")
+        nothing = torch.ones(10, dtype=torch.float64)
+        return dict.fromkeys(names, math.inf), None if ruler.vsd_delta_m is None else nothing
+    true, points = instance.camera_from_model, ruler.model.vertices_m
+    adds = float(adds_m(estimated, true, points))
+    depth_m = _read_depth(instance.depth, instance.depth_unit_m)
+    scale = BOP_WIDTH_PX / depth_m.shape[1]
+    rotation_deg, translation = _nearest_copy(estimated, true, ruler.symmetries)
+    row = {
+        "error_m": adds if ruler.is_adds else float(add_m(estimated, true, points)),
+        "adds_m": adds,
+        "mssd_m": float(mssd_m(estimated, true, points, ruler.symmetries)),
+        "mspd_px": scale * float(mspd_px(estimated, true, points, ruler.symmetries, instance.K)),
+        "rotation_deg": rotation_deg,
+        "translation_m": translation,
+    }
+    if ruler.vsd_delta_m is None:
+        return row, None
+    return row, _vsd(estimated, instance, ruler, depth_m)
+
+
+def _nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> tuple[float, float]:
+    R, t_m = symmetries.R.double(), symmetries.t_m.double()
+    copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
+    one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
+    turned = rotation_error_rad(one, copies)
+    nearest = int(turned.argmin())
+    moved = translation_error_m(one, copies)[nearest]
+    return math.degrees(float(turned[nearest])), float(moved)
+
+
+def _vsd(
+    estimated: Rigid, instance: Instance, ruler: Ruler, depth_m: Float[Tensor, "h w"]
+) -> Float[Tensor, "10"]:
+    assert ruler.vsd_delta_m is not None
+    poses = (estimated, instance.camera_from_model)
+    left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
+    # What neither pose covers has no say: only the window about both is drawn.
+    K = instance.K.double().clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    window = depth_m[top:bottom, left:right]
+    view = View(depth_m=window, K=K, render=_renderer(ruler.triangles_m, K, window))
+    taus_m = [share * ruler.diameter_m for share in BOP_SHARES]
+    return vsd(*poses, view, taus_m, ruler.vsd_delta_m)
+
+
+def _renderer(
+    triangles_m: Float[Tensor, "f 3 3"], K: Float[Tensor, "3 3"], window: Float[Tensor, "h w"]
+) -> Callable[[Rigid], Float[Tensor, "h w"]]:
+    height, width = window.shape
+
+    def render(pose: Rigid) -> Float[Tensor, "h w"]:
+        moved = _apply(pose, triangles_m)
+        return rasterize(moved, K, width, height, with_barycentric=False).depth_m
+
+    return render
+
+
+def _window(
+    poses: tuple[Rigid, Rigid], K: Tensor, triangles_m: Tensor, depth_m: Float[Tensor, "h w"]
+) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of what either pose covers; everything behind the camera."""
+    height, width = depth_m.shape
+    points = torch.cat([_apply(pose, triangles_m).reshape(-1, 3) for pose in poses])
+    pixels = project(points, K.double())
+    if not bool(pixels.isfinite().all()):
+        return 0, 0, width, height
+    low, high = pixels.amin(0) - _MARGIN_PX, pixels.amax(0) + _MARGIN_PX + 1
+    left, top = (int(low[i].clamp(0, size - 1)) for i, size in enumerate((width, height)))
+    right, bottom = (int(high[i].clamp(1, size)) for i, size in enumerate((width, height)))
+    return left, top, max(right, left + 1), max(bottom, top + 1)
+
+
+def _apply(pose: Rigid, triangles_m: Float[Tensor, "f 3 3"]) -> Float[Tensor, "f 3 3"]:
+    return triangles_m @ pose.R.double().mT + pose.t_m.double()
+
+
+@lru_cache(maxsize=4)
+def _read_depth(path: Path, unit_m: float) -> Float[Tensor, "h w"]:
+    # Instances of one image follow each other.
+    return read_depth_png(path, unit_m)

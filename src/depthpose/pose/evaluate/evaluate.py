@@ -1,0 +1,186 @@
+"""Predictions held against a data set: a row an instance, a row an object, the mean."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.pose.bop import BopDataset, Instance
+from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.evaluate.errors import Ruler, make_ruler, measure
+from depthpose.pose.evaluate.frames import frames_hash
+from depthpose.pose.evaluate.matching import match
+from depthpose.pose.evaluate.objects import diameter_of, is_adds
+from depthpose.pose.evaluate.rows import Row, mean_row, object_row, risk_rows
+from depthpose.pose.predictions import (
+    STAGES,
+    Prediction,
+    read_bop_results,
+    read_predictions,
+    score_of,
+)
+from depthpose.pose.types import PoseEstimate
+
+SUCCESS_SHARE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What evaluating one set of predictions gave.
+
+    Attributes:
+        rows: one an object; where there are several the ``mean`` over objects, in which each
+            counts the same, and ``all`` over instances, as BOP pools them.
+        per_instance: one an instance.
+        risk: how many answers are wrong if only the surest are given.
+    """
+
+    rows: list[dict[str, Any]]
+    per_instance: list[dict[str, Any]]
+    risk: list[dict[str, Any]]
+
+
+def read_any(path: Path) -> list[Prediction]:
+    """Read predictions: a folder with ``poses.json``, or anybody's BOP csv.
+
+    Raises:
+        InputError: it is neither, or damaged.
+    """
+    return read_predictions(path) if path.is_dir() else read_bop_results(path)
+
+
+def evaluate(
+    dataset: BopDataset,
+    predictions: Sequence[Prediction],
+    config: EvaluationConfig | None = None,
+    progress: Callable[[Sequence[Instance]], Iterable[Instance]] = iter,
+) -> Evaluation:
+    """Measure predictions; an instance without an answer is a failure and stays in every number.
+
+    A success is an ADD (ADD-S of a symmetric object) below a tenth of the diameter, ``auc`` the
+    area to 10 cm; BOP's errors and recalls as ``pose.metrics`` has them.
+
+    Args:
+        dataset: instances with truth.
+        predictions: of :func:`read_any`.
+        config: diameters, which objects by ADD-S, whether VSD.
+        progress: wraps the sequence of instances, to show how far it is.
+
+    Raises:
+        InputError: there is no instance, no prediction is of this data set, or a file of it is
+            damaged.
+    """
+    config = EvaluationConfig() if config is None else config
+    found = match(dataset.instances, predictions, dataset.objects)
+    _refuse_strangers(dataset, predictions, found)
+    rulers, stages = _rulers(dataset, config), _stages_of(predictions)
+    rows: list[Row] = []
+    vsd: dict[str, Float[Tensor, 10]] = {}
+    for instance in progress(dataset.instances):
+        estimate = found.get(instance.name)
+        row, errors = _instance_row(instance, estimate, rulers[instance.object_id], stages)
+        rows.append(row)
+        if errors is not None:
+            vsd[instance.name] = errors
+    stamp = _stamp(dataset, config)
+    summed = _sum_up(dataset, rows, vsd, rulers)
+    return Evaluation(
+        rows=[row | stamp for row in summed],
+        per_instance=[{k: _finite(v) for k, v in row.items()} for row in rows],
+        risk=[row | stamp for row in risk_rows(rows)],
+    )
+
+
+def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
+    return {
+        number: make_ruler(
+            model,
+            diameter_of(model, config),
+            is_adds=is_adds(dataset, model, config),
+            vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
+        )
+        for number, model in dataset.objects.items()
+    }
+
+
+def _instance_row(
+    instance: Instance, estimate: PoseEstimate | None, ruler: Ruler, stages: list[str]
+) -> tuple[Row, Float[Tensor, "10"] | None]:
+    pose = None if estimate is None else estimate.camera_from_model
+    errors, vsd = measure(pose, instance, ruler)
+    row: Row = {
+        "instance": instance.name,
+        "object": ruler.model.name,
+        "status": "missing" if estimate is None else estimate.status,
+        "is_success": errors["error_m"] < SUCCESS_SHARE * ruler.diameter_m,
+        "score": None if estimate is None or pose is None else score_of(estimate),
+        "visible_fraction": instance.visible_fraction,
+        "truth": "annotated" if instance.is_measured else "fitted",
+        "diameter_m": ruler.diameter_m,
+        "metric": "ADD-S" if ruler.is_adds else "ADD",
+    }
+    row |= errors
+    row["vsd"] = None if vsd is None else float(vsd.mean())
+    seconds = {} if estimate is None else estimate.seconds
+    for stage in stages:
+        row[f"ms_{stage}"] = 1000 * seconds[stage] if stage in seconds else None
+    row["ms_total"] = 1000 * sum(seconds.values()) if seconds else None
+    row["reason"] = "" if estimate is None else estimate.reason
+    return row, vsd
+
+
+def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
+    """Stages in the order of work; what a method of its own calls otherwise comes last."""
+    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
+    return [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
+
+
+def _finite(value: object) -> object:
+    """An answer that is missing has no error that a file could hold."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _sum_up(
+    dataset: BopDataset,
+    rows: list[Row],
+    vsd: dict[str, Float[Tensor, "10"]],
+    rulers: dict[int, Ruler],
+) -> list[Row]:
+    summed: list[Row] = []
+    numbers = [instance.object_id for instance in dataset.instances]
+    for number, ruler in sorted(rulers.items()):
+        own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
+        facts = {"metric": own[0]["metric"], "diameter_m": ruler.diameter_m}
+        summed.append(object_row(ruler.model.name, own, vsd) | facts)
+    if len(summed) > 1:
+        summed += [mean_row(summed), object_row("all", rows, vsd)]
+    return summed
+
+
+def _stamp(dataset: BopDataset, config: EvaluationConfig) -> Row:
+    """What a number cannot be compared without."""
+    return {
+        "diameters": config.diameters,
+        "frames": f"{dataset.folder.resolve().name} {dataset.split}",
+        "frames_sha256": frames_hash(dataset.instances)[:12],
+    }
+
+
+def _refuse_strangers(
+    dataset: BopDataset, predictions: Sequence[Prediction], found: dict[str, PoseEstimate]
+) -> None:
+    """A file of another data set would be measured as all missing, and look like a bad method."""
+    if len(dataset) == 0:
+        raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
+    if predictions and not found:
+        one = predictions[0]
+        raise InputError(
+            f"{dataset.folder}: none of the {len(predictions)} predictions is of one of its "
+            f"{len(dataset)} instances; the first is of {one.place or one.estimate.name!r}. Give "
+            "the predictions of this very split"
+        )

@@ -1,0 +1,189 @@
+"""``poses.json``: every estimate and refusal with all that is known of it."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args
+
+import torch
+from torch import Tensor
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import write_json
+from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import Instance
+from depthpose.pose.bop.parse import integer, number, read_rows
+from depthpose.pose.types import PoseEstimate, Status
+
+POSES = "poses.json"
+STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp")
+"""What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
+
+_ROTATION_SLACK = 1e-4
+_PLACE = ("scene_id", "im_id", "obj_id")
+
+
+class Place(NamedTuple):
+    """Where in a BOP data set an estimate belongs."""
+
+    scene_id: int
+    image_id: int
+    object_id: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """An estimate as a file keeps it.
+
+    Attributes:
+        estimate: or refusal; from the annotated mask of an instance it bears the instance's name.
+        place: scene, image and object; None for a cloud of no data set.
+    """
+
+    estimate: PoseEstimate
+    place: Place | None = None
+
+
+def place_of(instance: Instance) -> Place:
+    """Say where an annotated object belongs."""
+    return Place(instance.scene_id, instance.image_id, instance.object_id)
+
+
+def is_started(folder: Path) -> bool:
+    """Whether a folder holds predictions."""
+    return (folder / POSES).is_file()
+
+
+def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
+    """Write ``poses.json``: a list of estimates and refusals, in metres, radians and seconds.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    write_json(folder / POSES, [_row(prediction) for prediction in predictions])
+
+
+def read_predictions(folder: Path) -> list[Prediction]:
+    """Read what :func:`write_predictions` wrote.
+
+    Raises:
+        InputError: the file is missing or damaged, or two estimates have one name.
+    """
+    path = folder / POSES
+    found = [_prediction(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+    names: set[str] = set()
+    for prediction in found:
+        name = prediction.estimate.name
+        if name in names:
+            raise InputError(f"{path}: two estimates are called {name!r}; keep one of them")
+        names.add(name)
+    return found
+
+
+def score_of(estimate: PoseEstimate) -> float:
+    """Say how sure an estimate is, 0..1: the chance of being right, where its risk is known.
+
+    Else the share of the votes that agree, or 1 where nothing is said.
+    """
+    if estimate.risk is not None:
+        return 1 - estimate.risk
+    return 1.0 if estimate.inlier_share is None else estimate.inlier_share
+
+
+def _row(prediction: Prediction) -> dict[str, Any]:
+    estimate, place = prediction.estimate, prediction.place
+    pose = estimate.camera_from_model
+    row: dict[str, Any] = {"name": estimate.name, "object": estimate.object}
+    row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
+    row |= {"status": estimate.status, "reason": estimate.reason}
+    row["camera_from_model"] = None if pose is None else _matrix(pose)
+    for name in ("covariance", "free_motions", "keypoints_m"):
+        values: Tensor | None = getattr(estimate, name)
+        row[name] = None if values is None else values.double().tolist()
+    for name in ("inlier_share", "residual_m", "risk"):
+        value: float | None = getattr(estimate, name)
+        # JSON has no infinity, and nothing near the surface is no distance.
+        row[name] = value if value is not None and math.isfinite(value) else None
+    return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
+
+
+def _matrix(pose: Rigid) -> list[list[float]]:
+    top = torch.cat([pose.R.double(), pose.t_m.double()[:, None]], 1).tolist()
+    return [*top, [0.0, 0.0, 0.0, 1.0]]
+
+
+def _prediction(row: dict[str, Any], source: str) -> Prediction:
+    name, what = row.get("name"), row.get("object")
+    if not isinstance(name, str) or not isinstance(what, str):
+        raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
+    status, reason = _status(row.get("status"), source), row.get("reason", "")
+    pose = _pose(row.get("camera_from_model"), source)
+    if (pose is not None) != (status == "ok") or (status != "ok" and not reason):
+        raise InputError(
+            f"{source}: an estimate that is ok has a camera_from_model, a refused one none, but a "
+            f"reason; its status is {status!r}"
+        )
+    estimate = PoseEstimate(
+        name=name,
+        object=what,
+        status=status,
+        reason=str(reason),
+        camera_from_model=pose,
+        keypoints_m=_table(row, "keypoints_m", 3, source),
+        covariance=_table(row, "covariance", 6, source),
+        free_motions=_table(row, "free_motions", 6, source),
+        inlier_share=_optional(row, "inlier_share", source),
+        residual_m=_optional(row, "residual_m", source),
+        risk=_optional(row, "risk", source),
+        signals=_named(row, "signals", source),
+        seconds=_named(row, "seconds", source),
+    )
+    has_place = any(row.get(key) is not None for key in _PLACE)
+    place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
+    return Prediction(estimate=estimate, place=place)
+
+
+def _status(entry: object, source: str) -> Status:
+    known = get_args(Status)
+    if entry not in known:
+        raise InputError(f"{source}: status {entry!r}: {nearest_name(str(entry), known)}")
+    return cast("Status", entry)
+
+
+def _pose(entry: object, source: str) -> Rigid | None:
+    if entry is None:
+        return None
+    matrix = _numbers(entry, 4, f"{source}: camera_from_model")
+    R = matrix[:3, :3]
+    eye = torch.eye(3, dtype=torch.float64)
+    is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
+    if len(matrix) != 4 or not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{source}: camera_from_model is no rigid transform; write 4 rows of 4, a rotation, "
+            "metres, and 0 0 0 1 below"
+        )
+    return Rigid(R.clone(), matrix[:3, 3].clone())
+
+
+def _table(row: dict[str, Any], key: str, width: int, source: str) -> Tensor | None:
+    return None if row.get(key) is None else _numbers(row[key], width, f"{source}: {key}")
+
+
+def _numbers(entry: object, width: int, source: str) -> Tensor:
+    try:
+        values = torch.tensor(entry, dtype=torch.float64).reshape(-1, width)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{source} is not rows of {width} numbers; write them so") from error
+    return values
+
+
+def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
+    return None if row.get(key) is None else number(row, key, None, source)
+
+
+def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
+    found = row.get(key, {})
+    if not isinstance(found, dict):
+        raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
+    return {str(name): number(found, name, None, source) for name in found}

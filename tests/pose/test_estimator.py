@@ -1,0 +1,419 @@
+"""The estimator with an oracle in place of its network: every step but the learning."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.pose.made_object import (
+    FACTS,
+    K,
+    Oracle,
+    bottle,
+    bracket,
+    cloud_of,
+    pose_at,
+    tiny_weights,
+    view_of,
+)
+
+import depthpose
+from depthpose.core.camera import Camera, write_camera
+from depthpose.core.checkpoint import LicenceNotice
+from depthpose.core.errors import InputError
+from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.weights import write_pose_weights
+
+CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
+VOTE_ALONE = EstimateConfig(with_icp=False)
+
+
+@pytest.fixture(scope="module")
+def part() -> ObjectModel:
+    return bracket()
+
+
+def assert_close(found: PoseEstimate, truth: Rigid, limit_m: float = 0.002) -> None:
+    assert found.status == "ok", found.reason
+    assert found.camera_from_model is not None
+    assert float(add_m(found.camera_from_model, truth, bracket().vertices_m)) < limit_m
+
+
+@pytest.mark.parametrize("method", ["ransac", "least squares"])
+@pytest.mark.parametrize("with_icp", [True, False])
+def test_true_directions_give_the_true_pose(part: ObjectModel, method: str, with_icp: bool) -> None:
+    truth = pose_at()
+    voting = VotingConfig(method=method)  # pyright: ignore[reportArgumentType]
+    config = EstimateConfig(voting=voting, with_icp=with_icp)
+    net = Oracle(tiny_weights(part), [truth], config=config)
+    found = net.estimate(cloud=cloud_of(part, truth))
+    assert_close(found, truth, 0.0005)
+    stages = ["cloud", "network", "voting", "svd", "icp", "check"]
+    assert list(found.seconds) == [s for s in stages if with_icp or s != "icp"]
+    assert found.covariance is not None
+    assert bool(torch.linalg.eigvalsh(found.covariance.double()).min() > 0)
+
+
+def test_noise_and_outliers_are_survived(part: ObjectModel) -> None:
+    truth = pose_at(seed=3)
+    net = Oracle(tiny_weights(part), [truth], noise=0.05, wrong=0.3)
+    assert_close(net.estimate(cloud=cloud_of(part, truth)), truth)
+
+
+def test_files_arrays_and_tensors_are_one_input(part: ObjectModel, tmp_path: Path) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth], config=VOTE_ALONE)
+    depth_m, mask = view_of(part, truth)
+    units = (1000 * depth_m.nan_to_num(0.0)).round().to(torch.int32)
+    write_depth_png(tmp_path / "d.png", units / 1000, 0.001)
+    write_image(tmp_path / "m.png", mask.float().expand(3, -1, -1))
+    write_camera(tmp_path / "c.json", CAMERA)
+    inputs = [
+        (tmp_path / "d.png", tmp_path / "m.png", tmp_path / "c.json"),
+        (units, mask, CAMERA),
+        (units.numpy().astype(np.uint16), mask.numpy(), CAMERA),
+        (units.float() / 1000, mask.to(torch.uint8), K.numpy()),
+    ]
+    poses = []
+    for depth, pixels, camera in inputs:
+        found = net.estimate(depth=depth, mask=pixels, camera=camera, object="bracket")
+        assert_close(found, truth)
+        assert found.camera_from_model is not None
+        poses.append(found.camera_from_model)
+    assert all(torch.allclose(pose.t_m, poses[0].t_m, atol=1e-6) for pose in poses)
+
+
+def test_millimetres_are_millimetres(part: ObjectModel, tmp_path: Path) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth])
+    cloud = cloud_of(part, truth)
+    write_cloud(tmp_path / "c.ply", Cloud(points=1000 * cloud))
+    assert_close(net.estimate(cloud=tmp_path / "c.ply", unit="mm"), truth)
+    assert_close(net.estimate(cloud=cloud.double().numpy()), truth)
+
+
+def test_the_same_input_gives_the_same_bits(part: ObjectModel) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth], noise=0.1)
+    cloud = cloud_of(part, truth)
+    first, second = (net.estimate(cloud=cloud).camera_from_model for _ in range(2))
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first.R, second.R)
+    assert torch.equal(first.t_m, second.t_m)
+
+
+def test_many_at_once_are_each_as_alone(part: ObjectModel) -> None:
+    """Two objects and a refusal among them; the network is called once for all."""
+    truths = [pose_at(-0.3, seed=1), pose_at(0.0, seed=2), pose_at(0.3, seed=4)]
+    models = (part, bottle())
+    net = Oracle(tiny_weights(*models), truths, noise=0.02)
+    names = ["bracket", "bottle", "bracket"]
+    inputs: list[CloudInput | ViewInput] = [
+        CloudInput(name=str(k), points_m=cloud_of(models[n == "bottle"], t), object=n)
+        for k, (n, t) in enumerate(zip(names, truths, strict=True))
+    ]
+    inputs.insert(1, CloudInput(name="none", points_m=torch.zeros(0, 3), object="bottle"))
+    together = net.estimate_many(inputs)
+    assert net.calls == [3]
+    assert [e.name for e in together] == ["0", "none", "1", "2"]
+    assert [e.is_ok for e in together] == [True, False, True, True]
+    for given, found in zip(inputs, together, strict=True):
+        alone = net.estimate_many([given])[0]
+        assert (alone.status, alone.object) == (found.status, found.object)
+        if alone.camera_from_model is not None and found.camera_from_model is not None:
+            assert torch.equal(alone.camera_from_model.t_m, found.camera_from_model.t_m)
+
+
+def test_calls_of_the_network_are_bounded(part: ObjectModel) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth], config=EstimateConfig(batch_voxels=1))
+    given = CloudInput(name="a", points_m=cloud_of(part, truth), object="bracket")
+    net.estimate_many([given, given])
+    assert net.calls == [1, 1]
+
+
+def test_instances_of_one_mask_are_told_apart(part: ObjectModel) -> None:
+    truths = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
+    net = Oracle(tiny_weights(part), truths)
+    depth_m, mask = view_of(part, *truths)
+    mask[2:5, 2:5] = True  # a crumb
+    found = net.estimate_instances(depth=depth_m, mask=mask, camera=CAMERA)
+    assert [e.name for e in found] == ["input_0", "input_1"]
+    for estimate, truth in zip(found, truths, strict=True):
+        assert_close(estimate, truth)
+
+
+def test_a_declared_axis_is_no_reason_to_refuse() -> None:
+    model, truth = bottle(), pose_at(seed=5)
+    net = Oracle(tiny_weights(model), [truth], noise=0.02)
+    found = net.estimate(cloud=cloud_of(model, truth))
+    assert found.status == "ok", found.reason
+    assert found.camera_from_model is not None
+    assert found.free_motions is not None
+    assert found.covariance is not None
+    assert float(adds_m(found.camera_from_model, truth, model.vertices_m)) < 0.002
+    assert found.free_motions.shape == (1, 6)
+    along = found.free_motions[0].double() @ found.covariance.double()
+    assert float(along.norm()) < 1e-9
+
+
+def test_an_axis_that_nobody_declared_is_not_observable() -> None:
+    plain = bottle()
+    model = dataclasses.replace(plain, symmetries=type(plain.symmetries)())
+    truth = pose_at(seed=5)
+    found = Oracle(tiny_weights(model), [truth]).estimate(cloud=cloud_of(model, truth))
+    assert found.status == "not observable"
+    assert "the seen part of the object may turn along itself" in found.reason
+    assert found.camera_from_model is None
+
+
+def test_one_flat_side_is_not_observable(part: ObjectModel) -> None:
+    """Noise hides from the eye that the points are a plane, but not from the surface's normals."""
+    truth = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.8]))
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    model_points = points * torch.tensor([0.19, 0.055, 0.0]) + torch.tensor([0.0, 0.0, -0.025])
+    model_points[:, 2] += 0.001 * torch.randn(2000, generator=torch.Generator().manual_seed(1))
+    found = Oracle(tiny_weights(part), [truth]).estimate(cloud=truth.apply(model_points))
+    assert found.status == "not observable"
+    assert "may slide along itself" in found.reason or "may turn along itself" in found.reason
+
+
+def test_directions_that_do_not_meet_are_refused(part: ObjectModel) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part), [truth], wrong=1.0)
+    found = net.estimate(cloud=cloud_of(part, truth))
+    assert found.status in {"votes do not meet", "keypoints do not fit"}
+    assert "but 4 are needed" in found.reason
+
+
+def test_the_keypoints_of_another_object_do_not_fit(part: ObjectModel) -> None:
+    truth = pose_at()
+    cloud = cloud_of(part, truth)
+    net = Oracle(tiny_weights(part), [truth])
+    stretched = dataclasses.replace(part, keypoints_m=part.keypoints_m.flip(0) * 1.2)
+    told = dataclasses.replace(net.weights, models=(stretched,))
+
+    class Liar(Oracle):
+        def _true(self, points_m: torch.Tensor, number: int) -> torch.Tensor:
+            return net._true(points_m, number)
+
+    found = Liar(told, [truth]).estimate(cloud=cloud)
+    assert found.status == "keypoints do not fit"
+    assert "another object, or too much of it hidden" in found.reason
+
+
+def test_an_untrained_network_is_refused_or_doubted(part: ObjectModel) -> None:
+    """The real network, from the first to the last step."""
+    slopes = {"disagree": 10.0, "far": 10.0}
+    weights = tiny_weights(part, refusal=RefusalConfig(max_risk=0.1, bias=-4.0, slopes=slopes))
+    found = GeoPoseNet(weights).estimate(cloud=cloud_of(part, pose_at()))
+    assert found.status != "ok"
+    assert found.reason
+    assert found.camera_from_model is None
+
+
+def test_a_doubtful_pose_says_why(part: ObjectModel) -> None:
+    truth = pose_at()
+    refusal = RefusalConfig(max_risk=0.01, bias=-2.0, slopes={"disagree": 4.0, "far": 0.1})
+    net = Oracle(tiny_weights(part, refusal=refusal), [truth], wrong=0.5)
+    found = net.estimate(cloud=cloud_of(part, truth))
+    assert found.status == "doubtful"
+    assert "of the directions miss the keypoint that they are for: the risk" in found.reason
+    assert found.camera_from_model is None
+    assert found.risk is not None
+    assert found.risk > 0.01
+    assert found.signals["disagree"] > 0.4
+
+
+def test_weights_of_other_signals_are_refused(part: ObjectModel) -> None:
+    truth = pose_at()
+    net = Oracle(tiny_weights(part, refusal=RefusalConfig(slopes={"mood": 1.0})), [truth])
+    with pytest.raises(InputError, match="the refusal weighs 'mood', but the signals are"):
+        net.estimate(cloud=cloud_of(part, truth))
+
+
+def test_rotation_of_the_view_turns_the_answer(part: ObjectModel) -> None:
+    """Turning cloud and truth about the camera turns the pose, to the sampling of voxels."""
+    truth = pose_at(seed=2)
+    turn = Rigid(pose_at(seed=9).R, torch.zeros(3))
+    turned = turn @ truth
+    if float(turned.t_m[2]) < 0:
+        flip = Rigid(torch.diag(torch.tensor([1.0, -1, -1])), torch.zeros(3))
+        turn, turned = flip @ turn, flip @ turned
+    cloud = cloud_of(part, truth)
+    first = Oracle(tiny_weights(part), [truth]).estimate(cloud=cloud).camera_from_model
+    second = Oracle(tiny_weights(part), [turned]).estimate(cloud=turn.apply(cloud))
+    assert first is not None
+    assert second.camera_from_model is not None
+    assert float(geodesic_rad((turn @ first).R, second.camera_from_model.R)) < 0.01
+
+
+def test_terms_are_said_and_names_are_found(part: ObjectModel, tmp_path: Path) -> None:
+    facts = {**FACTS, "terms": "for research alone"}
+    write_pose_weights(tmp_path / "part-nc.safetensors", tiny_weights(part, facts=facts))
+    with pytest.warns(LicenceNotice, match="for research alone"):
+        net = depthpose.GeoPoseNet.load(tmp_path / "part-nc.safetensors")
+    assert net.objects == ("bracket",)
+    with pytest.raises(InputError, match="neither a file nor the name of weights"):
+        GeoPoseNet.load("no-such")
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({}, "give cloud=, or depth=, mask= and camera= together"),
+        ({"cloud": torch.zeros(3, 3), "depth": torch.zeros(2, 2)}, "give cloud=, or depth="),
+        ({"depth": torch.ones(240, 320), "mask": torch.ones(240, 320)}, "give cloud=, or depth="),
+        ({"cloud": torch.zeros(3, 50)}, r"is of shape \(3, 50\); give points as rows"),
+        ({"cloud": torch.zeros(30, 3), "object": "braket"}, "did you mean 'bracket'"),
+        ({"cloud": Path("none.ply")}, "none.ply"),
+        (
+            {"depth": torch.ones(240, 320), "mask": torch.ones(24, 32), "camera": CAMERA},
+            r"the mask is of shape \(24, 32\), but the depth image of \(240, 320\)",
+        ),
+        (
+            {"depth": torch.ones(480, 640), "mask": torch.ones(480, 640), "camera": CAMERA},
+            "is 640x480 but its camera is 320x240; the aspect agrees",
+        ),
+        (
+            {"depth": torch.ones(100, 100), "mask": torch.ones(100, 100), "camera": K},
+            "its principal point at \\(160, 120\\), outside the depth image of 100x100",
+        ),
+        (
+            {"depth": torch.ones(100, 100), "mask": torch.ones(100, 100), "camera": K.T},
+            "it looks transposed",
+        ),
+        (
+            {
+                "depth": torch.ones(240, 320).int(),
+                "mask": torch.ones(240, 320),
+                "camera": dataclasses.replace(CAMERA, depth_unit_m=None),
+            },
+            "whole numbers, and nothing says of what",
+        ),
+        (
+            {"depth": torch.ones(1, 240, 320), "mask": torch.ones(240, 320), "camera": CAMERA},
+            r"the depth is of shape \(1, 240, 320\), not \(h, w\)",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_an_error(part: ObjectModel, given: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Oracle(tiny_weights(part), [pose_at()]).estimate(**given)
+
+
+def test_one_of_several_objects_must_be_named(part: ObjectModel) -> None:
+    net = Oracle(tiny_weights(part, bottle()), [pose_at()])
+    with pytest.raises(InputError, match="the weights know bracket, bottle; say which by object="):
+        net.estimate(cloud=torch.zeros(30, 3))
+
+
+def line() -> torch.Tensor:
+    return torch.linspace(0, 0.1, 200)[:, None] * torch.tensor([1.0, 0.5, 0.2]) + torch.tensor(
+        [0.0, 0.0, 0.8]
+    )
+
+
+def plane() -> torch.Tensor:
+    grid = torch.cartesian_prod(torch.linspace(0, 0.12, 30), torch.linspace(0, 0.1, 30))
+    return torch.cat([grid, torch.full((900, 1), 0.8)], 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "text"),
+    [
+        ("empty", "too few points", "the cloud is empty"),
+        ("three points", "too few points", "the cloud has 3 points, fewer than the 16"),
+        ("NaN", "too few points", "the cloud has no point with finite coordinates"),
+        ("line", "not observable", "the points lie on a line"),
+        ("plane", "not observable", "the points lie in a plane"),
+        ("one place", "not observable", "the points lie in one place"),
+        ("millimetres", "unusable input", "times larger than the model: is it in mm?"),
+        ("metres for mm", "unusable input", "times larger than the cloud: is it in mm?"),
+        ("scene", "unusable input", "times larger than the model: is this the right object"),
+        ("backward", "unusable input", "100% of the points lie behind the camera"),
+    ],
+)
+def test_bad_clouds_are_refused_with_a_reason(
+    part: ObjectModel, name: str, status: str, text: str
+) -> None:
+    cloud = cloud_of(part, pose_at())
+    clouds = {
+        "empty": cloud[:0],
+        "three points": cloud[:3],
+        "NaN": cloud * torch.nan,
+        "line": line(),
+        "plane": plane(),
+        "one place": cloud[:1].expand(100, 3),
+        "millimetres": 1000 * cloud,
+        "metres for mm": 0.001 * cloud,
+        "scene": (cloud - cloud.mean(0)) * 4.5 + torch.tensor([0.0, 0, 2]),
+        "backward": -cloud,
+    }
+    found = Oracle(tiny_weights(part), [pose_at()]).estimate(cloud=clouds[name])
+    assert found.status == status
+    assert text in found.reason
+    assert found.camera_from_model is None
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "text"),
+    [
+        ("no mask", "too few points", "the mask is empty"),
+        ("no depth", "too few points", "the depth image has no reading at all"),
+        ("no depth there", "too few points", "masked pixels has a depth reading"),
+        ("millimetres", "unusable input", "times larger than the model: is it in mm?"),
+        ("another K", "unusable input", "a K of another image size, changes the size of its cloud"),
+    ],
+)
+def test_bad_views_are_refused_with_a_reason(
+    part: ObjectModel, name: str, status: str, text: str
+) -> None:
+    depth_m, mask = view_of(part, pose_at())
+    wide = K.clone()
+    wide[0, 0] = wide[1, 1] = 100.0
+    views = {
+        "no mask": (depth_m, mask & False, K),
+        "no depth": (torch.zeros(240, 320), mask, K),
+        "no depth there": (torch.where(mask, 0.0, 1.0), mask, K),
+        "millimetres": (1000 * depth_m, mask, K),
+        "another K": (depth_m, mask, wide),
+    }
+    depth, pixels, camera = views[name]
+    net = Oracle(tiny_weights(part), [pose_at()])
+    found = net.estimate(depth=depth, mask=pixels, camera=camera)
+    assert found.status == status
+    assert text in found.reason
+
+
+def test_some_nan_and_flying_pixels_do_no_harm(part: ObjectModel) -> None:
+    truth = pose_at()
+    cloud = cloud_of(part, truth)
+    cloud[::10] = torch.nan
+    cloud[5::10, 2] += 1.5
+    assert_close(Oracle(tiny_weights(part), [truth]).estimate(cloud=cloud), truth)
+
+
+def test_a_mesh_with_holes_and_bad_faces_serves_as_well(part: ObjectModel) -> None:
+    faces = torch.cat([part.faces[3:], part.faces[5:8], torch.tensor([[1, 1, 2], [0, 0, 0]])])
+    worn = dataclasses.replace(part, faces=faces)
+    truth = pose_at()
+    found = Oracle(tiny_weights(worn), [truth]).estimate(cloud=cloud_of(part, truth))
+    assert_close(found, truth)
+
+
+def test_ten_million_points_are_thinned_first(part: ObjectModel) -> None:
+    truth = pose_at()
+    cloud = cloud_of(part, truth)
+    many = cloud[torch.arange(10_000_000) * len(cloud) // 10_000_000]
+    config = EstimateConfig(max_cloud_points=5000)
+    weights = tiny_weights(part, cloud=CloudConfig(max_points=None))
+    net = Oracle(weights, [truth], config=config)
+    assert_close(net.estimate(cloud=many), truth)

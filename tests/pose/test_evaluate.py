@@ -1,0 +1,189 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_frames import K, make_dataset, moved, predictions_of
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import BopDataset, Target
+from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.evaluate import (
+    diameter_of,
+    evaluate,
+    frames_hash,
+    is_adds,
+    of_targets,
+    read_any,
+)
+from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.metrics import add_m, adds_m, mspd_px
+from depthpose.pose.predictions import write_bop_results, write_predictions
+from depthpose.pose.types import Symmetries
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+    return make_dataset(tmp_path_factory.mktemp("made"))
+
+
+def test_the_truth_itself_is_perfect(made: BopDataset) -> None:
+    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model))
+    assert [row["object"] for row in result.rows] == ["bracket", "bottle", "mean", "all"]
+    for row in result.rows:
+        for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
+            assert row[name] == pytest.approx(1.0), (row["object"], name)
+        assert row["refused"] == row["wrong"] == 0.0
+        assert row["rotation_deg_median"] == pytest.approx(0.0, abs=1e-5)
+        assert row["ms_network"] == pytest.approx(20.0)
+        assert row["ms_total"] == pytest.approx(25.0)
+        assert "ms_icp" not in row
+        assert row["frames_sha256"] == frames_hash(made.instances)[:12]
+    assert [row["metric"] for row in result.rows[:2]] == ["ADD", "ADD-S"]
+    assert result.rows[2]["instances"] == result.rows[3]["instances"] == 6
+
+
+def test_a_turn_about_the_axis_of_a_bottle_is_no_error(made: BopDataset) -> None:
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+    quarter = Rigid(turn, torch.zeros(3).double())
+    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model @ quarter))
+    bracket, bottle = result.rows[:2]
+    assert bracket["wrong"] == 1.0
+    assert bracket["rotation_deg_median"] == pytest.approx(90.0)
+    assert bottle["success"] == 1.0
+    # BOP turns about an axis in steps: half a step is left.
+    assert bottle["rotation_deg_median"] < math.degrees(0.01)
+    assert bottle["ar"] > 0.99
+
+
+def test_errors_are_those_of_the_definitions(made: BopDataset) -> None:
+    def off(instance):  # noqa: ANN001, ANN202
+        return moved(instance, [0.0, 0.0, 0.0, 0.0, 0.0, 0.012])
+
+    result = evaluate(made, predictions_of(made, off))
+    for row, instance in zip(result.per_instance, made.instances, strict=True):
+        points = made.objects[instance.object_id].vertices_m
+        error = add_m if row["metric"] == "ADD" else adds_m
+        exact = float(error(off(instance), instance.camera_from_model, points))
+        assert row["error_m"] == pytest.approx(exact)
+        assert row["mssd_m"] == pytest.approx(0.012, rel=1e-3)
+        assert row["translation_m"] == pytest.approx(0.012)
+        if row["metric"] == "ADD":
+            # As in an image 640 wide: four times these pixels.
+            eye = symmetry_transforms(Symmetries())
+            pixels = mspd_px(off(instance), instance.camera_from_model, points, eye, K)
+            assert row["mspd_px"] == pytest.approx(4 * float(pixels))
+        # 12 mm are beyond the first tau (0.05 d) of a bottle of 18 cm, within all others.
+        assert 0 < row["vsd"] < 0.4
+    # Moved away by 12 mm: AUC is what is left of 10 cm.
+    assert result.rows[0]["auc"] == pytest.approx(1 - 0.12)
+
+
+def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDataset) -> None:
+    first, second = made.instances[0].name, made.instances[2].name
+    every = predictions_of(made, lambda i: None if i.name == second else i.camera_from_model)
+    result = evaluate(made, [p for p in every if p.estimate.name != first])
+    bracket, bottle, mean, pooled = result.rows
+    for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
+        assert bracket[name] == pytest.approx(1 / 3), name
+        assert bottle[name] == pytest.approx(1.0), name
+        assert mean[name] == pooled[name] == pytest.approx(2 / 3), name
+    assert bracket["refused"] == pytest.approx(2 / 3)
+    assert bracket["wrong"] == 0.0
+    statuses = [row["status"] for row in result.per_instance]
+    assert statuses == ["missing", "ok", "votes do not meet", "ok", "ok", "ok"]
+    assert result.per_instance[0]["error_m"] is None
+    assert result.per_instance[2]["reason"] == "the directions are parallel"
+
+
+def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
+    far = [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
+    first = made.instances[0].name
+    every = predictions_of(
+        made, lambda i: moved(i, far) if i.name == first else i.camera_from_model
+    )
+    every[0] = replace(every[0], estimate=replace(every[0].estimate, inlier_share=0.1))
+    result = evaluate(made, every)
+    assert result.rows[0]["wrong"] == pytest.approx(1 / 3)
+    assert result.rows[0]["refused"] == 0.0
+    # The wrong one is the least sure: who asks for less gets no wrong answer.
+    assert [row["risk"] for row in result.risk][-1] == pytest.approx(1 / 6)
+    assert [row["risk"] for row in result.risk][:-1] == [0.0] * (len(result.risk) - 1)
+    assert result.risk[-1]["coverage"] == 1.0
+
+
+def test_behind_the_camera_is_measured_too(made: BopDataset) -> None:
+    back = [0.0, 0.0, 0.0, 0.0, 0.0, -1.5]
+    result = evaluate(made, predictions_of(made, lambda i: moved(i, back)))
+    assert result.rows[-1]["ar"] == 0.0
+    assert result.per_instance[0]["mspd_px"] is None
+    assert result.per_instance[0]["vsd"] == 1.0
+
+
+def test_files_are_measured_alike(made: BopDataset, tmp_path: Path) -> None:
+    every = predictions_of(made, lambda i: moved(i, [0.1, 0.0, 0.0, 0.0, 0.0, 0.01]))
+    write_predictions(tmp_path, every)
+    write_bop_results(tmp_path / "ours_made-test.csv", every)
+    ours = evaluate(made, read_any(tmp_path)).rows
+    csv = evaluate(made, read_any(tmp_path / "ours_made-test.csv")).rows
+    for one, other in zip(ours, csv, strict=True):
+        for name in ("success", "auc", "ar", "rotation_deg_median", "ms_total"):
+            assert one[name] == pytest.approx(other[name]), name
+    assert "ms_network" not in csv[0]
+
+
+def test_several_of_an_object_are_set_against_their_nearest(made: BopDataset) -> None:
+    # Both objects of each image are taken for brackets, and their estimates have no names.
+    two = replace(made, instances=[replace(i, object_id=7) for i in made.instances[:2]])
+    answers = predictions_of(two, lambda i: moved(i, [0.0] * 5 + [0.001]))
+    stray = predictions_of(two, lambda i: moved(i, [0.0] * 5 + [0.4]))[0]
+    stray = replace(stray, estimate=replace(stray.estimate, inlier_share=0.2))
+    nameless = [
+        replace(p, estimate=replace(p.estimate, name=f"row {k}"))
+        for k, p in enumerate([stray, *reversed(answers)])
+    ]
+    row = evaluate(two, nameless).rows[0]
+    assert (row["success"], row["instances"]) == (1.0, 2)
+
+
+def test_the_diameter_table_is_named_and_decides(made: BopDataset) -> None:
+    cat = replace(made.objects[7], number=6, diameter_m=0.154546)
+    pvnet = EvaluationConfig(diameters="pvnet")
+    assert diameter_of(cat, EvaluationConfig()) == 0.154546
+    assert diameter_of(cat, pvnet) == 0.152633
+    with pytest.raises(InputError, match=r"object 7 \(bracket\) .* no object of PVNet's table"):
+        evaluate(made, predictions_of(made, lambda i: i.camera_from_model), pvnet)
+
+
+def test_eggbox_and_glue_of_linemod_are_symmetric_without_being_declared(made: BopDataset) -> None:
+    glue = replace(made.objects[7], number=11, symmetries=Symmetries())
+    cat = replace(glue, number=6)
+    linemod = replace(made, layout="Linemod_preprocessed")
+    config = EvaluationConfig()
+    assert [is_adds(linemod, model, config) for model in (glue, cat)] == [True, False]
+    assert [is_adds(made, model, config) for model in (glue, cat)] == [False, False]
+    assert is_adds(made, cat, EvaluationConfig(adds="all"))
+
+
+def test_targets_keep_the_most_visible(made: BopDataset) -> None:
+    hidden = replace(made.instances[1], object_id=7, visible_fraction=0.2)
+    some = replace(made, instances=[hidden, *made.instances])
+    target = Target(scene_id=1, image_id=0, object_id=7, count=1)
+    assert [i.name for i in of_targets(some, [target]).instances] == [made.instances[0].name]
+    assert frames_hash(some.instances) != frames_hash(made.instances)
+    with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
+        of_targets(some, [replace(target, count=3)])
+
+
+def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:
+    strangers = [
+        replace(p, estimate=replace(p.estimate, name=f"x{k}"), place=None)
+        for k, p in enumerate(predictions_of(made, lambda i: i.camera_from_model))
+    ]
+    with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
+        evaluate(made, strangers)
+    assert evaluate(made, []).rows[0]["refused"] == 1.0
+    with pytest.raises(InputError, match="vsd_delta_m is 15"):
+        EvaluationConfig(vsd_delta_m=15.0)

@@ -1,0 +1,140 @@
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid, perturb
+from depthpose.pose.bop import read_results
+from depthpose.pose.predictions import (
+    Job,
+    Place,
+    Prediction,
+    predict,
+    read_predictions,
+    write_bop_results,
+    write_predictions,
+)
+from depthpose.pose.types import PoseEstimate
+
+
+def some_pose(seed: int) -> Rigid:
+    generator = torch.Generator().manual_seed(seed)
+    start = Rigid(torch.eye(3), torch.tensor([0.01, -0.02, 0.8]))
+    return perturb(start, torch.randn(6, generator=generator))
+
+
+def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
+    generator = torch.Generator().manual_seed(seed)
+    return PoseEstimate(
+        name=name,
+        object="cat",
+        status="ok",
+        camera_from_model=some_pose(seed),
+        keypoints_m=torch.randn(8, 3, generator=generator),
+        covariance=torch.randn(6, 6, generator=generator),
+        free_motions=torch.randn(1, 6, generator=generator),
+        inlier_share=0.75,
+        residual_m=0.002,
+        risk=0.125,
+        signals={"gap": 0.01, "far": 0.2},
+        seconds={"network": 0.015, "voting": 0.007},
+    )
+
+
+def refusal(name: str = "b") -> PoseEstimate:
+    reason = "the cloud has 3 points"
+    return PoseEstimate(name=name, object="cat", status="too few points", reason=reason)
+
+
+def test_estimates_go_out_and_come_back(tmp_path: Path) -> None:
+    sent = [
+        Prediction(estimate=answer(), place=Place(1, 20, 6)),
+        Prediction(estimate=refusal(), place=Place(1, 20, 5)),
+        Prediction(estimate=replace(answer("c", 1), free_motions=None, seconds={})),
+    ]
+    write_predictions(tmp_path, sent)
+    for one, again in zip(sent, read_predictions(tmp_path), strict=True):
+        assert one.place == again.place
+        before, after = vars(one.estimate), vars(again.estimate)
+        for name, value in before.items():
+            if isinstance(value, torch.Tensor):
+                assert torch.equal(value.double(), after[name]), name
+            elif isinstance(value, Rigid):
+                assert torch.equal(value.R.double(), after[name].R)
+                assert torch.equal(value.t_m.double(), after[name].t_m)
+            else:
+                assert value == after[name], name
+
+
+def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> None:
+    lost = replace(answer(), residual_m=float("inf"))
+    write_predictions(tmp_path, [Prediction(estimate=lost)])
+    assert read_predictions(tmp_path)[0].estimate.residual_m is None
+
+
+def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
+    by_votes = replace(answer("c", 1), seconds={}, risk=None)
+    slow = replace(refusal(), seconds={"segmentation": 0.1})
+    sent = [
+        Prediction(estimate=answer(), place=Place(1, 20, 6)),
+        Prediction(estimate=slow, place=Place(1, 20, 5)),
+        Prediction(estimate=by_votes, place=Place(2, 0, 6)),
+    ]
+    path = tmp_path / "ours_lm-test.csv"
+    write_bop_results(path, sent)
+    first, second = read_results(path)
+    assert (first.scene_id, first.image_id, first.object_id) == (1, 20, 6)
+    assert first.seconds == pytest.approx(0.122)
+    assert first.score == 0.875
+    assert (second.seconds, second.score) == (None, 0.75)
+    assert torch.allclose(first.camera_from_model.t_m, some_pose(0).t_m.double(), atol=1e-7)
+    with pytest.raises(InputError, match="a: belongs to no scene of a BOP data set"):
+        write_bop_results(path, [Prediction(estimate=answer())])
+
+
+def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def estimate(names: Sequence[str]) -> list[PoseEstimate]:
+        asked.extend(names)
+        return [answer(name) for name in names]
+
+    def jobs(*names: str) -> list[Job[str]]:
+        return [Job(name=name, read=lambda name=name: name) for name in names]
+
+    run = predict(estimate, jobs("a", "b", "c"), tmp_path, {"voxel_m": 0.008})
+    assert [next(run), next(run)] == ["a", "b"]
+    run.close()  # as an interrupt does
+    assert [p.estimate.name for p in read_predictions(tmp_path)] == ["a", "b"]
+    done = list(predict(estimate, jobs("a", "b", "c", "d"), tmp_path, {"voxel_m": 0.008}, batch=2))
+    assert done == ["a", "b", "c", "d"]
+    assert asked == ["a", "b", "c", "d"]
+    with pytest.raises(InputError, match=r"holds results made with voxel_m = 0.008, but now it is"):
+        next(predict(estimate, jobs("a"), tmp_path, {"voxel_m": 0.005}))
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    write_predictions(tmp_path, [Prediction(estimate=answer(), place=Place(1, 2, 3))])
+    path = tmp_path / "poses.json"
+    row = json.loads(path.read_text())[0]
+    flipped = [[-1.0, 0.0, 0.0, 0.0], *row["camera_from_model"][1:]]
+    for change, said in (
+        ({"name": 3}, "name and object are 3 and 'cat'; write two words"),
+        ({"status": "okay"}, "status 'okay': did you mean 'ok'"),
+        ({"status": "votes do not meet"}, "an estimate that is ok has a camera_from_model"),
+        ({"camera_from_model": None}, "an estimate that is ok has a camera_from_model"),
+        ({"camera_from_model": flipped}, "camera_from_model is no rigid transform; write 4 rows"),
+        ({"covariance": [[1.0, "x"]]}, "covariance is not rows of 6 numbers"),
+        ({"seconds": [0.1]}, "where names to numbers belong"),
+        ({"im_id": None}, "im_id is None, where a number of 0 or more belongs"),
+    ):
+        path.write_text(json.dumps([row | change]))
+        with pytest.raises(InputError, match=rf"poses.json: entry 0: .*{said}"):
+            read_predictions(tmp_path)
+    path.write_text(json.dumps([row, row]))
+    with pytest.raises(InputError, match="two estimates are called 'a'; keep one of them"):
+        read_predictions(tmp_path)
