@@ -55,7 +55,7 @@ def test_a_clean_view_is_what_its_truth_looks_like(views: int | None) -> None:
         error_m = (view.input.depth_m - again_m).abs()
         error_m = error_m[error_m.isfinite()]
         assert float(error_m.median()) < (1e-6 if views is None else 1e-4)
-        assert float(error_m.mean()) < (1e-6 if views is None else 5e-4)
+        assert float(error_m.mean()) < (1e-6 if views is None else 8e-4)
 
 
 def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:

@@ -21,7 +21,6 @@ def predict(
     bop: Path | None = None,
     split: str = "test",
     masks: str = "truth",
-    segmentation: str | None = None,
     voting: Voting = "ransac",
     hypotheses: int = 128,
     icp: bool = True,
@@ -52,17 +51,17 @@ def predict(
         object: which of the objects that the weights know.
         bop: folder of a data set in BOP's layout, or of Linemod_preprocessed.
         split: of the data set.
-        masks: truth (the annotated ones), predicted (by --segmentation), or a JSON file of BOP
-            detections.
-        segmentation: weights that find the objects in pictures, for --masks predicted.
+        masks: truth (the annotated ones), predicted (those that came with Linemod_preprocessed),
+            a JSON file of BOP detections, or weights of a segmentation, by name or file.
         voting: ransac, or least-squares.
         hypotheses: of RANSAC, for each keypoint.
         icp: slide the voted pose onto the cloud.
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
     """
-    from depthpose.cli import posing
-    from depthpose.core.run import own_device
+    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli.pose_methods import pose_method
+    from depthpose.core.run import claim_names, own_device
 
     _refuse_mixture(cloud, depth, bop)
     method_name = "least squares" if voting == "least-squares" else "ransac"
@@ -71,10 +70,10 @@ def predict(
         with_icp=icp,
         device=own_device(device),
     )
-    method = posing.read_method(weights, config)
+    method = pose_method(weights, config)
     if bop is not None:
-        return _predict_bop(method, bop, split, masks, segmentation, out, batch)
-    name = method.object_named(object)
+        return _predict_bop(method, (bop, split, masks), out, batch)
+    name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
         jobs = posing.cloud_jobs(cloud, unit, name)
@@ -85,7 +84,7 @@ def predict(
             raise InputError("--depth needs --mask and --camera beside it")
         jobs = posing.view_jobs(depth, mask, camera, name)
         settings |= {"camera": str(camera.resolve()), "mask": str(mask.resolve())}
-    posing.claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
+    claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
     predictions = posing.predict_all(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
@@ -95,24 +94,21 @@ def predict(
 
 def _predict_bop(
     method: Any,  # noqa: ANN401  a type of this would load torch for --help
-    bop: Path,
-    split: str,
-    masks: str,
-    segmentation: str | None,
+    given: tuple[Path, str, str],
     out: Path,
     batch: int,
 ) -> int:
-    from depthpose.cli import posing
-    from depthpose.core.checkpoint import file_sha256, find_weights
+    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli.pose_methods import find_masks
+    from depthpose.pose.bop import open_bop
 
-    dataset = posing.open_known(bop, split, method)
-    settings: dict[str, Any] = {"bop": str(bop.resolve()), "split": split, "masks": masks}
-    if masks not in ("truth", "predicted"):
-        settings["masks"] = file_sha256(Path(masks)) if Path(masks).is_file() else masks
-    if segmentation is not None:
-        settings["segmentation"] = file_sha256(find_weights(segmentation))
-    jobs = posing.bop_jobs(dataset, masks, method, segmentation)
-    predictions = posing.predict_all(method, jobs, out, settings, batch)
+    folder, split, word = given
+    dataset = open_bop(folder, split)
+    dataset = dataset.of_objects(*posing.known_objects(dataset, method))
+    masks = find_masks(word, dataset, out)
+    settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
+    jobs = posing.bop_jobs(dataset, masks, method)
+    predictions = posing.predict_all(method, jobs, out, {**settings, **masks.settings}, batch)
     if predictions is None:
         return 0
     posing.write_bop_files(predictions, dataset, out, method)

@@ -12,25 +12,25 @@ from typing import Any
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.core.checkpoint import file_sha256, find_weights, say_terms
-from depthpose.core.config import config_to_dict
+from depthpose.cli.pose_methods import Masks, PoseMethod, match_names
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import list_images, read_image, write_cloud, write_image
+from depthpose.core.files import (
+    list_images,
+    read_depth_png,
+    read_image,
+    write_cloud,
+    write_image,
+)
 from depthpose.core.run import Shard, claim_folder, find_shard, wait_for
-from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.bop import BopDataset, Instance, open_bop
-from depthpose.pose.bop.detections import Detection, encode_rle, read_detections
+from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import EstimateConfig, Unit
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.config import Unit
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.overlay import draw_pose, posed_cloud
 from depthpose.pose.predictions import (
     Job,
     Prediction,
-    detection_jobs,
-    instance_jobs,
     is_started,
     predict,
     read_predictions,
@@ -38,12 +38,9 @@ from depthpose.pose.predictions import (
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.pose.weights import read_pose_weights
 
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
-_NO_POSE = (".run.json", "poses.json")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,57 +52,20 @@ class Unreadable:
     reason: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Method:
-    """An estimator, the objects that it knows, and what decides its results."""
-
-    net: GeoPoseNet | DepthImageRegressor
-    settings: dict[str, Any]
-
-    @property
-    def models(self) -> dict[str, ObjectModel]:
-        """The objects by name."""
-        return {model.name: model for model in self.net.weights.models}
-
-    def object_named(self, name: str | None) -> str:
-        """Give the object that is meant.
-
-        Raises:
-            InputError: none of that name, or several and none is named.
-        """
-        known = self.net.objects
-        if name is None and len(known) > 1:
-            raise InputError(f"the weights know {', '.join(known)}; say which by --object")
-        if name is not None and name not in known:
-            raise InputError(
-                f"--object {name}: the weights do not know it; {nearest_name(name, known)}"
-            )
-        return known[0] if name is None else name
-
-    def estimate_many(self, inputs: Sequence[AnyInput | Unreadable]) -> list[PoseEstimate]:
-        """Estimate what could be read; the rest is a refusal that says why."""
-        readable: list[Any] = [given for given in inputs if not isinstance(given, Unreadable)]
-        found = iter(self.net.estimate_many(readable))
-        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
-
-
-def read_method(weights: str, config: EstimateConfig) -> Method:
-    """Load an estimator of the kind that the weights are of.
+def object_named(name: str | None, method: PoseMethod) -> str:
+    """Give the object that is meant.
 
     Raises:
-        InputError: no such weights.
+        InputError: none of that name, or several and none is named.
     """
-    path = find_weights(weights)
-    found = read_pose_weights(path)
-    say_terms(found.facts)
-    is_regressor = isinstance(found.network, DepthImageNet)
-    knobs = config_to_dict(config)
-    # These two change no answer.
-    knobs = {k: v for k, v in knobs.items() if k not in ("device", "batch_voxels")}
-    return Method(
-        net=DepthImageRegressor(found, config) if is_regressor else GeoPoseNet(found, config),
-        settings={"weights_sha256": file_sha256(path), **knobs},
-    )
+    known = [model.name for model in method.models]
+    if name is None and len(known) > 1:
+        raise InputError(f"the weights know {', '.join(known)}; say which by --object")
+    if name is not None and name not in known:
+        raise InputError(
+            f"--object {name}: the weights do not know it; {nearest_name(name, known)}"
+        )
+    return known[0] if name is None else name
 
 
 def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
@@ -144,48 +104,39 @@ def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[An
     ]
 
 
-def bop_jobs(
-    dataset: BopDataset, masks: str, method: Method, segmentation: str | None
-) -> list[Job[Any]]:
-    """Take the instances of a data set by their annotated masks, or by detected ones.
-
-    Raises:
-        InputError: the weights know none of the objects, or the detections are of another set.
-    """
-    names = {model.number: model.name for model in method.net.weights.models}
-    if masks == "truth":
-        jobs: Sequence[Job[ViewInput]] = instance_jobs(dataset, names)
-    elif masks == "predicted":
-        if segmentation is None:
-            raise InputError("--masks predicted needs --segmentation W, weights that make masks")
-        jobs = detection_jobs(dataset, names, _segment(dataset, names, segmentation))
-    else:
-        jobs = detection_jobs(dataset, names, read_detections(Path(masks)))
-    numbers = {name: number for number, name in names.items()}
-    return [_safe(job, names[_number(job, numbers)]) for job in jobs]
-
-
-def open_known(folder: Path, split: str, method: Method) -> BopDataset:
-    """Open a data set, and keep the objects that the weights know.
+def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
+    """Number the objects of a data set that the weights know; say which are left out.
 
     Raises:
         InputError: they know none.
     """
-    dataset = open_bop(folder, split)
-    known = {model.number for model in method.net.weights.models}
-    kept = [i for i in dataset.instances if i.object_id in known]
-    left = sorted({i.object_id for i in dataset.instances} - known)
-    if not kept:
+    numbers = {model.number for model in method.models}
+    words = {model.name for model in method.models}
+    there = sorted({instance.object_id for instance in dataset.instances})
+    known = [n for n in there if n in numbers or dataset.objects[n].name in words]
+    left = sorted(set(there) - set(known))
+    if not known:
         raise InputError(
-            f"{folder}: holds objects {left}, but the weights know {sorted(known)}; give weights "
-            "of its objects"
+            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(words)}; "
+            "give weights of its objects"
         )
     if left:
         print(f"left out, as the weights do not know them: objects {left}", file=sys.stderr)
-    return replace(dataset, instances=kept)
+    return known
 
 
-def predict_all(method: Method, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
+def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:
+    """Take the instances of a data set by some masks.
+
+    Raises:
+        InputError: the weights do not know an object of it.
+    """
+    names = match_names(dataset, method.models)
+    jobs = masks.jobs(names)
+    return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
+
+
+def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
                 batch: int) -> list[Prediction] | None:  # fmt: skip
     """Estimate what is not finished; several processes share the work and meet in the files.
 
@@ -194,12 +145,17 @@ def predict_all(method: Method, jobs: list[Job[Any]], out: Path, settings: dict[
     """
     shard = find_shard()
     settings = {**method.settings, **settings}
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
+        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
+
     claim_folder(out, settings)
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
     done = _known(out)
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        names = predict(method.estimate_many, left, home, settings, batch)
+        names = predict(estimate_many, left, home, settings, batch)
         for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
             pass
     if shard.rank:
@@ -224,7 +180,7 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
 
 
 def write_files(
-    predictions: list[Prediction], jobs: list[Job[Any]], out: Path, method: Method
+    predictions: list[Prediction], jobs: list[Job[Any]], out: Path, method: PoseMethod
 ) -> None:
     """Write NAME.ply, and NAME.png where there is a depth image."""
     for prediction, job in zip(predictions, jobs, strict=True):
@@ -232,7 +188,7 @@ def write_files(
         pose = estimate.camera_from_model
         if pose is None:
             continue
-        given, model = job.read(), method.models[estimate.object]
+        given, model = job.read(), _model(method, estimate.object)
         points_m = given.points_m if not isinstance(given, ViewInput) else cloud_from_depth(
             given.depth_m, given.mask, given.K, model.diameter_m
         )  # fmt: skip
@@ -244,7 +200,7 @@ def write_files(
 
 
 def write_bop_files(
-    predictions: list[Prediction], dataset: BopDataset, out: Path, method: Method
+    predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
 ) -> None:
     """Write BOP's csv, and a picture SCENE_IMAGE.png of each image."""
     write_bop_results(out / results_name(dataset), predictions)
@@ -259,16 +215,14 @@ def write_bop_files(
             write_image(path, _overlay(image_of[scene, image], estimates, method))
 
 
-def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Method) -> Tensor:
+def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
     if instance.rgb is not None:
         picture = read_image(instance.rgb)
     else:
-        from depthpose.core.files import read_depth_png
-
         picture = _grey(read_depth_png(instance.depth, instance.depth_unit_m))
     for estimate in estimates:
         assert estimate.camera_from_model is not None
-        model = method.models[estimate.object]
+        model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture
 
@@ -303,6 +257,10 @@ def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
     return predictions
 
 
+def _model(method: PoseMethod, name: str) -> ObjectModel:
+    return next(model for model in method.models if model.name == name)
+
+
 _FAILED = "cannot be read: "
 
 
@@ -329,29 +287,3 @@ def _safe(job: Job[Any], object: str) -> Job[Any]:
             return Unreadable(name=job.name, object=object, reason=str(error))
 
     return replace(job, read=read)
-
-
-def _number(job: Job[Any], numbers: dict[str, int]) -> int:
-    return next(iter(numbers.values())) if job.place is None else job.place.object_id
-
-
-def _segment(dataset: BopDataset, names: dict[int, str], segmentation: str) -> list[Detection]:
-    """Find the objects of every image of a data set."""
-    segmenter = Segmenter.load(segmentation)
-    numbers = {name: number for number, name in names.items()}
-    images = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    found: list[Detection] = []
-    for (scene, image), instance in tqdm(images.items(), "masks", disable=None, unit=" images"):
-        if instance.rgb is None:
-            raise InputError(f"{instance.name}: has no picture, and masks are found in pictures")
-        start = time.perf_counter()
-        seen = segmenter.segment(read_image(instance.rgb))
-        seconds = time.perf_counter() - start
-        for name, masks in seen.masks.items():
-            if name in numbers:
-                found += [
-                    Detection(scene_id=scene, image_id=image, object_id=numbers[name],
-                              score=float(score), segmentation=encode_rle(mask), seconds=seconds)
-                    for mask, score in zip(masks, seen.scores[name], strict=True)
-                ]  # fmt: skip
-    return found

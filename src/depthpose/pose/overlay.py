@@ -27,10 +27,8 @@ def draw_pose(
     pose: Rigid,
     model: ObjectModel,
     K: Float64[Tensor, "3 3"],
-    color: Color = FOUND,
     *,
-    is_dashed: bool = False,
-    with_outline: bool = True,
+    is_true: bool = False,
 ) -> Float[Tensor, "3 h w"]:
     """Draw the projected box of a posed object, and the border of its silhouette.
 
@@ -39,17 +37,18 @@ def draw_pose(
         pose: ``camera_from_model``.
         model: the object; one of points alone is drawn by small discs.
         K: intrinsic matrix of the image.
-        color: RGB in [0, 1].
-        is_dashed: dash the box, as the truth is drawn beside an estimate.
-        with_outline: draw the silhouette too.
+        is_true: draw the box alone, green and dashed, as the truth beside an estimate; an estimate
+            is blue.
     """
-    ends_px = project(pose.apply(box_edges(model).flatten(0, 1)), K).unflatten(0, (12, 2))
-    if with_outline:
-        triangles = drawn_triangles(model).to(pose.R)
-        moved = pose.apply(triangles.flatten(0, 1)).unflatten(0, (-1, 3))
-        seen = rasterize(moved, K, image.shape[2], image.shape[1], with_barycentric=False)
-        image = draw_outline(image, seen.depth_m.isfinite(), color)
-    return draw_lines(image, ends_px, color, dash_px=_DASH_PX if is_dashed else None)
+    pose = Rigid(pose.R.double(), pose.t_m.double())
+    ends_m = pose.apply(box_edges(model).double().flatten(0, 1))
+    ends_px = project(ends_m, K).unflatten(0, (12, 2))
+    if is_true:
+        return draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
+    triangles = drawn_triangles(model).double()
+    moved = pose.apply(triangles.flatten(0, 1)).unflatten(0, (-1, 3))
+    seen = rasterize(moved, K, image.shape[2], image.shape[1], with_barycentric=False)
+    return draw_lines(draw_outline(image, seen.depth_m.isfinite(), FOUND), ends_px, FOUND)
 
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:

@@ -60,7 +60,7 @@ class ObjectsConfig:
     centre_px: tuple[float, float] = (325.2611, 242.04899)
     """Principal point."""
 
-    resolution: tuple[float, float] = (0.5, 1.0)
+    resolution: tuple[float, float] = (0.4, 0.8)
     """The image is so many times as large: coarser pictures are faster made."""
 
     occluded_share: float = 0.6
@@ -94,7 +94,7 @@ class ObjectsConfig:
         if not 0 <= self.mask_error_px <= 20:
             raise InputError(f"mask_error_px is {self.mask_error_px}; take 0 to 20, usually 3")
         _refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
-        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.5, 1.0)")
+        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.4, 0.8)")
         _refuse_range("occlusion", self.occlusion, (0.0, 0.95), "(0.0, 0.4)")
 
 

@@ -46,7 +46,7 @@ class FramesConfig:
     """Of the samples; the others are made."""
 
     with_roll: bool = True
-    """Turn the camera of a frame about its optical axis at random, which is as true as the frame."""
+    """Turn the camera of a frame about its optical axis at random: as true as the frame."""
 
     def __post_init__(self) -> None:
         """Refuse no folder, and shares that are none."""
