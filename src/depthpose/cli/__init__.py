@@ -32,7 +32,7 @@ COMMANDS = {
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose evaluate": ("pose_measures:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),
     "reproduce 3.1": ("pose_reproduce:table_3_1", "the method beside its baselines, by object"),
     "reproduce 3.2": ("pose_reproduce:table_3_2", "LineMOD: published rows, ours, difference"),

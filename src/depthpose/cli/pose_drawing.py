@@ -24,7 +24,7 @@ from depthpose.pose.figures import (
     embed_line,
     seen_points,
 )
-from depthpose.pose.overlay import TRUE, draw_pose, grey_depth
+from depthpose.pose.overlay import draw_pose, grey_depth
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.tables import VotingCase, cases_of
 from depthpose.pose.types import ObjectModel
@@ -145,11 +145,10 @@ def draw_boxes(
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "3 h w"]:
     """Draw the box of the truth, green and dashed, and of the estimate, blue and solid."""
-    truth, found = (None if p is None else Rigid(p.R.float(), p.t_m.float()) for p in poses)
-    assert truth is not None
+    truth, found = poses
     if found is not None:
-        image = draw_pose(image, found, model, K.double(), with_outline=False)
-    return draw_pose(image, truth, model, K.double(), TRUE, is_dashed=True, with_outline=False)
+        image = draw_pose(image, found, model, K.double())
+    return draw_pose(image, truth, model, K.double(), is_true=True)
 
 
 def picture_sections(

@@ -27,7 +27,7 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.overlay import draw_pose, posed_cloud
+from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
 from depthpose.pose.predictions import (
     Job,
     Prediction,
@@ -195,7 +195,7 @@ def write_files(
         finite_m = points_m[points_m.isfinite().all(-1)]
         write_cloud(out / f"{job.name}.ply", posed_cloud(finite_m, pose, model))
         if isinstance(given, ViewInput):
-            picture = draw_pose(_grey(given.depth_m), pose, model, given.K)
+            picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
             write_image(out / f"{job.name}.png", picture)
 
 
@@ -219,20 +219,12 @@ def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Pose
     if instance.rgb is not None:
         picture = read_image(instance.rgb)
     else:
-        picture = _grey(read_depth_png(instance.depth, instance.depth_unit_m))
+        picture = grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
     for estimate in estimates:
         assert estimate.camera_from_model is not None
         model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture
-
-
-def _grey(depth_m: Tensor) -> Tensor:
-    """Show depth by its grey, from the nearest to the farthest reading."""
-    seen = depth_m[depth_m.isfinite()]
-    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
-    share = 1 - (depth_m - low) / max(high - low, 1e-6)
-    return (0.15 + 0.85 * share).nan_to_num(0.0).clamp(0, 1).float().expand(3, -1, -1)
 
 
 def _known(out: Path) -> dict[str, Prediction]:

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from depthpose.cli.pose import Voting, voting_method
 from depthpose.core.errors import InputError
-from depthpose.pose.config import DiameterTable, VotingMethod
+from depthpose.pose.config import DiameterTable
 
 
 def table_3_1(
@@ -16,7 +17,7 @@ def table_3_1(
     objects: tuple[str, ...] = (),
     targets: Path | None = None,
     diameters: DiameterTable = "bop",
-    voting: VotingMethod = "ransac",
+    voting: Voting = "ransac",
     icp: bool = True,
     vsd: bool = False,
     pictures: int = 4,
@@ -41,7 +42,7 @@ def table_3_1(
         objects: keep these alone, by name or number.
         targets: a BOP list of targets.
         diameters: bop, or pvnet.
-        voting: ransac, or least squares.
+        voting: ransac, or least-squares.
         icp: refine each pose by ICP, the same for all.
         vsd: measure VSD and BOP's average recall too.
         pictures: how many instances the page shows.
@@ -54,7 +55,7 @@ def table_3_1(
     source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects)
     order = pose_reproducing.make_order("3.1", source, targets, pictures)
     rule = pose_reproducing.Rule(
-        diameters=diameters, voting=voting, with_icp=icp, with_vsd=vsd, device=device
+        diameters=diameters, voting=voting_method(voting), with_icp=icp, with_vsd=vsd, device=device
     )
     return pose_reproducing.reproduce_by_object(order, weights, masks, rule, out)
 
@@ -70,7 +71,7 @@ def table_3_2(
     objects: tuple[str, ...] = (),
     targets: Path | None = None,
     diameters: DiameterTable = "bop",
-    voting: VotingMethod = "ransac",
+    voting: Voting = "ransac",
     icp: bool = True,
     vsd: bool = False,
     pictures: int = 4,
@@ -95,7 +96,7 @@ def table_3_2(
         objects: keep these alone, by name or number.
         targets: a BOP list of targets.
         diameters: bop, or pvnet.
-        voting: ransac, or least squares.
+        voting: ransac, or least-squares.
         icp: refine each pose by ICP.
         vsd: measure VSD and BOP's average recall too.
         pictures: how many instances the page shows.
@@ -108,7 +109,7 @@ def table_3_2(
     source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects)
     order = pose_reproducing.make_order("3.2", source, targets, pictures)
     rule = pose_reproducing.Rule(
-        diameters=diameters, voting=voting, with_icp=icp, with_vsd=vsd, device=device
+        diameters=diameters, voting=voting_method(voting), with_icp=icp, with_vsd=vsd, device=device
     )
     return pose_reproducing.reproduce_by_object(order, weights, masks, rule, out, csv)
 
