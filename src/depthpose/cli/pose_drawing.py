@@ -130,9 +130,9 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Panel]:
     panels: list[Panel] = []
     for k, view in enumerate(views.samples):
         found = net.estimate_many([view.input])[0]
-        truth = view.truth.camera_from_model
-        model = models[view.input.object]
-        image = draw_boxes(views.picture(k), (truth, found.camera_from_model), model, view.input.K)
+        poses = (view.truth.camera_from_model, found.camera_from_model)
+        picture, K = _close_up(views.picture(k), view.input.mask, view.input.K)
+        image = draw_boxes(picture, poses, models[view.input.object], K)
         caption = view.input.name if found.is_ok else f"{view.input.name}: refused, {found.reason}"
         panels.append(Panel(caption, image))
     return panels

@@ -70,10 +70,14 @@ def draw_discs(
     steps = torch.cartesian_prod(*[torch.arange(-reach, reach + 1)] * 2)
     steps = steps[steps.double().norm(dim=1) <= radius_px]
     order = places[:, 2].argsort(descending=True, stable=True)
-    drawn = image.clone()
-    # One after the other, far ones first: the last to write a pixel is the nearest.
-    for place, ink in zip(places[order, :2].round().long(), colors[order].to(image), strict=True):
-        u, v = (place + steps).unbind(1)
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        drawn[:, v[inside], u[inside]] = ink[:, None]
-    return drawn
+    cells = places[order, None, :2].round().long() + steps
+    u, v = cells.unbind(-1)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    # Of the discs that cover a pixel the last in this order, the nearest, is seen.
+    rank = torch.arange(len(order))[:, None].expand_as(u)
+    seen = torch.full((height * width,), -1)
+    seen.scatter_reduce_(0, (v * width + u)[inside], rank[inside], "amax")
+    drawn = image.flatten(1).clone()
+    is_drawn = seen >= 0
+    drawn[:, is_drawn] = colors[order][seen[is_drawn]].to(image).T
+    return drawn.view_as(image)

@@ -37,7 +37,9 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
     y = _principal(features.double())
     y = 1e-4 * y / y.std().clamp(min=1e-12)
     speed, gain = torch.zeros_like(y), torch.ones_like(y)
-    rate = max(len(y) / _EXAGGERATION / 4, 50.0)
+    # A larger one than the curvature at the start allows tears groups apart, and on a line they
+    # never come together again.
+    rate = len(y) / (4 * _EXAGGERATION)
     for step in range(_STEPS):
         is_early = step < _EXAGGERATED
         gradient = kl_gradient(P * (_EXAGGERATION if is_early else 1.0), y)
