@@ -21,6 +21,10 @@ COMMANDS = {
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
+    "data make objects": (
+        "data:make_objects",
+        "made frames of your CAD files on a table, in BOP's layout",
+    ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
