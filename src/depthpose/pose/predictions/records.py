@@ -17,7 +17,7 @@ from depthpose.pose.bop.parse import integer, number, read_rows
 from depthpose.pose.types import PoseEstimate, Status
 
 POSES = "poses.json"
-STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp")
+STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
 _ROTATION_SLACK = 1e-4

@@ -1,0 +1,120 @@
+"""The work behind ``depthpose pose evaluate``."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.core.checkpoint import file_sha256
+from depthpose.core.report import Section, markdown_table, write_page, write_table
+from depthpose.core.run import environment, read_settings
+from depthpose.pose.bop import BopDataset, Instance, open_bop, read_targets
+from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.evaluate import Evaluation, evaluate, of_targets, read_any
+
+HOW = (
+    "Success: ADD (ADD-S of a symmetric object) below 10 % of the diameter. Refused: no answer, or "
+    "no estimate at all; wrong: an answer that is no success. Both stay in every number. AUC: area "
+    "to 10 cm. ar, ar_vsd, ar_mssd, ar_mspd: BOP's average recalls. The row 'mean' counts each "
+    "object the same, 'all' each instance, as BOP does."
+)
+
+
+def open_instances(
+    bop: Path, split: str, objects: Sequence[str], targets: Path | None
+) -> BopDataset:
+    """Open what is to be measured, and say what it is."""
+    dataset = open_bop(bop, split)
+    if targets is not None:
+        dataset = of_targets(dataset, read_targets(targets))
+    if objects:
+        dataset = dataset.of_objects(*(int(o) if o.isdecimal() else o for o in objects))
+    names = ", ".join(model.name for model in dataset.objects.values())
+    print(f"{bop} {split}: {len(dataset)} instances, layout {dataset.layout}; objects: {names}")
+    return dataset
+
+
+def measure_all(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
+) -> Evaluation:
+    """Measure several folders or csv files of predictions; each row says whose it is."""
+    rows: list[dict[str, Any]] = []
+    instances: list[dict[str, Any]] = []
+    risk: list[dict[str, Any]] = []
+    for path in predictions:
+        who = describe(path)
+        result = evaluate(dataset, read_any(path), config, _show_progress)
+        rows += [who | row for row in result.rows]
+        short = {"method": who["method"], "masks": who["masks"]}
+        instances += [short | row for row in result.per_instance]
+        risk += [short | row for row in result.risk]
+    return Evaluation(rows=rows, per_instance=instances, risk=risk)
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Columns that say whose predictions these are."""
+    settings = read_settings(path) if path.is_dir() else None
+    if settings is None:
+        # A file of others is its own fingerprint.
+        sha256 = "" if path.is_dir() else file_sha256(path)[:12]
+        return {"method": path.stem, "masks": "", "weights": "", "weights_sha256": sha256}
+    masks = settings.get("masks", "")
+    return {
+        "method": path.name.removesuffix(f"_{masks}"),
+        "masks": masks,
+        "weights": settings.get("weights", ""),
+        "weights_sha256": settings.get("weights_sha256", "")[:12],
+    }
+
+
+def success_by_masks(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Set the successes with each kind of masks side by side, a row a method and object."""
+    table: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        place = (row["method"], row["object"])
+        entry = table.setdefault(place, {"method": row["method"], "object": row["object"]})
+        entry[f"{row['masks'] or 'their'} masks"] = row["success"]
+    return list(table.values())
+
+
+def report(dataset: BopDataset, measured: Evaluation, out: Path) -> int:
+    """Write rows.json, rows.csv, table.md, report.html and instances.csv, and print the rows."""
+    write_table(out, measured.rows)
+    write_details(measured, out)
+    sections = [
+        Section(title="Success by masks", text=HOW, rows=success_by_masks(measured.rows)),
+        Section(title="All numbers", rows=measured.rows),
+        *detail_sections(measured),
+    ]
+    page = out / "report.html"
+    title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
+    write_page(page, title, sections, environment())
+    print(markdown_table(measured.rows))
+    print(f"the page: {page}")
+    return 0
+
+
+def write_details(measured: Evaluation, out: Path) -> None:
+    """Write each instance's numbers, and the risk by coverage."""
+    write_table(out, measured.per_instance, name="instances")
+    if measured.risk:
+        write_table(out, measured.risk, name="risk")
+
+
+def detail_sections(measured: Evaluation) -> list[Section]:
+    """Make the parts of a page below its tables."""
+    failed = [row for row in measured.per_instance if not row["is_success"]]
+    sections = [
+        Section(
+            title="Risk by coverage",
+            text="How many answers are wrong if only the surest are given.",
+            rows=measured.risk,
+        ),
+        Section(title="Each instance that is no success", rows=failed),
+    ]
+    return [section for section in sections if section.rows]
+
+
+def _show_progress(instances: Sequence[Instance]) -> Iterable[Instance]:
+    return tqdm(instances, unit=" instances", disable=None)

@@ -1,0 +1,119 @@
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_frames import made_models, make_dataset, moved, predictions_of
+from tests.pose.made_object import tiny_weights
+
+from depthpose.cli import main
+from depthpose.core.checkpoint import file_sha256
+from depthpose.pose.bop import BopDataset, Detection, encode_rle, read_mask, write_detections
+from depthpose.pose.evaluate import frames_hash
+from depthpose.pose.predictions import read_predictions, write_bop_results
+from depthpose.pose.weights import write_pose_weights
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+    return make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    write_pose_weights(path, tiny_weights(*made_models()))
+    return path
+
+
+def rows_of(out: Path) -> list[dict[str, object]]:
+    return json.loads((out / "rows.json").read_text())
+
+
+def test_a_csv_is_measured(
+    made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "theirs_made-test.csv"
+    off = predictions_of(made, lambda i: moved(i, [0.0] * 5 + [0.01]) if i.index else None)
+    write_bop_results(file, off)
+    out = tmp_path / "out"
+    words = ["--bop", str(made.folder), "--csv", str(file), "--out", str(out)]
+    assert main(["pose", "evaluate", *words]) == 0
+    bracket, bottle, mean, pooled = rows_of(out)
+    assert (bracket["refused"], bracket["success"]) == (1.0, 0.0)
+    assert (bottle["refused"], bottle["success"]) == (0.0, 1.0)
+    assert mean["success"] == pooled["success"] == 0.5
+    assert mean["method"] == "theirs_made-test"
+    assert mean["weights_sha256"] == file_sha256(file)[:12]
+    assert mean["frames_sha256"] == frames_hash(made.instances)[:12]
+    assert mean["diameters"] == "bop"
+    assert "| theirs_made-test |" in (out / "table.md").read_text()
+    with (out / "instances.csv").open() as lines:
+        statuses = [row["status"] for row in csv.DictReader(lines)]
+    assert statuses == ["missing", "ok"] * 2
+    assert "Success by masks" in (out / "report.html").read_text()
+    assert "4 instances, layout BOP; objects: bracket, bottle" in capsys.readouterr().out
+
+
+def test_weights_predict_once_with_true_and_predicted_masks(
+    made: BopDataset, weights: Path, tmp_path: Path
+) -> None:
+    # Of the second image nothing is detected; of the first both, and something of another set.
+    seen = [i for i in made.instances if i.image_id == 0]
+    masks = [read_mask(i.mask) for i in seen if i.mask is not None]
+    found = [
+        Detection(scene_id=i.scene_id, image_id=i.image_id, object_id=i.object_id, score=0.9,
+                  segmentation=encode_rle(mask), seconds=0.5)
+        for i, mask in zip(seen, masks, strict=True)
+    ]  # fmt: skip
+    stray = Detection(scene_id=9, image_id=0, object_id=7, score=1.0,
+                      segmentation=encode_rle(masks[0]))  # fmt: skip
+    write_detections(tmp_path / "found.json", [*found, stray])
+    out = tmp_path / "out"
+    words = ["--bop", str(made.folder), "--weights", str(weights), "--out", str(out)]
+    words += ["--masks", "truth", str(tmp_path / "found.json"), "--no-vsd"]
+    assert main(["pose", "evaluate", *words]) == 0
+    homes = [out / "predictions" / f"tiny_{masks}" for masks in ("truth", "found")]
+    assert [len(read_predictions(home)) for home in homes] == [4, 2]
+    first = [p.estimate for p in read_predictions(homes[0])[:2]]
+    again = [p.estimate for p in read_predictions(homes[1])]
+    for one, other in zip(first, again, strict=True):
+        # The same pixels, the same pose or refusal.
+        assert one.status == other.status
+        assert other.seconds["segmentation"] == 0.25
+        if one.keypoints_m is not None:
+            assert other.keypoints_m is not None
+            assert torch.equal(one.keypoints_m, other.keypoints_m)
+    assert (homes[0] / "depthpose_made-test.csv").is_file()
+    rows = rows_of(out)
+    assert [(row["masks"], row["object"]) for row in rows[::4]] == [
+        ("truth", "bracket"), ("found", "bracket"),
+    ]  # fmt: skip
+    assert {row["weights_sha256"] for row in rows} == {file_sha256(weights)[:12]}
+    assert rows[0]["ar"] is None
+    before = [(home / "poses.json").stat().st_mtime_ns for home in homes]
+    assert main(["pose", "evaluate", *words]) == 0
+    assert before == [(home / "poses.json").stat().st_mtime_ns for home in homes]
+
+
+def test_what_cannot_be_measured_is_refused(
+    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = ["--bop", str(made.folder), "--out", str(tmp_path / "out")]
+    few = tmp_path / "few.safetensors"
+    write_pose_weights(few, tiny_weights(made_models()[0]))
+    nobody = tmp_path / "nobody.json"
+    nobody.write_text("[]")
+    for words, said in (
+        ([], "measure --weights FILE, --csv FILE or --predictions DIR"),
+        (["--weights", str(few)], "object 10 (bottle) is none of those the weights know"),
+        (["--weights", str(weights), "--masks", "predicted"], "came without predicted masks"),
+        (["--weights", str(weights), "--masks", str(nobody)], "none of the 0 detections is of an"),
+        (["--weights", str(weights), "--objects", "duck"], "no instance of ('duck',)"),
+    ):
+        assert main(["pose", "evaluate", *here, *words]) == 2
+        assert said in capsys.readouterr().err
+    assert (
+        main(["pose", "evaluate", *here, "--weights", str(few), "--objects", "7", "--no-vsd"]) == 0
+    )
