@@ -35,6 +35,10 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "pose train": (
+        "pose_training:train",
+        "your CAD file, or a config, to a network that poses it",
+    ),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose evaluate": ("pose_measures:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),

@@ -92,6 +92,9 @@ class ResUNet(nn.Module):
         # The answers are parts of unit vectors: begin near nothing, not twice too long.
         with torch.no_grad():
             self.final.weight.mul_(0.5)
+            if config.norm == "batch":
+                self.mix.weight.mul_(NORMED_SCALE)
+                self.final.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints components"]:
         """Give the raw directions (and logits, where the config has them) of each point given.
