@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.pose.config import CloudConfig
 
@@ -47,11 +46,22 @@ def cloud_from_depth(
     """
     refuse_other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
-    points_m = back_project(depth_m, K)[is_read]
+    points_m = _lifted(depth_m, is_read, K)
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+
+
+def _lifted(
+    depth_m: Float[Tensor, "h w"], is_read: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n 3"]:
+    """Do as ``back_project`` for some pixels alone, a fraction of the image."""
+    v, u = is_read.nonzero(as_tuple=True)
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    y = (v.to(depth_m) - cy) / fy
+    x = (u.to(depth_m) - cx - skew * y) / fx
+    return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
 
 
 def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:

@@ -18,7 +18,9 @@ from depthpose.pose.mesh import symmetries_from_bop, symmetries_to_bop
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel
 
-AnyNetwork = ResUNet | PointNet | DepthImageNet
+DirectionNet = ResUNet | PointNet
+"""Networks whose points vote."""
+AnyNetwork = DirectionNet | DepthImageNet
 KIND = "geoposenet"
 _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     KIND: (ResUNet, ResUNetConfig),

@@ -101,7 +101,7 @@ class TrainingClouds:
             if refusal_of(points, self.cloud) is None:
                 return self._voxelised(sample, generator)
         raise InputError(
-            f"{_TRIES} samples of {sample.input.object!r} in a row have fewer than "
+            f"ticket {ticket}: {_TRIES} samples in a row have fewer than "
             f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
