@@ -47,11 +47,12 @@ def table_3_1(
         pictures: how many instances the page shows.
         device: cpu, cuda, cuda:1, ...
     """
-    from depthpose.cli import pose_reproducing
+    from depthpose.cli import pose_reproducing, pose_views
 
     if len(weights) < 2:
         raise InputError("table 3.1 sets the method beside its baselines: give two weights or more")
-    order = pose_reproducing.make_order("3.1", (linemod, bop, split), (objects, targets), pictures)
+    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects)
+    order = pose_reproducing.make_order("3.1", source, targets, pictures)
     rule = pose_reproducing.Rule(
         diameters=diameters, voting=voting, with_icp=icp, with_vsd=vsd, device=device
     )
@@ -80,7 +81,7 @@ def table_3_2(
     Writes rows.json, rows.csv, table.md (percent by object), all.json (every number),
     instances.csv, report.md and report.html. Masks truth and predicted are two rows of ours.
 
-        depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W.safetensors --masks truth predicted --out out/table-3.2
+        depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W --out out/table-3.2
 
     Args:
         out: folder for all that is written.
@@ -100,11 +101,12 @@ def table_3_2(
         pictures: how many instances the page shows.
         device: cpu, cuda, cuda:1, ...
     """
-    from depthpose.cli import pose_reproducing
+    from depthpose.cli import pose_reproducing, pose_views
 
     if not weights and not csv:
         raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
-    order = pose_reproducing.make_order("3.2", (linemod, bop, split), (objects, targets), pictures)
+    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects)
+    order = pose_reproducing.make_order("3.2", source, targets, pictures)
     rule = pose_reproducing.Rule(
         diameters=diameters, voting=voting, with_icp=icp, with_vsd=vsd, device=device
     )
@@ -123,10 +125,10 @@ def table_3_3(
 ) -> int:
     """Make table 3.3 again: RANSAC against least squares on the same directions of one network.
 
-    Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50, 128
-    and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:
-    success by ADD(-S) without ICP, and milliseconds of the vote alone, all in one process. Without a
-    data set the clouds are made views of the weights' objects.
+    Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50,
+    128 and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:
+    success by ADD(-S) without ICP, and milliseconds of the vote alone, all in one process. Without
+    a data set the clouds are made views of the weights' objects.
 
         depthpose reproduce 3.3 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
@@ -140,7 +142,7 @@ def table_3_3(
         made: how many made views where no data set is given.
         points: at most so many votes of a cloud; a block of rows each.
     """
-    from depthpose.cli import pose_reproducing
+    from depthpose.cli import pose_reproducing, pose_views
 
-    sources = (linemod, bop, split)
-    return pose_reproducing.reproduce_voting(weights, sources, objects, (made, points), out)
+    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects, made=made)
+    return pose_reproducing.reproduce_voting(weights, source, points, out)

@@ -1,14 +1,15 @@
 """The work behind ``depthpose reproduce 3.1``, ``3.2`` and ``3.3``."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from depthpose.cli import pose_evaluating, pose_methods
-from depthpose.cli.pose_figures import picture_sections
+from depthpose.cli.pose_drawing import picture_sections
+from depthpose.cli.pose_views import Source, open_views
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.report import (
@@ -24,20 +25,12 @@ from depthpose.pose.config import (
     DiameterTable,
     EstimateConfig,
     EvaluationConfig,
-    ObjectsConfig,
     VotingConfig,
     VotingMethod,
 )
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
-from depthpose.pose.objects import Objects
 from depthpose.pose.tables import TITLES, cases_of, compare_voting, join_by_object
-from depthpose.pose.types import ViewSample
-
-MADE_SEED = 3303
-"""Of the made views of table 3.3: no training begins with it."""
-
-Sources = tuple[Path | None, Path | None, str]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,18 +64,15 @@ class Rule:
         return EvaluationConfig(diameters=self.diameters, with_vsd=self.with_vsd)
 
 
-def make_order(
-    number: str, sources: Sources, chosen: tuple[Sequence[str], Path | None], pictures: int
-) -> Order:
+def make_order(number: str, source: Source, targets: Path | None, pictures: int) -> Order:
     """Open the one data set that was named.
 
     Raises:
         InputError: none was named, or two.
     """
-    folder = _one_folder(sources)
-    if folder is None:
+    if source.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
-    dataset = pose_evaluating.open_instances(folder, sources[2], *chosen)
+    dataset = pose_evaluating.open_instances(source.folder, source.split, source.objects, targets)
     return Order(number=number, dataset=dataset, pictures=pictures)
 
 
@@ -115,30 +105,15 @@ def reproduce_by_object(
     return _write(f"{TITLES[order.number]}, on {dataset.folder.resolve().name}", sections, out)
 
 
-def reproduce_voting(
-    weights: str,
-    sources: Sources,
-    objects: Sequence[str],
-    amounts: tuple[int, Sequence[int]],
-    out: Path,
-) -> int:
+def reproduce_voting(weights: str, source: Source, points: Sequence[int], out: Path) -> int:
     """Compare ways of voting on the same directions, block by block of points."""
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
-    folder = _one_folder(sources)
-    made, points = amounts
-    facts: dict[str, Any] = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12]}
-    if folder is None:
-        views = _made_views(net, made)
-        facts["frames"] = f"made, seed {MADE_SEED}"
-    else:
-        dataset = pose_evaluating.open_instances(folder, sources[2], objects, None)
-        views = list(_views_of(dataset, net))
-        facts["frames"] = f"{folder.resolve().name} {sources[2]}"
-        facts["frames_sha256"] = frames_hash(dataset.instances)[:12]
+    views = open_views(net, source)
+    facts = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12], **views.facts}
     rows: list[dict[str, Any]] = []
     for count in points:
-        cases = list(cases_of(net, tqdm(views, f"{count} points", disable=None), count))
+        cases = list(cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count))
         rows += [row | facts for row in compare_voting(cases, count)]
     write_table(out, rows)
     text = (
@@ -157,26 +132,6 @@ def _write(title: str, sections: Sequence[Section], out: Path) -> int:
     print(markdown_table(sections[0].rows))
     print(f"the page: {out / 'report.html'}")
     return 0
-
-
-def _one_folder(sources: Sources) -> Path | None:
-    linemod, bop, _ = sources
-    if linemod is not None and bop is not None:
-        raise InputError(f"two data sets were named, {linemod} and {bop}; a table is of one.")
-    return linemod or bop
-
-
-def _made_views(net: GeoPoseNet, number: int) -> list[ViewSample]:
-    config = ObjectsConfig(number=number, seed=MADE_SEED)
-    objects = Objects(net.weights.models, config, net.weights.cloud)
-    return [objects.view(i) for i in range(number)]
-
-
-def _views_of(dataset: BopDataset, net: GeoPoseNet) -> Iterator[ViewSample]:
-    names = pose_methods.match_names(dataset, net.weights.models)
-    for instance in dataset.instances:
-        view = dataset.view(instance)
-        yield replace(view, input=replace(view.input, object=names[instance.object_id]))
 
 
 def _settings(

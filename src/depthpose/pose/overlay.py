@@ -64,3 +64,18 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid, model: ObjectModel) 
     surface_m = pose.apply(sample_surface(model, _SURFACE)[0].to(pose.R))
     colors = [torch.full((len(cloud_m), 3), 0.6), torch.tensor(FOUND).expand(len(surface_m), 3)]
     return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))
+
+
+def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
+    """Show depth by its grey, near bright and far dark, black where nothing was read.
+
+    From the 1st to the 99th percentile of the readings: a stray one does not set the scale.
+    """
+    seen = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
+    if len(seen) == 0:
+        return torch.zeros(3, *depth_m.shape)
+    last = len(seen) - 1
+    low, high = float(seen[round(0.01 * last)]), float(seen[round(0.99 * last)])
+    share = 1 - ((depth_m - low) / max(high - low, 1e-6)).clamp(0, 1)
+    grey = torch.where(depth_m > 0, 0.15 + 0.85 * share, 0.0)
+    return grey.nan_to_num(0.0).float().expand(3, -1, -1)
