@@ -115,7 +115,7 @@ def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
 def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) -> None:
     config = dataclasses.replace(
         depth_image_config(models_folder),
-        loop=LoopConfig(steps=60, batch_size=4, device="cpu", log_every_steps=10),
+        loop=LoopConfig(steps=40, batch_size=4, device="cpu", log_every_steps=10),
         adam=AdamConfig(learning_rate=3e-3),
     )
     STAGES["depth-image"][1](config, Run(folder=tmp_path))

@@ -21,6 +21,10 @@ COMMANDS = {
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
+    "data make objects": (
+        "data:make_objects",
+        "made frames of your CAD files on a table, in BOP's layout",
+    ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
@@ -31,6 +35,10 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "pose train": (
+        "pose_training:train",
+        "your CAD file, or a config, to a network that poses it",
+    ),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),

@@ -79,6 +79,31 @@ class HeldOutConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CalibrationConfig:
+    """Made views by which the refusal is chosen, after the training."""
+
+    number: int = 150
+    """Of each object; 0: nothing is ever refused for its risk."""
+
+    occlusion: tuple[float, float] = (0.0, 0.6)
+    """Hidden shares of the silhouette, from easy to hard."""
+
+    max_wrong_share: float = 0.01
+    """Wrong answers among the answers that are given."""
+
+    def __post_init__(self) -> None:
+        """Refuse too few views to choose by, and shares that are none."""
+        if self.number and self.number < 20:
+            raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
+                             "views: take 150, or 0 for no refusal")  # fmt: skip
+        if not 0 < self.max_wrong_share < 1:
+            raise InputError(
+                f"max_wrong_share is {self.max_wrong_share}, but a share is between 0 and 1; take "
+                "0.01"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class PoseTraining:
     """The direction network learns to point at keypoints."""
 
@@ -117,6 +142,9 @@ class PoseTraining:
 
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
     """What validation looks at."""
+
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """By what the refusal is chosen."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(

@@ -13,6 +13,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.loop import Evidence, Turn, make_adam, shuffled_index, ticket_generator, train
 from depthpose.core.rigid import Rigid
+from depthpose.core.run import find_shard
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.bop import open_bop
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -23,9 +24,9 @@ from depthpose.pose.objects import Objects
 from depthpose.pose.train.baselines_config import DepthImageTraining
 from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, claim_run, leave_weights, with_classes
+from depthpose.pose.train.run import Run, claim_run, packed, with_classes
 from depthpose.pose.types import ObjectModel, ViewSample
-from depthpose.pose.weights import PoseWeights, read_pose_weights
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 _TRIES = 20
 _SYMMETRY_STEP = 0.2
@@ -174,7 +175,9 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     task = DepthImageTask(network, models, config)
     train(task, crops, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
     path = run.folder / "depth-image.safetensors"
-    return leave_weights(path, network.cpu().eval(), models, config)
+    if not find_shard().rank:
+        write_pose_weights(path, packed(network, models, config), with_half=config.with_half)
+    return path
 
 
 def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:

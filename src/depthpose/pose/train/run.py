@@ -13,7 +13,7 @@ from depthpose.core.run import claim_folder, find_shard
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.train.config import FramesConfig
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.weights import AnyNetwork, PoseWeights, write_pose_weights
+from depthpose.pose.weights import AnyNetwork, PoseWeights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Knobs of the loop that change no weight: a resumed run may have others."""
@@ -50,7 +50,8 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     settings = {"stage": type(config).__name__, **config_to_dict(config)}
     settings["loop"] = {k: v for k, v in settings["loop"].items() if k not in _FREE}
     settings["loop"]["processes"] = find_shard().world
-    settings.pop("held_out", None)
+    for judged in ("held_out", "calibration"):  # no weight of the network follows from these
+        settings.pop(judged, None)
     settings["sha256"] = [file_sha256(Path(path)) for path in files]
     if config.start is not None:
         settings["start_sha256"] = file_sha256(find_weights(config.start))
@@ -58,21 +59,18 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     write_config(run.folder / "config.yaml", config)
 
 
-def leave_weights(
-    path: Path,
+def packed(
     network: AnyNetwork,
     models: tuple[ObjectModel, ...],
     config: Any,  # noqa: ANN401
-) -> Path:
-    """Write a trained network with its objects, from the first process alone."""
-    if find_shard().rank:
-        return path  # statistics of batch norm are rank 0's, and so is the file
+) -> PoseWeights:
+    """Put a trained network and its objects together, with what the card says of them."""
     frames: FramesConfig | None = config.frames
     cloud: CloudConfig = config.cloud
     names = ", ".join(model.name for model in models)
-    source = "made views" if frames is None else f"{frames.folder} and made views"
-    weights = PoseWeights(
-        network=network,
+    source = "made views" if frames is None else f"{Path(frames.folder).name} and made views"
+    return PoseWeights(
+        network=network.cpu().eval(),
         models=models,
         cloud=cloud,
         refusal=RefusalConfig(),
@@ -82,8 +80,6 @@ def leave_weights(
             "licence": "not stated; that of the models binds",
         },
     )
-    write_pose_weights(path, weights, with_half=config.with_half)
-    return path
 
 
 def with_classes(network: Any, models: Sequence[ObjectModel]) -> Any:  # noqa: ANN401

@@ -8,7 +8,9 @@ import torch
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
+from depthpose.core.files import atomic_write, write_json
 from depthpose.core.loop import train
+from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.train.baselines_config import DepthImageTraining, PointNetTraining
@@ -16,12 +18,14 @@ from depthpose.pose.train.clouds import TrainingClouds
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.depth_image import train_depth_image
 from depthpose.pose.train.held_out import HeldOut
+from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, claim_run, leave_weights, with_classes
+from depthpose.pose.train.run import Run, claim_run, packed, with_classes
 from depthpose.pose.train.segmentation import train_segmentation
 from depthpose.pose.train.segmentation_config import SegmentationTraining
 from depthpose.pose.train.task import PoseTask
-from depthpose.pose.weights import read_pose_weights
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.weights import read_pose_weights, write_pose_weights
 
 
 def train_pose(config: PoseTraining, run: Run) -> Path:
@@ -37,10 +41,9 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
     train(task, clouds, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
-    network = network.cpu().eval()
     if isinstance(network, PointNet):
-        return leave_weights(run.folder / "pointnet.safetensors", network, models, config)
-    return leave_weights(run.folder / "pose.safetensors", fold_norms(network), models, config)
+        return _leave(run.folder / "pointnet.safetensors", network, models, config)
+    return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config)
 
 
 STAGES = {
@@ -50,6 +53,21 @@ STAGES = {
     "segmentation": (SegmentationTraining, train_segmentation),
 }
 """Config and function of each network, by its word on the command line."""
+
+
+def _leave(
+    path: Path, network: ResUNet | PointNet, models: tuple[ObjectModel, ...], config: PoseTraining
+) -> Path:
+    """Calibrate the refusal, judge the whole estimator, and write weights and card."""
+    if find_shard().rank:
+        return path  # statistics of batch norm are rank 0's, and so is the file
+    weights = calibrated(packed(network, models, config), config.objects, config.calibration)
+    table = judged(weights, config.objects, config.held_out)
+    write_pose_weights(path, weights, with_half=config.with_half)
+    write_json(path.with_suffix(".json"), {"held_out": table})
+    with atomic_write(path.with_suffix(".md")) as part:
+        part.write_text(card_text(models, weights.facts, table))
+    return path
 
 
 def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
