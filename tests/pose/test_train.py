@@ -90,10 +90,12 @@ class _Oracle(ResUNet):
     """Answers with the true directions, whatever it is shown."""
 
     truth: torch.Tensor
+    seen: tuple[torch.Tensor, ...] = ()
 
     def directions(
         self, points_m: torch.Tensor, coordinates: torch.Tensor, class_of_point: torch.Tensor
     ) -> torch.Tensor:
+        self.seen = (points_m, coordinates, class_of_point)
         return self.truth
 
 
@@ -137,7 +139,7 @@ def test_the_loss_falls() -> None:
     task = PoseTask(ResUNet(_SMALL), models, config, None)
     optimizer, _ = task.optimizers["network"]
     losses = []
-    for _ in range(60):
+    for _ in range(40):
         (turn,) = list(task.step(batch))
         turn.loss.backward()
         optimizer.step()
@@ -225,7 +227,8 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
     assert "Objects: bracket (160 mm)." in card
     rows = json.loads(path.with_suffix(".json").read_text())["held_out"]
     assert set(rows) == {"0"}
-    assert rows["0"]["right"] + rows["0"]["wrong"] + rows["0"]["refused"] == pytest.approx(1)
+    shares = [rows["0"][name] for name in ("right", "wrong", "refused")]
+    assert sum(shares) == pytest.approx(1)
     again = read_config(tmp_path / "run" / "config.yaml", PoseTraining)
     assert again.network.classes == 1
     with pytest.raises(InputError, match="holds a training"):
@@ -257,7 +260,7 @@ def test_the_refusal_is_chosen_on_views_of_its_own(tmp_path: Path) -> None:
     chosen = calibrated(weights, _MADE, config)
     # Three steps teach nothing: nearly all answers are wrong, so nearly none may be given.
     table = judged(chosen, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
-    assert table["0"]["wrong"] <= 0.5
+    assert (table["0"]["wrong"] or 0.0) <= 0.5
     assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
     text = card_text(weights.models, {"licence": "MIT"}, table)
     assert "| hidden % | right % | wrong % | refused %" in text

@@ -154,7 +154,7 @@ def _circle(radius: float) -> np.ndarray:
 
 def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole: float) -> Mesh:
     """A plate with a round hole of a diameter; the outline is seen from the hole."""
-    unit, at = _circle(1), np.array(hole_at)
+    unit, at = _circle(1.0), np.array(hole_at)
     low, high = -np.array(size[:2]) / 2 - at, np.array(size[:2]) / 2 - at
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
@@ -163,7 +163,7 @@ def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole:
     # The ray nearest to each corner goes to the corner itself, or the plate would lack its corners.
     for corner in corners:
         outline[np.argmax(unit @ (corner / np.linalg.norm(corner)))] = corner
-    return _moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0))
+    return _moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0.0))
 
 
 def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
