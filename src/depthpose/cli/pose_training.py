@@ -14,6 +14,7 @@ def train(
     unit: Literal["m", "mm"] | None = None,
     symmetries: Literal["none", "found"] | None = None,
     config: Path | None = None,
+    data: str | None = None,
     what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose",
     start: str | None = None,
     steps: int | None = None,
@@ -40,6 +41,7 @@ def train(
         symmetries: found looks whether the part looks alike from several sides, and counts these
             poses as one; without, you are told of what is found.
         config: YAML with what differs from the defaults.
+        data: folder of a data set; it takes the place of the config's, for models and frames.
         what: which network; all but pose are compared with it, or cut the object out for it.
         start: weights to begin with.
         steps: optimiser steps in place of the config's length.
@@ -63,6 +65,8 @@ def train(
     chosen = changed(dataclasses.replace(chosen, loop=loop), start=start)
     if cad or unit or symmetries:
         chosen = dataclasses.replace(chosen, models=_models(chosen, what, cad, unit, symmetries))
+    if data is not None:
+        chosen = _with_data(chosen, data)
     is_first = find_shard().rank == 0
     with progress_bar() as on_step:
         run = Run(folder=out, resume=resume, on_step=on_step, tell=print if is_first else None)
@@ -72,6 +76,19 @@ def train(
         card = path.with_suffix(".md")
         print(card.read_text() if card.is_file() else "", end="")
     return 0
+
+
+def _with_data(chosen: Any, data: str) -> Any:  # noqa: ANN401 - any config of a training
+    """Name the data set wherever the config names one."""
+    changes = {}
+    if (models := getattr(chosen, "models", None)) is not None and models.bop is not None:
+        changes["models"] = dataclasses.replace(models, bop=data)
+    for part in ("frames", "images"):
+        if getattr(chosen, part, None) is not None:
+            changes[part] = dataclasses.replace(getattr(chosen, part), folder=data)
+    if not changes:
+        raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
+    return dataclasses.replace(chosen, **changes)
 
 
 def _models(
@@ -88,7 +105,7 @@ def _models(
         )
     taken = changed(chosen.models, cad=cad or None, unit=unit)
     if cad:  # they take the place of a data set's models
-        taken = dataclasses.replace(taken, bop=None, objects=())
+        taken = dataclasses.replace(taken, bop=None, objects=(), parts=())
     return changed(
         taken, with_found_symmetries=None if symmetries is None else symmetries == "found"
     )

@@ -11,7 +11,7 @@ from depthpose.pose.network import ResUNetConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ModelsConfig:
-    """The objects that are learnt: CAD files, or models of a folder in BOP's layout."""
+    """The objects that are learnt: CAD files, or models of a data set, or parts of our own."""
 
     cad: tuple[str, ...] = ()
     """Model files; each object is called as its file."""
@@ -21,6 +21,9 @@ class ModelsConfig:
 
     bop: str | None = None
     """Folder of a data set, whose models are taken in place of CAD files."""
+
+    parts: tuple[str, ...] = ()
+    """Names of made parts (bracket, flange, mug, connector, spool), in place of either."""
 
     objects: tuple[int, ...] = ()
     """Numbers of the data set's objects; none: all."""
@@ -136,7 +139,7 @@ class PoseTraining:
     """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=2e-3, schedule="cosine", warmup_steps=50)
+        default_factory=lambda: AdamConfig(learning_rate=4e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
 

@@ -17,6 +17,10 @@ _RIGHT = 0.1
 """Of the diameter: ADD, or ADD-S of a symmetric object."""
 _TOGETHER = 32
 
+Table = Mapping[str, Mapping[str, float | None]]
+"""By occlusion in percent: shares of right, wrong and refused, and the median error of the answers
+in diameters, None where there is no answer."""
+
 
 def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationConfig) -> PoseWeights:
     """Choose when answers are withheld, on made views from easy to hard.
@@ -45,15 +49,9 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     return dataclasses.replace(weights, refusal=refusal)
 
 
-def judged(
-    weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig
-) -> Mapping[str, Mapping[str, float]]:
-    """Count right, wrong and refused answers of the whole estimator, by occlusion.
-
-    Returns:
-        For each occlusion in percent the shares, and the median error of the answers in diameters.
-    """
-    table: dict[str, dict[str, float]] = {}
+def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:
+    """Count right, wrong and refused answers of the whole estimator, by occlusion."""
+    table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
         objects = held_out_objects(weights.models, made, weights.cloud, config, occlusion)
         estimates, errors = _posed(weights, objects)
@@ -63,7 +61,7 @@ def judged(
             "right": right / len(errors),
             "wrong": (len(answered) - right) / len(errors),
             "refused": 1 - len(answered) / len(errors),
-            "median": sorted(answered)[len(answered) // 2] if answered else float("nan"),
+            "median": sorted(answered)[len(answered) // 2] if answered else None,
         }
     return table
 
@@ -71,7 +69,7 @@ def judged(
 def card_text(
     models: Sequence[ObjectModel],
     facts: Mapping[str, str],
-    table: Mapping[str, Mapping[str, float]],
+    table: Table,
 ) -> str:
     """Say what the weights know, and what was measured, for people."""
     names = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in models)
@@ -87,7 +85,8 @@ def card_text(
             "| --- | --- | --- | --- | --- |",
         ]
     for hidden, row in table.items():
-        values = " | ".join(f"{100 * row[k]:.1f}" for k in ("right", "wrong", "refused", "median"))
+        given = [row[k] for k in ("right", "wrong", "refused", "median")]
+        values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
         lines.append(f"| {hidden} | {values} |")
     return "\n".join(lines) + "\n"
 
