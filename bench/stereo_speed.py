@@ -137,8 +137,9 @@ def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     double.load_state_dict(network.state_dict())
     h, w = pair[0].shape[-2:]
     least = network.config.min_side_px
-    left, right = (pad_top_right(normalise(i.double()), least) for i in pair)
-    return PSMNetInference(double, torch.float64).match(left, right, Steps()).disparity_px[-h:, :w]
+    left, right = (pad_top_right(normalise(i.double()), least)[None] for i in pair)
+    found = PSMNetInference(double, torch.float64).match(left, right, Steps())
+    return found[0].disparity_px[-h:, :w]
 
 
 def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> list[dict]:

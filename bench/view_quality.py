@@ -3,7 +3,8 @@
     python bench/view_quality.py --weights default runs/l1/fakestereo.safetensors --number 20
 
 Streets of a seed that no weights were trained on, so every pixel's truth is known: which points of
-the right view the left one hides, and which points of the left view the right one does.
+the right view the left one hides, and which points of the left view the right one does. The first
+streets become pictures: the real right view, and below it what each generator draws.
 """
 
 import argparse
@@ -13,12 +14,13 @@ import torch
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights
+from depthpose.core.files import write_image
 from depthpose.core.report import markdown_table, write_table
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.streets import StreetFrame, draw_street
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 def mean(values: Tensor, mask: Tensor) -> float:
@@ -34,10 +36,16 @@ def seen_by_left(frame: StreetFrame) -> Tensor:
     return (mirrored - frame.right_disparity_px).abs() < 1
 
 
+def estimate_street(net: FakestereoNet, frame: StreetFrame) -> DepthEstimate:
+    """Depth of the left view alone."""
+    return net.estimate_pair(
+        StereoInput(name="street", left=frame.left, right=None, camera=frame.rig)
+    )
+
+
 def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
     """L1 of the drawn view and relative depth error, in seen and in hidden regions."""
-    pair = StereoInput(name="street", left=frame.left, right=None, camera=frame.rig)
-    estimate = net.estimate_pair(pair)
+    estimate = estimate_street(net, frame)
     assert estimate.right is not None
     assert estimate.depth_m is not None
     l1 = (estimate.right - frame.right).abs().mean(0)
@@ -53,12 +61,23 @@ def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
     }
 
 
+def draw_views(path: Path, nets: dict[str, FakestereoNet], frames: list[StreetFrame]) -> None:
+    """Write real right views, a column a street, and below them what each generator draws."""
+    columns = []
+    for frame in frames:
+        drawn = [estimate_street(net, frame).right for net in nets.values()]
+        views = [frame.right, *(view for view in drawn if view is not None)]
+        columns.append(torch.cat([view[:, :187, :611] for view in views], 1))
+    write_image(path, torch.cat(columns, 2))
+
+
 def main() -> None:
     """Measure each weights file on the same streets."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--weights", nargs="+", default=["default"])
     parser.add_argument("--number", type=int, default=20)
     parser.add_argument("--scale", type=float, default=0.5)
+    parser.add_argument("--pictures", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     config = StreetsConfig(seed=9, scale=options.scale)
@@ -68,6 +87,8 @@ def main() -> None:
         frame = draw_street(config, index)
         for name, net in nets.items():
             found[name].append(measure(net, frame))
+    first = [draw_street(config, index) for index in range(options.pictures)]
+    draw_views(options.out / "view_quality.png", nets, first)
     rows = [
         {"weights": Path(name).stem, "streets": options.number}
         | {key: float(torch.tensor([r[key] for r in rows]).nanmean()) for key in rows[0]}

@@ -10,7 +10,14 @@ from tests.made_street import make_street
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
-from depthpose.core.files import read_map, read_video, write_disparity_png, write_image, write_video
+from depthpose.core.files import (
+    read_image,
+    read_map,
+    read_video,
+    write_disparity_png,
+    write_image,
+    write_video,
+)
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
@@ -78,9 +85,23 @@ def test_one_broken_image_stops_no_other(
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
     good = str(home / "images" / "0.png")
-    assert predict(home, tmp_path / "out", str(broken), good, "--focal-px", "70") == 1
+    words = (str(broken), good, "--focal-px", "70", "--batch", "2")
+    assert predict(home, tmp_path / "out", *words) == 1
     assert "broken.png" in capsys.readouterr().err
     assert (tmp_path / "out" / "0.depth_m.npy").is_file()
+
+
+def test_one_image_of_another_camera_stops_no_other_of_its_batch(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = read_image(home / "images" / "0.png")
+    write_image(tmp_path / "in" / "odd.png", image[:, 5:])
+    write_image(tmp_path / "in" / "right.png", image)
+    words = (str(tmp_path / "in"), "--camera", str(home / "cam.json"), "--batch", "4")
+    assert predict(home, tmp_path / "out", *words) == 1
+    assert "odd" in capsys.readouterr().err
+    assert (tmp_path / "out" / "right.depth_m.npy").is_file()
+    assert not (tmp_path / "out" / "odd.depth_m.npy").exists()
 
 
 @pytest.mark.parametrize(

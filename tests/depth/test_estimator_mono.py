@@ -15,6 +15,7 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.stereo import CallableMatcher, PSMNet
 from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import write_depth_weights
 
 FOCAL_PX, BASELINE_M = 120.0, 0.5
@@ -166,3 +167,28 @@ def test_terms_of_the_weights_are_said(generator: UNetGenerator, tmp_path: Path)
     write_depth_weights(path, generator=generator, matcher=small_matcher(), facts=facts)
     with pytest.warns(LicenceNotice, match="for research alone"):
         FakestereoNet.load(path)
+
+
+def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_path: Path) -> None:
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
+    net = FakestereoNet.load(path)
+    sizes = [(60, 40), (60, 40), (72, 40), (60, 40)]
+    inputs = [
+        StereoInput(
+            name=f"{k}",
+            left=torch.rand(3, height, width, generator=torch.Generator().manual_seed(k)),
+            right=None,
+            camera=camera(width, height, 100.0),
+        )
+        for k, (width, height) in enumerate(sizes)
+    ]
+    many = net.estimate_many(inputs)
+    assert len(many) == 4
+    for given, together in zip(inputs, many, strict=True):
+        alone = net.estimate_pair(given)
+        torch.testing.assert_close(together.disparity_px, alone.disparity_px, rtol=1e-4, atol=1e-4)
+        assert together.right is not None
+        assert alone.right is not None
+        torch.testing.assert_close(together.right, alone.right, rtol=1e-4, atol=1e-5)
+    assert net.estimate_many([]) == []

@@ -81,11 +81,12 @@ def test_inference_equals_the_plain_network(config: PSMNetConfig, size: tuple[in
 @pytest.mark.parametrize("rows", [2, 4, 6, 10, 64])
 def test_slabs_of_any_height_give_one_answer_in_double_precision(rows: int) -> None:
     network = random_network(SMALL).double()
-    left, right = torch.rand(2, 3, 80, 96, dtype=torch.float64)
+    left, right = torch.rand(2, 2, 3, 80, 96, dtype=torch.float64)
     inference = PSMNetInference(network, torch.float64)
-    disparity_px = inference.match(left, right, Steps(rows=rows, chunk_bytes=1)).disparity_px
+    found = inference.match(left, right, Steps(rows=rows, chunk_bytes=1))
+    disparity_px = torch.stack([match.disparity_px for match in found])
     with torch.no_grad():
-        expected_px = network(left[None], right[None])[-1][0]
+        expected_px = network(left, right)[-1]
     assert float((disparity_px - expected_px).abs().max()) < 1e-9
 
 

@@ -310,3 +310,14 @@ def test_streets_are_made_while_training() -> None:
         pair = samples[ticket]
         error = (warp_right_to_left(pair.right, pair.left_px) - pair.left).abs()
         assert float(error.nanmedian()) < 0.06
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU computes these gradients itself")
+def test_gradients_that_a_cpu_gets_wrong_are_refused(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = StereoTraining(
+        matcher=PSMNetConfig(max_disparity_px=32),
+        pairs=pairs,
+        loop=LoopConfig(steps=1, precision="bf16"),
+    )
+    with pytest.raises(InputError, match=r"max_disparity_px 48, or precision fp32"):
+        train_stereo(config, Run(folder=tmp_path))

@@ -120,6 +120,7 @@ def make_streets(
     """
     from tqdm import tqdm
 
+    from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.kitti import has_raw_frame
     from depthpose.depth.streets import rig_number
@@ -132,7 +133,8 @@ def make_streets(
     config = StreetsConfig(
         seed=seed, scale=scale, with_antialiasing=with_antialiasing, with_lidar=with_lidar
     )
-    _keep_settings(out, asdict(config))
+    # Seeds have drives of their own, so they may share a folder.
+    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"})
     indices = range(first, first + number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]

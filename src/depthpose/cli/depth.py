@@ -23,6 +23,7 @@ def predict(
     device: str = "cpu",
     precision: Precision = "fp32",
     max_memory: str | None = None,
+    batch: int = 1,
     cloud: bool = False,
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
@@ -47,6 +48,8 @@ def predict(
         device: cpu, cuda, cuda:1, ...
         precision: fp32, or bf16: faster, at some hundredths of a pixel.
         max_memory: bound on the memory of the matcher, such as 1GB; exact.
+        batch: images of one size that go through the networks together: for a GPU; a processor is
+            busy with one.
         cloud: write a coloured point cloud, NAME.ply.
     """
     from depthpose.cli import methods, predicting
@@ -56,14 +59,15 @@ def predict(
     )
     if not 0 < color_range[0] < color_range[1]:
         raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
+    if batch < 1:
+        raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
     if matcher == "sgbm" and config != MatcherConfig():
         raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
     sources = predicting.find_sources(images)
     lens = predicting.read_lens(camera, focal_px)
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
-    return predicting.predict_all(
-        sources, lens, method, out, predicting.Look(range_m=color_range, with_cloud=cloud)
-    )
+    look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
+    return predicting.predict_all(sources, lens, method, out, look)
 
 
 def match(

@@ -2,7 +2,8 @@
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import torch
@@ -22,6 +23,7 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.run import claim_folder, claim_names, find_shard
+from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
 from depthpose.depth.types import StereoInput
 
@@ -46,10 +48,11 @@ class Lens:
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """Which pictures and clouds are written beside the maps."""
+    """Which pictures and clouds are written beside the maps, and how many images go together."""
 
     range_m: tuple[float, float]
     with_cloud: bool
+    batch: int
 
 
 def read_lens(camera: Path | None, focal_px: float | None) -> Lens:
@@ -79,8 +82,7 @@ def find_sources(words: Sequence[str]) -> list[Path]:
     """
     found: list[Path] = []
     for word in words:
-        is_video = Path(word).suffix.lower() in VIDEO_SUFFIXES
-        found += [Path(word)] if is_video else list_images(word)
+        found += [Path(word)] if _is_video(Path(word)) else list_images(word)
     stems = [path.stem for path in found]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
@@ -95,44 +97,89 @@ def predict_all(sources: list[Path], lens: Lens, method: Method, out: Path, look
     claim_folder(out, {**method.settings, "camera": facts, "color_range_m": list(look.range_m)})
     claim_names(out, {source.stem: source for source in sources})
     mine = [sources[k] for k in find_shard().share(len(sources))]
-    failures: list[str] = []
-    done = 0
-    for source in mine:
-        try:
-            done += _predict_source(source, lens, method, out, look)
-        except InputError as error:
-            if len(sources) == 1:
-                raise
-            failures.append(str(error))
+    assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
+    predictor = Predictor(lens=lens, net=method.net, out=out, look=look)
+    done = predictor.predict_images([path for path in mine if not _is_video(path)])
+    for path in filter(_is_video, mine):
+        done += predictor.predict_video(path)
+    failures = predictor.failures
+    if failures and len(sources) == 1:
+        raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{done} depth maps are in {out}")
     return 1 if failures else 0
 
 
-def _predict_source(source: Path, lens: Lens, method: Method, out: Path, look: Look) -> int:
-    video = read_video(source) if source.suffix.lower() in VIDEO_SUFFIXES else None
-    frames = iter(video) if video else iter([(source.stem, None)])
-    names: list[str] = []
-    total = (video.frames or None) if video else 1
-    for name, image in tqdm(frames, source.name, total=total, disable=None, unit=" images"):
-        _predict_one(name, read_image(source) if image is None else image, lens, method, out, look)
-        names.append(name)
-    if video:
-        write_video(out / f"{source.stem}.color.mp4", _colors(names, out, look), video.fps)
-    return len(names)
+@dataclass(frozen=True, kw_only=True)
+class Predictor:
+    """Images in, files out; what fails is remembered in ``failures``."""
+
+    lens: Lens
+    net: FakestereoNet
+    out: Path
+    look: Look
+    failures: list[InputError] = field(default_factory=list)
+
+    def predict_images(self, sources: list[Path]) -> int:
+        """Predict images; give how many are done."""
+        return len(self._predict(self._read(sources), len(sources), "images"))
+
+    def predict_video(self, source: Path) -> int:
+        """Predict a video's frames, and make a video of them; give how many are done."""
+        try:
+            video = read_video(source)
+            names = self._predict(iter(video), video.frames or None, source.name)
+            colors = _colors(names, self.out, self.look)
+            write_video(self.out / f"{source.stem}.color.mp4", colors, video.fps)
+        except InputError as error:
+            self.failures.append(error)
+            return 0
+        return len(names)
+
+    def _read(self, sources: list[Path]) -> Iterator[tuple[str, Tensor]]:
+        for source in sources:
+            try:
+                yield source.stem, read_image(source)
+            except InputError as error:
+                self.failures.append(error)
+
+    def _predict(
+        self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
+    ) -> list[str]:
+        done: list[str] = []
+        with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:
+            while chunk := list(islice(frames, self.look.batch)):
+                done += self._predict_chunk([self._input(*frame) for frame in chunk])
+                bar.update(len(chunk))
+        return done
+
+    def _input(self, name: str, image: Tensor) -> StereoInput:
+        return StereoInput(name=name, left=image, right=None, camera=self.lens.camera_of(image))
+
+    def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
+        """Predict inputs together; where one of them is unusable, each alone."""
+        wanted = [given for given in inputs if not self._is_finished(given.name)]
+        try:
+            found = self.net.estimate_many(wanted)
+            for given, estimate in zip(wanted, found, strict=True):
+                if self.look.with_cloud:
+                    write_estimate_cloud(self.out, given, estimate)
+                write_estimate(self.out, given, estimate, self.look.range_m)
+        except InputError as error:
+            if len(inputs) > 1:
+                return [name for given in inputs for name in self._predict_chunk([given])]
+            self.failures.append(error)
+            return []
+        return [given.name for given in inputs]
+
+    def _is_finished(self, name: str) -> bool:
+        has_cloud = not self.look.with_cloud or (self.out / f"{name}.ply").is_file()
+        return has_cloud and is_finished(self.out, name)
 
 
-def _predict_one(
-    name: str, image: Tensor, lens: Lens, method: Method, out: Path, look: Look
-) -> None:
-    if is_finished(out, name) and (not look.with_cloud or (out / f"{name}.ply").is_file()):
-        return
-    pair = StereoInput(name=name, left=image, right=None, camera=lens.camera_of(image))
-    estimate = method.net.estimate_pair(pair)
-    if look.with_cloud:
-        write_estimate_cloud(out, pair, estimate)
-    write_estimate(out, pair, estimate, look.range_m)
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def _colors(names: list[str], out: Path, look: Look) -> Iterator[Tensor]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath, refused_as, write_bytes
-from depthpose.core.files.images import opened_image
+from depthpose.core.files.images import FAST_PNG, opened_image
 
 KITTI_UNIT = 1 / 256
 """KITTI stores metres and pixels of disparity times 256."""
@@ -79,7 +79,7 @@ def _write_units(path: AnyPath, values: Float[Tensor, "h w"], unit: float) -> No
     units = torch.where((units >= 1) & (units <= 65535), units, 0)
     encoded = BytesIO()
     with refused_as(path, "map", "check its size"):
-        Image.fromarray(units.numpy().astype(np.uint16)).save(encoded, "PNG")
+        Image.fromarray(units.numpy().astype(np.uint16)).save(encoded, "PNG", **FAST_PNG)
     write_bytes(path, encoded.getvalue())
 
 

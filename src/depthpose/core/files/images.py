@@ -21,6 +21,9 @@ from depthpose.core.files.disk import (
 )
 
 LISTED_SUFFIXES = (".png", ".jpg", ".jpeg")
+FAST_PNG = {"compress_level": 1}
+"""Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
+an estimate took as long as the estimate."""
 MAX_PIXELS = 2**26
 """A small file may declare any size; this many pixels are 0.8 GB of floats."""
 
@@ -81,7 +84,9 @@ def write_image(path: AnyPath, image: Tensor) -> None:
         raise refused_suffix(path, "picture", LISTED_SUFFIXES)
     _check_image(path, image)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
-    form, options = ("PNG", {}) if suffix == ".png" else ("JPEG", {"quality": 95, "subsampling": 0})
+    form, options = (
+        ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": 95, "subsampling": 0})
+    )
     encoded = BytesIO()
     with refused_as(path, "picture", "check its size"):
         Image.fromarray(pixels.contiguous().numpy()).save(encoded, form, **options)

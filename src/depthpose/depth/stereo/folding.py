@@ -11,7 +11,7 @@ from depthpose.depth.stereo.features import ConvNorm, FeatureExtractor
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d
-Rows = Float[Tensor, "1 _ _ _ _"]
+Rows = Float[Tensor, "b _ _ _ _"]
 
 
 def folded_weight(layer: ConvNorm) -> tuple[Tensor, Tensor]:
@@ -54,7 +54,7 @@ def _memory_format(x: Tensor) -> torch.memory_format:
 class RowsConv:
     """A folded 3x3x3 convolution for volumes whose rows stand before disparities.
 
-    Inference keeps volumes as ``(1, C, rows, disparities, columns)`` with channels last in
+    Inference keeps volumes as ``(pairs, C, rows, disparities, columns)`` with channels last in
     memory, so some rows of a volume are one piece of memory and no copy is needed to take them.
     """
 
@@ -97,10 +97,10 @@ class CostConv:
         turned = conv.weight.detach()[0].permute(2, 1, 3, 0)
         self.weight = turned.reshape(27, -1).to(like.device, self.dtype)
 
-    def __call__(self, rows: Rows) -> Float[Tensor, "m d w"]:
-        """Convolve rows that carry their own halo; the answer has none."""
-        c, n, bins, width = rows.shape[1:]
-        voxels = rows[0].permute(1, 2, 3, 0).reshape(-1, c).to(self.dtype)
+    def __call__(self, rows: Float[Tensor, "c n d w"]) -> Float[Tensor, "m d w"]:
+        """Convolve rows of one pair that carry their own halo; the answer has none."""
+        c, n, bins, width = rows.shape
+        voxels = rows.permute(1, 2, 3, 0).reshape(-1, c).to(self.dtype)
         taps = (self.weight @ voxels.T).view(3, 3, 3, n, bins, width)
         out = taps.new_zeros(n - 2, bins + 2, width + 2)
         for y, d, x in product(range(3), repeat=3):

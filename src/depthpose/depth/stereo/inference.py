@@ -22,7 +22,7 @@ from depthpose.depth.stereo.psmnet import Head, Hourglass, PSMNet
 from depthpose.depth.stereo.slabs import Slab, convolve, spans, whole
 from depthpose.depth.types import Match
 
-View = Float[Tensor, "3 h w"]
+Views = Float[Tensor, "b 3 h w"]
 
 
 class PSMNetInference:
@@ -58,20 +58,23 @@ class PSMNetInference:
 
     @torch.no_grad()
     def match(
-        self, left: View, right: View, steps: Steps, *, with_confidence: bool = False
-    ) -> Match:
-        """Match one normalised pair whose sides suit the network."""
-        size = Size(self.config.max_disparity_px, left.shape[1], left.shape[2])
-        disparity_px, confidence = expected_disparity(
-            self.cost(left, right, steps),
-            size,
-            align_corners=self.config.align_corners,
-            chunk_bytes=steps.chunk_bytes,
-            with_confidence=with_confidence,
-        )
-        return Match(disparity_px=disparity_px, confidence=confidence)
+        self, left: Views, right: Views, steps: Steps, *, with_confidence: bool = False
+    ) -> list[Match]:
+        """Match normalised pairs of one size whose sides suit the network."""
+        size = Size(self.config.max_disparity_px, *left.shape[2:])
+        found = [
+            expected_disparity(
+                cost,
+                size,
+                align_corners=self.config.align_corners,
+                chunk_bytes=steps.chunk_bytes,
+                with_confidence=with_confidence,
+            )
+            for cost in self.cost(left, right, steps)
+        ]
+        return [Match(disparity_px=d, confidence=c) for d, c in found]
 
-    def cost(self, left: View, right: View, steps: Steps) -> Float[Tensor, "h4 w4 d4"]:
+    def cost(self, left: Views, right: Views, steps: Steps) -> Float[Tensor, "b h4 w4 d4"]:
         """Answer the cost after the last hourglass."""
         cost0 = whole(self._cost0(self._look(left, right), steps))
         pass_ = _Pass(self, cost0, steps)
@@ -79,21 +82,23 @@ class PSMNetInference:
             pass_.run(index)
         return pass_.finish()
 
-    def _look(self, left: View, right: View) -> LookedPair:
+    def _look(self, left: Views, right: Views) -> list[LookedPair]:
         bins = self.config.max_disparity_px // 4
-        return self.first.look(self._describe(left), self._describe(right), bins)
+        both = zip(self._describe(left), self._describe(right), strict=True)
+        return [self.first.look(one[None], other[None], bins) for one, other in both]
 
-    def _describe(self, view: View) -> Float[Tensor, "1 c h4 w4"]:
-        batch = view[None].to(self._like)
+    def _describe(self, views: Views) -> Float[Tensor, "b c h4 w4"]:
+        batch = views.to(self._like)
         return self.features(batch.contiguous(memory_format=torch.channels_last))
 
-    def _cost0(self, pair: LookedPair, steps: Steps) -> Float[Tensor, "1 c h d w"]:
+    def _cost0(self, pairs: list[LookedPair], steps: Steps) -> Float[Tensor, "b c h d w"]:
         """Run the layers before the hourglasses."""
-        height = pair.height
-        cost0 = empty_volume(self._like, self.config.width, (height, pair.bins, pair.width))
+        height = pairs[0].height
+        size = (height, pairs[0].bins, pairs[0].width)
+        cost0 = empty_volume(self._like, (len(pairs), self.config.width), size)
         for first, stop in spans(height, steps.rows):
             begin, end = max(first - 3, 0), min(stop + 3, height)
-            x = Slab(pair.rows(begin, end), begin, height)
+            x = Slab(_joined([pair.rows(begin, end) for pair in pairs]), begin, height)
             x = relu(convolve(self.residual[0], x, first - 2, stop + 2))
             y = relu(convolve(self.residual[1], x, first - 1, stop + 1))
             y = convolve(self.residual[2], y, first, stop).values
@@ -122,9 +127,9 @@ class _Pass:
 
     def __init__(self, net: PSMNetInference, cost0: Slab, steps: Steps) -> None:
         self.net, self.cost0, self.steps = net, cost0, steps
-        _, c, h, d, w = cost0.values.shape
-        self.half = (2 * c, (h // 2, d // 2, w // 2))
-        self.cost = torch.zeros(h, d, w, dtype=net.heads[0].cost.dtype, device=cost0.values.device)
+        b, c, h, d, w = cost0.values.shape
+        self.half = ((b, 2 * c), (h // 2, d // 2, w // 2))
+        self.cost = cost0.values.new_zeros(b, h, d, w, dtype=net.heads[0].cost.dtype)
         self.first_down: Slab | None = None
         self.up: Slab | None = None
 
@@ -139,11 +144,11 @@ class _Pass:
         self.up = down = None
         self.up = self._up2(hourglass, deep, self.first_down)
 
-    def finish(self) -> Float[Tensor, "h4 w4 d4"]:
+    def finish(self) -> Float[Tensor, "b h4 w4 d4"]:
         """Score the volume after the last hourglass."""
         for first, stop in spans(self.cost0.height, self.steps.rows):
             self._score(2, self._refined(3, first, stop), first, stop)
-        return self.cost.transpose(1, 2).contiguous()
+        return self.cost.transpose(2, 3).contiguous()
 
     def _refined(self, index: int, first: int, stop: int) -> Slab:
         """Input of hourglass ``index``, rows ``first - 2 .. stop + 1``."""
@@ -167,7 +172,8 @@ class _Pass:
     def _score(self, index: int, x: Slab, first: int, stop: int) -> None:
         head = self.net.heads[index]
         hidden = relu(convolve(head.hidden, x, first - 1, stop + 1))
-        self.cost[first:stop] += head.cost(hidden.rows(first - 1, stop + 1))
+        for cost, rows in zip(self.cost, hidden.rows(first - 1, stop + 1), strict=True):
+            cost[first:stop] += head.cost(rows)
 
     def _same1(self, hourglass: _FoldedHourglass, x: Slab) -> Slab:
         """Second layer on the way down, plus what came up from the hourglass before."""
@@ -195,10 +201,14 @@ def relu(slab: Slab) -> Slab:
     return slab
 
 
-def empty_volume(like: Tensor, channels: int, size: tuple[int, int, int]) -> Tensor:
-    """Make a volume ``(1, channels, *size)`` whose channels stand last in memory."""
+def _joined(slabs: list[Tensor]) -> Tensor:
+    return slabs[0] if len(slabs) == 1 else torch.cat(slabs)
+
+
+def empty_volume(like: Tensor, head: tuple[int, int], size: tuple[int, int, int]) -> Tensor:
+    """Make volumes ``(pairs, channels, *size)`` whose channels stand last in memory."""
     return torch.empty(
-        (1, channels, *size),
+        (*head, *size),
         dtype=like.dtype,
         device=like.device,
         memory_format=torch.channels_last_3d,

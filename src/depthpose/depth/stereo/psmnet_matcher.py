@@ -1,5 +1,7 @@
 """PSMNet as a matcher: images of any size in, disparity and confidence out."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -18,6 +20,8 @@ from depthpose.depth.types import Match
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
+
+Views = Float[Tensor, "b 3 h w"]
 
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
@@ -53,6 +57,23 @@ class PSMNetMatcher:
         return self._match(left, right, with_tiles=self.config.tile_px is not None)
 
     @torch.no_grad()
+    def match_many(self, pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Match]:
+        """Match pairs; those of one size together, unless memory is bounded or there are tiles.
+
+        A processor is busy with one pair; it is a GPU that gains.
+
+        Raises:
+            InputError: as :meth:`match`.
+        """
+        is_alone = self.config.tile_px is not None or self.config.max_memory_bytes is not None
+        if is_alone or len({left.shape for left, _ in pairs}) > 1:
+            return [self.match(left, right) for left, right in pairs]
+        for left, right in pairs:
+            check_pair(left, right)
+        views = [self._normalised(torch.stack(list(of))) for of in zip(*pairs, strict=True)]
+        return self._match_both_ways(views[0], views[1], pairs[0][0].device)
+
+    @torch.no_grad()
     def match_whole(self, left: Tensor, right: Tensor) -> Match:
         """Match one pair without tiles, whatever the config says: what tiles are compared with.
 
@@ -63,23 +84,38 @@ class PSMNetMatcher:
 
     def _match(self, left: Tensor, right: Tensor, *, with_tiles: bool) -> Match:
         check_pair(left, right)
-        one_way = self._match_tiled if with_tiles else self._match_padded
-        pair = [normalise(image.to(self._device, torch.float32)) for image in (left, right)]
-        found = one_way(pair[0], pair[1])
-        if self.config.with_left_right_check:
-            mirrored = one_way(pair[1].flip(-1), pair[0].flip(-1))
-            found = lower_where_disagreeing(found, mirrored.disparity_px.flip(-1))
-        confidence = None if found.confidence is None else found.confidence.to(left.device)
-        return Match(disparity_px=found.disparity_px.to(left.device), confidence=confidence)
+        pair = [self._normalised(image[None]) for image in (left, right)]
+        return self._match_both_ways(pair[0], pair[1], left.device, with_tiles=with_tiles)[0]
 
-    def _match_tiled(self, left: Tensor, right: Tensor) -> Match:
+    def _normalised(self, views: Views) -> Views:
+        return normalise(views.to(self._device, torch.float32))
+
+    def _match_both_ways(
+        self, left: Views, right: Views, device: torch.device, *, with_tiles: bool = False
+    ) -> list[Match]:
+        one_way = self._match_tiled if with_tiles else self._match_padded
+        found = one_way(left, right)
+        if self.config.with_left_right_check:
+            mirrored = one_way(right.flip(-1), left.flip(-1))
+            found = [
+                lower_where_disagreeing(match, other.disparity_px.flip(-1))
+                for match, other in zip(found, mirrored, strict=True)
+            ]
+        return [_moved(match, device) for match in found]
+
+    def _match_tiled(self, left: Views, right: Views) -> list[Match]:
         assert self.config.tile_px is not None
         reach = self.network_config.max_disparity_px
         tiling = Tiling(*self.config.tile_px, self.config.tile_overlap_px, reach)
-        return match_tiles(self._match_padded, left, right, tiling)
 
-    def _match_padded(self, left: Tensor, right: Tensor) -> Match:
-        """Match a normalised pair of any size: pad, run, crop back."""
+        def match_tile(one: Tensor, other: Tensor) -> Match:
+            return self._match_padded(one[None], other[None])[0]
+
+        both = zip(left, right, strict=True)
+        return [match_tiles(match_tile, one, other, tiling) for one, other in both]
+
+    def _match_padded(self, left: Views, right: Views) -> list[Match]:
+        """Match normalised pairs of any size: pad, run, crop back."""
         h, w = left.shape[-2:]
         least = self.network_config.min_side_px
         padded = pad_top_right(left, least), pad_top_right(right, least)
@@ -91,8 +127,17 @@ class PSMNetMatcher:
         )
         steps = footprint.plan(self.config.max_memory_bytes)
         found = self._inference.match(*padded, steps, with_confidence=self.config.with_confidence)
-        confidence = None if found.confidence is None else found.confidence[-h:, :w]
-        return Match(disparity_px=found.disparity_px[-h:, :w], confidence=confidence)
+        return [_cropped(match, h, w) for match in found]
+
+
+def _cropped(match: Match, height: int, width: int) -> Match:
+    confidence = None if match.confidence is None else match.confidence[-height:, :width]
+    return Match(disparity_px=match.disparity_px[-height:, :width], confidence=confidence)
+
+
+def _moved(match: Match, device: torch.device) -> Match:
+    confidence = None if match.confidence is None else match.confidence.to(device)
+    return Match(disparity_px=match.disparity_px.to(device), confidence=confidence)
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
@@ -101,7 +146,9 @@ def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h
     return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
 
 
-def pad_top_right(image: Float[Tensor, "3 h w"], least: int) -> Float[Tensor, "3 h2 w2"]:
+def pad_top_right(
+    image: Float[Tensor, "*batch 3 h w"], least: int
+) -> Float[Tensor, "*batch 3 h2 w2"]:
     """Pad a normalised image with zeros, top and right, to multiples of 16 of at least ``least``.
 
     Top and right, as the authors do: columns stay where they are, so disparity does too.

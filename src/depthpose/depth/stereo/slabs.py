@@ -15,16 +15,16 @@ class Slab:
     """Some rows of a volume.
 
     Attributes:
-        values: ``(1, C, rows, disparities, columns)``, channels last in memory.
+        values: ``(pairs, C, rows, disparities, columns)``, channels last in memory.
         first: the row of the volume that ``values`` begin with.
         height: rows of the whole volume.
     """
 
-    values: Float[Tensor, "1 c n d w"]
+    values: Float[Tensor, "b c n d w"]
     first: int
     height: int
 
-    def rows(self, first: int, stop: int) -> Float[Tensor, "1 c m d w"]:
+    def rows(self, first: int, stop: int) -> Float[Tensor, "b c m d w"]:
         """Rows ``first .. stop - 1``; zeros outside the volume, as a convolution pads."""
         inside_first, inside_stop = max(first, 0), min(stop, self.height)
         assert self.first <= inside_first
@@ -48,7 +48,7 @@ def convolve(conv: RowsConv, slab: Slab, first: int, stop: int) -> Slab:
     return Slab(conv(halo), first, height)
 
 
-def whole(values: Float[Tensor, "1 c n d w"]) -> Slab:
+def whole(values: Float[Tensor, "b c n d w"]) -> Slab:
     """A volume as the slab of all its rows."""
     return Slab(values, 0, values.shape[2])
 

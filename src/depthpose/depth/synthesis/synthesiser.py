@@ -29,10 +29,12 @@ class Synthesiser:
             _keep_training(self.generator)
 
     @torch.no_grad()
-    def synthesise(self, left: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
-        """Draw the right view; images are RGB in [0, 1]."""
-        image = left.to(self.device, torch.float32)[None]
-        return draw_right(self.generator, image)[0].to(left.device)
+    def synthesise(self, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Draw right views; images are RGB in [0, 1]."""
+        if self.generator.config.test_mode == "batch" and len(left) > 1:
+            # The statistics are those of one image: company would change them.
+            return torch.cat([self.synthesise(image[None]) for image in left])
+        return draw_right(self.generator, left.to(self.device, torch.float32)).to(left.device)
 
 
 def draw_right(

@@ -1,36 +1,30 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
-import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import (
-    Camera,
-    StereoRig,
-    check_image_matches_camera,
-    check_rectified,
-    read_camera,
-)
+from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image
 from depthpose.depth.config import MatcherConfig, SGBMConfig
-from depthpose.depth.disparity import (
-    depth_from_disparity,
-    disparity_from_depth,
-    resize_disparity,
+from depthpose.depth.disparity import depth_from_disparity
+from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
+from depthpose.depth.estimator.virtual import (
+    focal_size,
+    from_virtual,
+    resize_image,
+    resized_match,
+    square_camera,
 )
 from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
 from depthpose.depth.synthesis import Synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights, read_depth_weights
-
-Picture = str | Path | Float[Tensor, "3 _ _"] | UInt8[np.ndarray, "_ _ 3"]
-"""A file, a tensor of RGB in [0, 1], or an array of 8-bit RGB."""
 
 
 class FakestereoNet:
@@ -108,8 +102,8 @@ class FakestereoNet:
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
         pair = StereoInput(
             name=chosen,
-            left=_tensor(image),
-            right=None if right is None else _tensor(right),
+            left=as_tensor(image),
+            right=None if right is None else as_tensor(right),
             camera=read_camera(Path(camera)) if isinstance(camera, str | Path) else camera,
         )
         return self.estimate_pair(pair, with_check=with_check)
@@ -118,8 +112,8 @@ class FakestereoNet:
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = False) -> DepthEstimate:
         """Estimate depth of one input whose images are read already."""
         if pair.right is None:
-            return self._estimate_alone(pair)
-        right = _usable_right(pair)
+            return self._estimate_alone([pair])[0]
+        right = usable_right(pair)
         if with_check:
             refuse_unrectified(pair)
         match = self._match(pair.left, right, pair.camera)
@@ -130,40 +124,54 @@ class FakestereoNet:
             depth_m=depth_m, disparity_px=match.disparity_px, confidence=match.confidence
         )
 
-    def _estimate_alone(self, image: StereoInput) -> DepthEstimate:
-        """Bring the image to the virtual rig, draw its right view, match, and come back."""
+    @torch.inference_mode()
+    def estimate_many(self, images: Sequence[StereoInput]) -> list[DepthEstimate]:
+        """Estimate depth of images without right view; neighbours of one camera size go together.
+
+        Raises:
+            InputError: as :meth:`estimate`; the first unusable image is named.
+        """
+        found: list[DepthEstimate] = []
+        for _, group in groupby(images, self._virtual_size):
+            found += self._estimate_alone(list(group))
+        return found
+
+    def _virtual_size(self, image: StereoInput) -> tuple[int, int]:
         synthesiser, camera = self._usable_alone(image)
+        return focal_size(camera, synthesiser.generator.config.virtual_focal_px)
+
+    def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
+        """Bring images to the virtual rig, draw their right views, match, and come back."""
+        synthesiser, _ = self._usable_alone(images[0])
         rig = synthesiser.generator.config
-        height, width = image.left.shape[1:]
-        virtual_px = rig.virtual_focal_px
-        left = resize_image(image.left, *focal_size(camera, virtual_px))
+        size = self._virtual_size(images[0])
+        left = torch.stack([resize_image(image.left, *size) for image in images])
         right = synthesiser.synthesise(left)
-        match = self._match(left, right, virtual_camera(camera, virtual_px))
-        seen_px = resize_disparity(match.disparity_px, height, width)
-        imitated = StereoRig(
-            width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m
-        )
-        depth_m = depth_from_disparity(seen_px, imitated)
-        own = disparity_from_depth(depth_m, camera) if isinstance(camera, StereoRig) else seen_px
-        return DepthEstimate(
-            depth_m=depth_m,
-            disparity_px=own,
-            confidence=_resized_map(match.confidence, height, width),
-            right=resize_image(right, height, width),
-        )
+        matches = self._match_many(left, right, square_camera(size, rig.virtual_focal_px))
+        parts = zip(images, right, matches, strict=True)
+        return [from_virtual(image, rig, drawn, match) for image, drawn, match in parts]
 
     def _match(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
+        return self._match_many(left[None], right[None], camera)[0]
+
+    def _match_many(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
+    ) -> list[Match]:
         """Match at the focal length that the matcher's weights want, and come back."""
+        height, width = left.shape[2:]
         work_px = work_focal_px(self.matcher)
-        if work_px is None or camera is None:
-            return self.matcher.match(left, right)
-        height, width = left.shape[1:]
-        size = focal_size(camera, work_px)
-        found = self.matcher.match(resize_image(left, *size), resize_image(right, *size))
-        return Match(
-            disparity_px=resize_disparity(found.disparity_px, height, width),
-            confidence=_resized_map(found.confidence, height, width),
-        )
+        size = (height, width)
+        if work_px is not None and camera is not None:
+            size = focal_size(camera, work_px)
+        pairs = [
+            (resize_image(one, *size), resize_image(other, *size))
+            for one, other in zip(left, right, strict=True)
+        ]
+        if isinstance(self.matcher, PSMNetMatcher) and len(pairs) > 1:
+            found = self.matcher.match_many(pairs)
+        else:
+            found = [self.matcher.match(*pair) for pair in pairs]
+        return [resized_match(match, height, width) for match in found]
 
     def _usable_alone(self, image: StereoInput) -> tuple[Synthesiser, Camera]:
         if self.synthesiser is None:
@@ -184,45 +192,6 @@ class FakestereoNet:
 def work_focal_px(matcher: Matcher) -> float | None:
     """Focal length that the matcher's weights were trained at, where they say so [px]."""
     return matcher.network_config.work_focal_px if isinstance(matcher, PSMNetMatcher) else None
-
-
-def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
-    """Rows and columns at which the camera's image has ``focal_px``, with square pixels."""
-    rows = round(camera.height * focal_px / float(camera.K[1, 1]))
-    columns = round(camera.width * focal_px / float(camera.K[0, 0]))
-    return max(rows, 1), max(columns, 1)
-
-
-def virtual_camera(camera: Camera, focal_px: float) -> Camera:
-    """Make the camera of the image brought to ``focal_px``."""
-    rows, columns = focal_size(camera, focal_px)
-    K = torch.tensor(
-        [[focal_px, 0, (columns - 1) / 2], [0, focal_px, (rows - 1) / 2], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    return Camera(width=columns, height=rows, K=K)
-
-
-def resize_image(
-    image: Float[Tensor, "3 _ _"], height: int, width: int
-) -> Float[Tensor, "3 {height} {width}"]:
-    """Resize bilinearly, averaging where it shrinks."""
-    if image.shape[1:] == (height, width):
-        return image
-    shrinks = height < image.shape[1] or width < image.shape[2]
-    resized = F.interpolate(image[None], (height, width), mode="bilinear", antialias=shrinks)
-    return resized[0].clamp(0, 1)
-
-
-def refuse_unrectified(pair: StereoInput) -> None:
-    """Raise where the two images are swapped, or their rows do not correspond.
-
-    Raises:
-        InputError: with what was measured and what to do.
-    """
-    report = check_rectified(pair.left, _usable_right(pair))
-    if report.is_swapped or report.is_rectified is False:
-        raise InputError(f"{pair.name}: {report.message}")
 
 
 def _choose_matcher(
@@ -256,46 +225,3 @@ def _choose_matcher(
             "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
         )
     return PSMNetMatcher(found.matcher, run)
-
-
-def _usable_right(pair: StereoInput) -> Float[Tensor, "3 h w"]:
-    if pair.right is None:
-        raise InputError(f"{pair.name}: there is no right image; give right=.")
-    if pair.right.shape != pair.left.shape:
-        left, right = pair.left.shape[1:], pair.right.shape[1:]
-        raise InputError(
-            f"{pair.name}: the left image is {left[1]}x{left[0]} and the right one "
-            f"{right[1]}x{right[0]}; a rectified pair has one size. Rectify the pair again."
-        )
-    if pair.camera is not None:
-        height, width = pair.left.shape[1:]
-        check_image_matches_camera(pair.camera, width, height, pair.name)
-        if not isinstance(pair.camera, StereoRig):
-            raise InputError(
-                f"{pair.name}: the camera has no baseline, so disparity cannot become metres. Add "
-                '"baseline_m" (the distance between the two cameras in metres) to its file.'
-            )
-    return pair.right
-
-
-def _resized_map(
-    values: Float[Tensor, "_ _"] | None, height: int, width: int
-) -> Float[Tensor, "{height} {width}"] | None:
-    if values is None or values.shape == (height, width):
-        return values
-    return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]
-
-
-def _tensor(image: Picture) -> Float[Tensor, "3 h w"]:
-    match image:
-        case str() | Path():
-            return read_image(Path(image))
-        case np.ndarray() if image.dtype != np.uint8:
-            raise InputError(
-                f"the image is an array of {image.dtype}; give 8-bit RGB (H, W, 3), or a tensor "
-                "(3, H, W) of float in [0, 1]"
-            )
-        case np.ndarray():
-            return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
-        case _:
-            return image

@@ -1,0 +1,240 @@
+"""What each choice of the training is worth, by one small configuration and one number of steps.
+
+    python bench/ablations.py --made streets --real PAIRS/kitti2015_train_drives \
+        --evaluate PAIRS/kitti2015_eval_drives --out out/ablations
+
+L1 alone against cGAN + L1, patch against pixel discriminator, batch norm's mode at test; and how
+accuracy grows with the number of made and of real pairs. Every arm is trained apart, measured, then
+fine-tuned and measured again: on real pairs, and on made streets of a seed that none has seen.
+What stands in ``--out`` is not done again: a second call goes on where the first was stopped.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+import torch
+from view_quality import measure
+
+from depthpose.cli import main as depthpose
+from depthpose.core.files import write_json
+from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.report import markdown_table, write_table
+from depthpose.depth.config import (
+    AugmentConfig,
+    GeneratorConfig,
+    PairsConfig,
+    PSMNetConfig,
+    StreetsConfig,
+)
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.streets import draw_street
+from depthpose.depth.train import STAGES, Run
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+
+FOCAL_PX = 186.0
+"""A quarter of KITTI's resolution: an arm takes minutes on one core."""
+
+GENERATOR = GeneratorConfig(width=16, levels=5, virtual_focal_px=FOCAL_PX)
+MATCHER = PSMNetConfig(
+    width=16, max_disparity_px=48, blocks=(2, 4, 2, 2), pools=(16, 8, 4, 2),
+    align_corners=False, work_focal_px=FOCAL_PX,
+)  # fmt: skip
+STEPS = {"stereo": 1200, "view": 1000, "view on real": 400, "finetune": 300}
+HELD_OUT_STREETS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm:
+    """One training.
+
+    Attributes:
+        made: number of made pairs that both stages see, where ``real`` is None.
+        real: number of real pairs that both stages see, after the made ones have been learnt.
+        discriminator: who judges the generator; none: L1 alone.
+        seed: of weights, order and augmentation.
+    """
+
+    made: int = 1000
+    real: int | None = None
+    discriminator: Literal["patch", "pixel", "none"] = "patch"
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        data = f"made{self.made}" if self.real is None else f"real{self.real}"
+        return f"{data}-{self.discriminator}-{self.seed}"
+
+
+def arms(real_pairs: tuple[int, ...], seeds: int) -> list[Arm]:
+    """Every arm, what others begin with first."""
+    found: list[Arm] = []
+    for seed in range(seeds):
+        found += [Arm(seed=seed), Arm(seed=seed, discriminator="none")]
+        found += [Arm(seed=seed, real=number) for number in real_pairs]
+        found += [Arm(seed=seed, made=number) for number in (30, 100, 300)]
+        found += [Arm(seed=seed, discriminator="pixel")]
+    return found
+
+
+class Bench:
+    """Where the data lie and the runs go."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options, self.out = options, options.out
+
+    def pairs(self, arm: Arm) -> PairsConfig:
+        """Give what an arm is trained on."""
+        folder = self.options.made if arm.real is None else self.options.real
+        return PairsConfig(
+            folders=(str(folder),), limit=arm.made if arm.real is None else arm.real,
+            focal_px=FOCAL_PX, with_cache=True, augment=AugmentConfig(crop_px=(96, 224)),
+        )  # fmt: skip
+
+    def matcher(self) -> Path:
+        """Train the one matcher of all arms, on made streets."""
+        pairs = self.pairs(Arm())
+        pairs = replace(pairs, augment=AugmentConfig(crop_px=(64, 160), scale=(0.9, 1.4)))
+        config = StereoTraining(
+            matcher=MATCHER, pairs=pairs, loop=self.loop("stereo", 4),
+            adam=AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=50),
+        )  # fmt: skip
+        return self.train("stereo", config, self.out / "matcher") / "matcher.safetensors"
+
+    def apart(self, arm: Arm) -> Path:
+        """Train the generator of an arm; give its file."""
+        start = None
+        if arm.real is not None:
+            start = self.apart(replace(arm, real=None))
+        adam = AdamConfig(learning_rate=5e-4, beta1=0.5, schedule="cosine")
+        config = ViewTraining(
+            generator=GENERATOR, discriminator=arm.discriminator, discriminator_width=32,
+            generator_adam=adam, discriminator_adam=adam, pairs=self.pairs(arm),
+            start=None if start is None else str(start),
+            loop=self.loop("view" if start is None else "view on real", 4, arm.seed),
+        )  # fmt: skip
+        return self.train("view", config, self.out / arm.name / "view") / "generator.safetensors"
+
+    def tuned(self, arm: Arm, generator: Path) -> Path:
+        """Fine-tune an arm's generator; give the file of both networks."""
+        config = FinetuneTraining(
+            generator=str(generator), matcher=str(self.matcher()), pairs=self.pairs(arm),
+            adam=AdamConfig(learning_rate=3e-4, beta1=0.5, schedule="cosine"),
+            loop=self.loop("finetune", 2, arm.seed),
+        )  # fmt: skip
+        folder = self.train("finetune", config, self.out / arm.name / "finetune")
+        return folder / "fakestereo.safetensors"
+
+    def loop(self, stage: str, batch: int, seed: int = 0) -> LoopConfig:
+        """Give the length of a stage."""
+        return LoopConfig(
+            steps=STEPS[stage], batch_size=batch, seed=seed, precision="bf16",
+            save_every_steps=100, validate_every_steps=10**6, log_every_steps=50,
+        )  # fmt: skip
+
+    def train(self, stage: str, config: Any, folder: Path) -> Path:  # noqa: ANN401 - any stage
+        """Train once; a finished run is left alone."""
+        if not (folder / "done.json").exists():
+
+            def show(progress: Any) -> None:  # noqa: ANN401
+                if progress.numbers:
+                    print(folder.name, progress.step, dict(progress.numbers), flush=True)
+
+            run = Run(folder=folder, resume=folder.exists(), on_step=show)
+            STAGES[stage][1](config, run)
+            write_json(folder / "done.json", {"stage": stage})
+        return folder
+
+    def measure(self, arm: Arm, stage: str, weights: Path) -> dict[str, Any]:
+        """Measure weights on real pairs and on made streets, once."""
+        folder = self.out / arm.name / f"measured-{stage}"
+        if not (folder / "row.json").exists():
+            real = ("depth", "evaluate", "--data", str(self.options.evaluate), "--cap", "80")
+            rule = ("--protocol", "eigen-raw-camera", "--weights", str(weights))
+            assert depthpose([*real, *rule, "--out", str(folder / "real")]) == 0
+            row: dict[str, Any] = json.loads((folder / "real" / "rows.json").read_text())[0]
+            kept = ("abs_rel", "rmse", "d1", "right_l1", "right_psnr_db")
+            row = {name: row[name] for name in kept if name in row} | made_quality(weights)
+            write_json(folder / "row.json", row)
+        found = json.loads((folder / "row.json").read_text())
+        facts = {"discriminator": arm.discriminator, "made": arm.made, "real": arm.real}
+        return facts | {"seed": arm.seed, "stage": stage} | found
+
+    def rows_of(self, arm: Arm) -> list[dict[str, Any]]:
+        """Train and measure one arm: apart, with batch norm's other mode, fine-tuned."""
+        generator = self.apart(arm)
+        home = self.out / arm.name
+        modes = ("running", "batch") if arm.real is None and arm.made == Arm.made else ("running",)
+        rows = []
+        for mode in modes:
+            network = read_generator(generator)
+            network.config = replace(network.config, test_mode=mode)
+            both = home / f"apart-{mode}.safetensors"
+            matcher = read_matcher(self.matcher())
+            write_depth_weights(both, generator=network, matcher=matcher, facts={})
+            rows.append(self.measure(arm, f"apart, {mode}" if mode == "batch" else "apart", both))
+        return [*rows, self.measure(arm, "fine-tuned", self.tuned(arm, generator))]
+
+
+def made_quality(weights: Path) -> dict[str, float]:
+    """What is drawn and measured where the left view shows it and where it hides it."""
+    net = FakestereoNet.load(weights)
+    config = StreetsConfig(seed=9, scale=0.25)
+    rows = [measure(net, draw_street(config, index)) for index in range(HELD_OUT_STREETS)]
+    return {key: float(torch.tensor([r[key] for r in rows]).nanmean()) for key in rows[0]}
+
+
+def draw_growth(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Plot AbsRel on the real pairs over the number of training pairs."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), sharey=True)
+    for axis, kind in zip(axes, ("made", "real"), strict=True):
+        for stage, colour in (("apart", "tab:grey"), ("fine-tuned", "tab:blue")):
+            of = [r for r in rows if r["stage"] == stage and r["discriminator"] == "patch"]
+            if kind == "made":
+                points = [(r["made"], r["abs_rel"]) for r in of if r["real"] is None]
+            else:  # none at all: made pairs alone
+                points = [(r["real"] or 0, r["abs_rel"]) for r in of if r["made"] == Arm.made]
+            counts = sorted({count for count, _ in points})
+            values = [[value for count, value in points if count == n] for n in counts]
+            means = [sum(v) / len(v) for v in values]
+            axis.plot(counts, means, "o-", color=colour, label=stage)
+            for count, value in zip(counts, values, strict=True):
+                axis.plot([count] * len(value), value, ".", color=colour)
+        axis.set_xscale("symlog", linthresh=10)
+        axis.set_xlabel(f"{kind} pairs")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("AbsRel, 25 real pairs")
+    axes[1].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    """Train and measure all arms; write the table and the plot after each."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--made", type=Path, required=True)
+    parser.add_argument("--real", type=Path, required=True)
+    parser.add_argument("--evaluate", type=Path, required=True)
+    parser.add_argument("--pairs", type=int, nargs="+", default=[10, 30, 70])
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("out/ablations"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    bench, rows = Bench(options), []
+    for arm in arms(tuple(options.pairs), options.seeds):
+        rows += bench.rows_of(arm)
+        write_table(options.out, rows, name="ablations")
+        draw_growth(options.out / "growth.png", rows)
+    print(markdown_table(rows))
+
+
+if __name__ == "__main__":
+    main()
