@@ -12,16 +12,21 @@ import argparse
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from real_poses import RealCase, real_cases
 
+from depthpose.core.checkpoint import find_weights
 from depthpose.core.report import markdown_table, write_table
 from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
+from depthpose.pose.config import EstimateConfig, VotingConfig
+from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.types import CloudInput, PoseEstimate
+from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 POINTS = 2000
 Row = dict[str, Any]
@@ -47,9 +52,28 @@ def judge(case: RealCase, estimate: PoseEstimate) -> Row:
 
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
     """The classical peer for one model."""
-    icp = 0.0 if words.no_icp else FpfhConfig.icp_voxels
-    config = FpfhConfig(seed=seed, icp_voxels=icp, voxel_diameters=words.voxel)
+    config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
     return FpfhRegistration(case.model, config).estimate
+
+
+def our_method(weights: Sequence[str], case: RealCase, seed: int, with_icp: bool) -> Method:
+    """Trained weights that know the object; the seed chooses points and pairs of votes."""
+    config = EstimateConfig(with_icp=with_icp, voting=VotingConfig(seed=seed))
+    net = next(n for n in map(read_weights, weights) if case.sample.input.object in names_in(n))
+    estimator = GeoPoseNet(net, config)
+    estimator.estimate_many([case.sample.input])  # the model's surface is prepared once
+    return lambda given: estimator.estimate_many([given])[0]
+
+
+@cache
+def read_weights(name: str) -> PoseWeights:
+    """Read a file once."""
+    return read_pose_weights(find_weights(name))
+
+
+def names_in(weights: PoseWeights) -> set[str]:
+    """Name the objects that weights know."""
+    return {model.name for model in weights.models}
 
 
 def run_method(
@@ -98,15 +122,20 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", default="", help="instances whose name contains this")
     parser.add_argument("--voxel", type=float, default=FpfhConfig.voxel_diameters)
-    parser.add_argument("--no-icp", action="store_true")
+    parser.add_argument("--weights", nargs="*", default=[], help="of ours")
     parser.add_argument("--out", type=Path, default=Path("out/pose_peers"))
     words = parser.parse_args()
     torch.set_num_threads(1)
     cases = [case for case in real_cases(words.samples) if words.only in case.name]
     rows = run_method(
-        "Open3D FPFH + RANSAC" + ("" if words.no_icp else " + ICP"), cases,
+        "Open3D FPFH + RANSAC + ICP", cases,
         lambda case, seed: open3d_method(case, seed, words), words.seeds,
     )  # fmt: skip
+    objects = set[str]().union(*(names_in(read_weights(name)) for name in words.weights))
+    known = [case for case in cases if case.sample.input.object in objects]
+    for name, with_icp in (("Geo-PoseNet", False), ("Geo-PoseNet + ICP", True)):
+        make = partial(our_method, words.weights, with_icp=with_icp)
+        rows += run_method(name, known, make, words.seeds)
     write_table(words.out, rows)
     print(markdown_table(summary(rows)))
 

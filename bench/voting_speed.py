@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from depthpose.pose.baselines.one_by_one import ransac_one_by_one
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.voting import meet_lines, vote_ransac
 
@@ -37,38 +38,6 @@ def made_votes(points: int, noise: float, seed: int) -> tuple[torch.Tensor, ...]
     wrong = torch.nn.functional.normalize(torch.randn(n.shape, generator=generator), dim=-1)
     is_wrong = torch.rand(points, generator=generator) < WRONG_SHARE
     return x, torch.where(is_wrong[:, None, None], wrong, n), keypoints
-
-
-def nearest_point(x: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Least squares of one keypoint's lines."""
-    A = len(x) * np.eye(3) - n.T @ n
-    b = x.sum(0) - n.T @ (n * x).sum(1)
-    return np.linalg.solve(A, b)
-
-
-def ransac_one_by_one(
-    x: np.ndarray, directions: np.ndarray, hypotheses: int, min_cosine: float, seed: int
-) -> np.ndarray:
-    """Find every keypoint with a loop over keypoints and hypotheses."""
-    random = np.random.default_rng(seed)
-    found = []
-    for k in range(directions.shape[1]):
-        n = directions[:, k]
-        best, best_inliers = -1, None
-        for _ in range(hypotheses):
-            pair = random.choice(len(x), 2, replace=False)
-            try:
-                tried = nearest_point(x[pair], n[pair])
-            except np.linalg.LinAlgError:
-                continue
-            way = tried - x
-            cosine = (way * n).sum(1) / np.sqrt((way * way).sum(1))
-            inliers = cosine > min_cosine
-            count = np.count_nonzero(inliers)
-            if count > best:
-                best, best_inliers = count, inliers
-        found.append(nearest_point(x[best_inliers], n[best_inliers]))
-    return np.stack(found)
 
 
 def least_seconds(run: Callable[[], object], budget_s: float = 1.5, most: int = 200) -> float:

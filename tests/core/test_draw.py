@@ -4,6 +4,8 @@ import torch
 from depthpose.core.draw import (
     draw_depth,
     draw_disparity,
+    draw_lines,
+    draw_outline,
     draw_points,
     draw_share,
     find_range_m,
@@ -61,3 +63,26 @@ def test_one_depth_everywhere_still_makes_a_scale() -> None:
 def test_a_range_of_nothing_is_refused(frames: list[torch.Tensor]) -> None:
     with pytest.raises(InputError, match="no frame has a valid depth"):
         find_range_m(frames)
+
+
+def test_lines_are_where_they_should_be() -> None:
+    black = torch.zeros(3, 20, 30)
+    ends = torch.tensor([[[2.0, 5], [12, 5]], [[float("nan"), 1], [3, 3]], [[25, 15], [99, 15]]])
+    drawn = draw_lines(black, ends, (1.0, 0.0, 0.5), width_px=1)
+    ink = (drawn[0] > 0).nonzero().tolist()
+    assert [5, 2] in ink
+    assert [5, 7] in ink
+    assert {v for v, _ in ink} == {5, 15}
+    assert max(u for _, u in ink) == 29
+    assert float(drawn[2].max()) == 0.5
+    assert float(black.max()) == 0
+    dashed = draw_lines(black, ends[:1], (1.0, 0.0, 0.0), width_px=1, dash_px=3.0)
+    assert 4 < int((dashed[0] > 0).sum()) < int((drawn[0, 5] > 0).sum())
+
+
+def test_the_outline_lies_inside_the_mask() -> None:
+    mask = torch.zeros(10, 10, dtype=torch.bool)
+    mask[2:8, 3:9] = True
+    drawn = draw_outline(torch.zeros(3, 10, 10), mask, (0.0, 1.0, 0.0))[1] > 0
+    assert int(drawn.sum()) == 36 - 16
+    assert not bool((drawn & ~mask).any())

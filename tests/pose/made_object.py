@@ -116,6 +116,7 @@ class Oracle(GeoPoseNet):
     def _true(self, points_m: Tensor, number: int) -> Tensor:
         middle = points_m.mean(0)
         pose = min(self.truths, key=lambda truth: float((truth.t_m - middle).norm()))
+        pose = Rigid(pose.R.float(), pose.t_m.float())
         keypoints_m = pose.apply(self.weights.models[number].keypoints_m)
         directions = keypoints_m[None] - points_m[:, None]
         directions = directions / directions.norm(dim=-1, keepdim=True)

@@ -123,7 +123,7 @@ def test_grazing_surfaces_are_not_read_but_edges_are() -> None:
         measure(ramp_m, (572.0, 572.0), _sensor("laser", 0.0), _generator()).isfinite().all()
     )
     lost = measure(ramp_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator()).isnan()
-    assert bool(lost[:, :10].all())
+    assert bool(lost[:, 1:10].all())
     step_m = torch.where(torch.arange(30) < 15, 1.0, 1.5).expand(10, 30)
     read_m = measure(step_m, (572.0, 572.0), _sensor("laser", 0.0), _generator())
     assert torch.equal(read_m, step_m)

@@ -219,26 +219,32 @@ def test_the_order_of_points_and_the_company_of_clouds_change_nothing() -> None:
             torch.testing.assert_close(part, alone[i].flip(0), rtol=1e-4, atol=1e-5)
 
 
-def test_one_class_alone_is_its_part_of_all() -> None:
+def test_each_point_is_answered_for_its_class_about_its_clouds_mean() -> None:
     network = PointNet(POINTNET).eval()
     points = 0.1 * torch.randn(6, 3)
     every = network(points, torch.zeros(6, dtype=torch.long))
     assert every.shape == (6, 2, 4, 3)
-    for number in (0, 1):
-        torch.testing.assert_close(network.forward_class(points, number), every[:, number])
+    rows = torch.zeros(6, 4, dtype=torch.long)
+    # Wherever the cloud is: only places about its mean are looked at.
+    classes = torch.tensor([0, 1, 1, 0, 1, 0])
+    own = network.directions(points + 1.0, rows, classes)
+    about = network(points - points.mean(0), rows[:, 0])
+    torch.testing.assert_close(own, about[torch.arange(6), classes], rtol=1e-4, atol=1e-5)
 
 
 def test_every_weight_of_pointnet_learns_and_transforms_begin_as_nothing() -> None:
+    torch.manual_seed(0)
     network = PointNet(POINTNET)
+    plain = PointNet(replace(POINTNET, with_transforms=False)).eval()
+    shared = {k: v for k, v in network.state_dict().items() if not k.startswith("turn")}
+    plain.load_state_dict(shared)
     points, cloud = 0.1 * torch.randn(20, 3), torch.arange(20) // 10
-    features, strain = network.features(points, cloud)
-    assert float(strain.detach()) == 0
+    torch.testing.assert_close(network.eval()(points, cloud), plain(points, cloud))
+    network.train()
     for layer in (network.turn_points, network.turn_features):
         assert layer is not None
         torch.nn.init.normal_(layer.final.weight, std=0.1)
-    features, strain = network.features(points, cloud)
-    assert float(strain.detach()) > 0
-    (network.final(features).square().sum() + strain).backward()
+    network(points, cloud).square().sum().backward()
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in network.parameters())
 
 

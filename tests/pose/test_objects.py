@@ -1,6 +1,7 @@
 """Made views: exact, reproducible, and what the knobs say."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,9 +10,10 @@ import trimesh
 from depthpose.core.errors import InputError
 from depthpose.core.raster import rasterize
 from depthpose.pose.augment import random_rotation
+from depthpose.pose.bop import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.config import ObjectsConfig, SensorConfig
 from depthpose.pose.mesh import make_model
-from depthpose.pose.objects import Objects, surfel_triangles
+from depthpose.pose.objects import Objects, make_frames, surfel_triangles
 from depthpose.pose.objects.views import draw_view, gaze, make_shape, pose_of_middle, turn_view
 from depthpose.pose.types import ObjectModel, ViewSample
 
@@ -55,7 +57,7 @@ def test_a_clean_view_is_what_its_truth_looks_like(views: int | None) -> None:
         error_m = (view.input.depth_m - again_m).abs()
         error_m = error_m[error_m.isfinite()]
         assert float(error_m.median()) < (1e-6 if views is None else 1e-4)
-        assert float(error_m.mean()) < (1e-6 if views is None else 5e-4)
+        assert float(error_m.mean()) < (1e-6 if views is None else 8e-4)
 
 
 def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:
@@ -182,3 +184,79 @@ def test_errors_say_what_to_do() -> None:
         InputError, match=r"the camera would stand in it\. Begin at 0\.[0-9]+ or farther"
     ):
         Objects([_model()], ObjectsConfig(distance_m=(0.06, 1.0)))
+
+
+def _numbered(number: int) -> ObjectModel:
+    return dataclasses.replace(_model(f"part_{number}", 0.01 * number), number=number)
+
+
+_FRAME = ObjectsConfig(
+    image_px=(160, 120),
+    focal_px=(143.0, 143.0),
+    centre_px=(81.0, 60.0),
+    frame_objects=(3, 3),
+    sensor=SensorConfig(kinds=("none",)),
+)
+
+
+def test_a_frame_is_what_its_poses_look_like() -> None:
+    models = [_numbered(n) for n in (1, 2, 3)]
+    for frame in make_frames(models, _FRAME, 3):
+        assert frame.rgb is not None
+        assert frame.rgb.shape == (3, 120, 160)
+        assert 0 <= float(frame.rgb.min()) <= float(frame.rgb.max()) <= 1
+        assert len(frame.objects) >= 2
+        for shown in frame.objects:
+            corners = shown.camera_from_model.apply(models[shown.number - 1].triangles_m)
+            alone_m = rasterize(corners, frame.K, 160, 120).depth_m
+            assert torch.equal(shown.silhouette, alone_m.isfinite())
+            assert not (shown.visible & ~shown.silhouette).any()
+            gap_m = (frame.depth_m - alone_m)[shown.silhouette]
+            # Where it is visible its own surface was measured, elsewhere something nearer.
+            assert float(gap_m[shown.visible[shown.silhouette]].abs().max()) < 1e-6
+            assert bool((gap_m <= 1e-6).all())
+
+
+def test_objects_of_a_frame_stand_on_one_table_and_not_in_each_other() -> None:
+    models = [_numbered(n) for n in (1, 2, 3)]
+    for frame in make_frames(models, _FRAME, 3):
+        clouds = [o.camera_from_model.apply(models[o.number - 1].vertices_m) for o in frame.objects]
+        for i, cloud in enumerate(clouds):
+            for other in clouds[:i]:
+                assert float(torch.cdist(cloud, other).min()) > 1e-4
+
+
+def test_frames_are_numbered_and_repeatable() -> None:
+    models = [_numbered(1)]
+    frames = list(make_frames(models, _FRAME, 3))
+    again = next(iter(make_frames(models, _FRAME, 1, first=2)))
+    assert [frame.number for frame in frames] == [0, 1, 2]
+    assert frames[2].rgb is not None
+    assert again.rgb is not None
+    assert torch.equal(frames[2].rgb, again.rgb)
+    assert not torch.equal(frames[1].rgb if frames[1].rgb is not None else again.rgb, again.rgb)
+
+
+def test_frames_go_through_bops_layout_and_back(tmp_path: Path) -> None:
+    models = [_numbered(1), _numbered(2)]
+    frames = list(make_frames(models, _FRAME, 2))
+    write_bop_models(tmp_path, models)
+    write_bop_scene(tmp_path, "train", 0, frames)
+    assert check_bop(tmp_path).is_ok
+    back = open_bop(tmp_path, "train")
+    assert len(back) == sum(len(frame.objects) for frame in frames)
+    sample, shown = back[0], frames[0].objects[0]
+    found, known = sample.truth.camera_from_model.R, shown.camera_from_model.R
+    assert torch.allclose(found.float(), known, atol=1e-6)
+    assert sample.input.object == f"part_{shown.number}"
+
+
+def test_frames_refuse_what_they_cannot_show() -> None:
+    with pytest.raises(InputError, match="two models have the number 1"):
+        next(make_frames([_numbered(1), _numbered(1)], _FRAME, 1))
+    with pytest.raises(InputError, match=r"distance_m begins at 0\.2 m, but the largest object"):
+        next(make_frames([_numbered(1)], dataclasses.replace(_FRAME, distance_m=(0.2, 1.0)), 1))
+    with pytest.raises(InputError, match="there is no object to show"):
+        next(make_frames([], _FRAME, 1))
+    with pytest.raises(InputError, match=r"frame_objects is \(0, 2\), but it goes from 1 or more"):
+        dataclasses.replace(_FRAME, frame_objects=(0, 2))

@@ -21,6 +21,10 @@ COMMANDS = {
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
+    "data make objects": (
+        "data:make_objects",
+        "made frames of your CAD files on a table, in BOP's layout",
+    ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
@@ -31,9 +35,20 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
-    "pose evaluate": ("pose_measures:evaluate", "measure poses on a BOP or LineMOD data set"),
-    "reproduce": ("reproduce:reproduce", "a table of the thesis: published rows, ours, difference"),
-    "figure": ("reproduce:figure", "a figure of the thesis from your frames and weights"),
+    "pose train": (
+        "pose_training:train",
+        "your CAD file, or a config, to a network that poses it",
+    ),
+    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),
+    "reproduce 3.1": ("pose_reproduce:table_3_1", "the method beside its baselines, by object"),
+    "reproduce 3.2": ("pose_reproduce:table_3_2", "LineMOD: published rows, ours, difference"),
+    "reproduce 3.3": ("pose_reproduce:table_3_3", "RANSAC against least squares"),
+    "figure": ("reproduce:figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": ("pose_figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": ("pose_figures:figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("pose_figures:figure_3_5", "boxes of true and estimated poses"),
 }
 _EXIT_CODES = """exit codes:
   0    done

@@ -2,11 +2,14 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from depthpose.core.errors import InputError
+
+_FRAMES_A_SCENE = 50
+_SCENES_A_SEED = 1000
 
 if TYPE_CHECKING:
     from depthpose.depth.config import StreetsConfig
@@ -139,6 +142,98 @@ def make_streets(
         _make_street(out, drives[index], config, index)
     print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
     return 0
+
+
+def make_objects(
+    cad: tuple[Path, ...],
+    out: Path,
+    unit: Literal["m", "mm"] = "mm",
+    number: int = 100,
+    split: str = "train",
+    seed: int = 0,
+    distance: tuple[float, float] = (0.6, 1.1),
+    sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light",
+) -> int:
+    """Make frames of objects on a table, with picture, depth, masks and poses, in BOP's layout.
+
+    A scene holds 50 frames; scenes that are there are skipped, so an interrupted run goes on where
+    it was. 'depthpose data check OUT' reads what this writes.
+
+        depthpose data make objects --cad part.stl clamp.stl --unit mm --out made --number 500
+
+    Args:
+        cad: model files, of any kind that holds a surface or points; the first is object 1.
+        out: folder to write to.
+        unit: of the numbers in the files.
+        number: how many frames.
+        split: name of the part of the data set.
+        seed: another seed, other frames.
+        distance: nearest and farthest view [m].
+        sensor: whose errors the depth has.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.config import config_to_dict
+    from depthpose.pose.bop import write_bop_models, write_bop_scene
+    from depthpose.pose.config import ObjectsConfig, SensorConfig
+    from depthpose.pose.mesh import read_model
+    from depthpose.pose.objects import make_frames
+
+    if number < 1:
+        raise InputError(f"--number {number}: at least 1 frame")
+    models = [read_model(path, unit, number=i) for i, path in enumerate(cad, start=1)]
+    config = ObjectsConfig(
+        seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number
+    )
+    said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
+    _keep_settings(out, said | {"cad": [path.name for path in cad], "unit": unit}, "objects.json")
+    write_bop_models(out, models)
+    scenes = [
+        range(first, min(first + _FRAMES_A_SCENE, number))
+        for first in range(0, number, _FRAMES_A_SCENE)
+    ]
+    # Of another seed, other scenes: they may share a folder.
+    number_of = {scene: seed * _SCENES_A_SEED + scene.start // _FRAMES_A_SCENE for scene in scenes}
+    wanted = [scene for scene in scenes if not _is_made(out / split, number_of[scene], scene)]
+    with tqdm(total=sum(map(len, wanted)), unit=" frames", leave=False, disable=None) as bar:
+        for scene in wanted:
+            frames = []
+            for frame in make_frames(models, config, len(scene), scene.start):
+                frames.append(frame)
+                bar.update()
+            write_bop_scene(out, split, number_of[scene], frames)
+    print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
+    return 0
+
+
+def _is_made(split: Path, scene: int, frames: range) -> bool:
+    """Whether a scene is there with all of its frames; its last file says so."""
+    from depthpose.core.files import read_json
+
+    path = split / f"{scene:06d}" / "scene_camera.json"
+    if not path.is_file():
+        return False
+    there = read_json(path)
+    return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
+
+
+def _keep_settings(out: Path, settings: dict, name: str = "streets.json") -> None:
+    """Refuse to mix frames of different settings in one folder."""
+    from depthpose.core.files import read_json, write_json
+
+    path = out / name
+    if not path.exists():
+        write_json(path, settings)
+        return
+    read = read_json(path)
+    there = read if isinstance(read, dict) else {}
+    # Seeds have drives of their own, so they may share a folder.
+    differing = [key for key in settings if key != "seed" and there.get(key) != settings[key]]
+    if differing:
+        raise InputError(
+            f"{path}: the frames here were made with other settings ({', '.join(differing)}); "
+            "write to another folder, or remove this one"
+        )
 
 
 def _drive(config: "StreetsConfig", day: int) -> str:

@@ -9,11 +9,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.run import claim_folder
+from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.bop import (
     BopDataset,
     Detection,
@@ -24,7 +25,7 @@ from depthpose.pose.bop import (
 )
 from depthpose.pose.bop.linemod import segnet_mask
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.predictions import (
     Job,
     detection_jobs,
@@ -36,6 +37,7 @@ from depthpose.pose.predictions import (
 )
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.weights import read_pose_weights
 
 _SAME_DIAMETER = 0.05
 
@@ -68,7 +70,10 @@ def pose_method(word: str, config: EstimateConfig) -> PoseMethod:
         InputError: there are no such weights, or they pose nothing.
     """
     path = find_weights(word)
-    net = GeoPoseNet.load(path, config)
+    found = read_pose_weights(path)
+    say_terms(found.facts)
+    is_regressor = isinstance(found.network, DepthImageNet)
+    net = DepthImageRegressor(found, config) if is_regressor else GeoPoseNet(found, config)
     suffix = "" if config.voting.method == "ransac" else "-least-squares"
     suffix += "" if config.with_icp else "-without-icp"
     facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
@@ -76,7 +81,7 @@ def pose_method(word: str, config: EstimateConfig) -> PoseMethod:
     return PoseMethod(
         name=path.stem + suffix,
         estimate_many=net.estimate_many,
-        models=net.weights.models,
+        models=found.models,
         settings={**facts, "estimate": config_to_dict(config)},
     )
 

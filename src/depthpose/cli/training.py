@@ -53,28 +53,29 @@ def train(
 
     kind, run_stage = STAGES[stage]
     chosen = kind() if config is None else read_config(config, kind)
-    loop = _changed(chosen.loop, seed=seed, device=device, precision=precision)
+    loop = changed(chosen.loop, seed=seed, device=device, precision=precision)
     if steps is not None:
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
-    pairs = _changed(chosen.pairs, folders=data or None)
+    pairs = changed(chosen.pairs, folders=data or None)
     words = {"generator": generator, "matcher": matcher, "start": start}
     knobs = {field.name: field.type for field in dataclasses.fields(kind)}
     for word, value in words.items():
         if value is not None and (word not in knobs or (word != "start" and stage != "finetune")):
             raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
-    chosen = _changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
-    with _progress_bar() as on_step:
+    chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
+    with progress_bar() as on_step:
         path = run_stage(chosen, Run(folder=out, resume=resume, on_step=on_step))
     if find_shard().rank == 0:
         print(f"trained weights: {path}")
     return 0
 
 
-def _changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
+def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
+    """Give a config with other values; None leaves a knob as it is."""
     return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
 
 
-class _progress_bar:  # noqa: N801 - reads as a verb where it is used
+class progress_bar:  # noqa: N801 - reads as a verb where it is used
     """A bar with time left and the latest numbers."""
 
     def __enter__(self) -> Callable[[Any], None]:
@@ -87,6 +88,7 @@ class _progress_bar:  # noqa: N801 - reads as a verb where it is used
         return self.show
 
     def show(self, progress: Any) -> None:  # noqa: ANN401
+        """Move the bar to where the training is."""
         if self.bar.total is None:
             self.bar.reset(progress.steps)
             self.bar.initial = self.bar.n = progress.step - 1

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -83,3 +83,52 @@ def draw_points(
     nearest_m = -F.max_pool2d(-depth_m.nan_to_num(torch.inf)[None], side, 1, radius_px)[0]
     grown_m = torch.where(torch.isfinite(nearest_m), nearest_m, torch.nan)
     return torch.where(torch.isnan(grown_m), 0.35 * image, draw_depth(grown_m, far_m=far_m))
+
+
+def draw_lines(
+    image: Float[Tensor, "3 h w"],
+    ends_px: Float[Tensor, "n 2 2"],
+    color: tuple[float, float, float],
+    width_px: int = 2,
+    dash_px: float | None = None,
+) -> Float[Tensor, "3 h w"]:
+    """Draw straight lines; what lies outside the image is cut, a line with a NaN end left out.
+
+    Args:
+        image: what they are drawn on; it is not changed.
+        ends_px: (u, v) of both ends of each.
+        color: RGB in [0, 1].
+        width_px: side of the square brush.
+        dash_px: length of the dashes, and of the gaps between them; None: no gap.
+    """
+    height, width = image.shape[1:]
+    drawn = image.clone()
+    ink = torch.tensor(color).to(image)[:, None]
+    for start, end in ends_px.double().tolist():
+        length = math.dist(start, end)
+        if not 0 < length < 1e5:  # NaN, a point, or beyond any picture
+            continue
+        way = torch.arange(0.0, length, 0.5, dtype=torch.float64)
+        if dash_px is not None:
+            way = way[(way / dash_px).floor() % 2 == 0]
+        share = (way / length)[:, None]
+        line = torch.tensor(start) * (1 - share) + torch.tensor(end) * share
+        brush = torch.arange(width_px) - (width_px - 1) // 2
+        cells = (line.round().long()[:, None] + torch.cartesian_prod(brush, brush)).flatten(0, 1)
+        inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
+        u, v = cells[inside].unbind(-1)
+        drawn[:, v, u] = ink
+    return drawn
+
+
+def draw_outline(
+    image: Float[Tensor, "3 h w"],
+    mask: Bool[Tensor, "h w"],
+    color: tuple[float, float, float],
+    width_px: int = 1,
+) -> Float[Tensor, "3 h w"]:
+    """Draw the border of a mask, inside it."""
+    outside = (~mask).float()[None]
+    grown = F.max_pool2d(outside, 2 * width_px + 1, 1, width_px)[0] > 0
+    ink = torch.tensor(color).to(image)[:, None, None]
+    return torch.where(mask & grown, ink, image)

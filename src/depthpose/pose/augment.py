@@ -7,7 +7,7 @@ import math
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.pose.config import SensorConfig, SensorKind
@@ -147,17 +147,13 @@ def _polygon(along: Depth, across: Depth, generator: torch.Generator) -> Depth:
 
 def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
     """Mark surfaces seen at a grazing angle: one pixel on, the depth changes by far too much."""
+    limit_m = depth_m * (steepest / focal_px)
+    is_steep = torch.zeros_like(depth_m, dtype=torch.bool)
+    across, down = depth_m.diff(dim=1).abs_(), depth_m.diff(dim=0).abs_()
     # A jump to another surface is steep on one side alone: the flatter side decides.
-    change = torch.zeros_like(depth_m)
-    for axis in (0, 1):
-        step = depth_m.diff(dim=axis).abs().nan_to_num(torch.inf)
-        pad = (0, 0, 1, 0) if axis == 0 else (1, 0)
-        end = (0, 0, 0, 1) if axis == 0 else (0, 1)
-        before = F.pad(step, pad, value=torch.inf)
-        after = F.pad(step, end, value=torch.inf)
-        flatter = torch.minimum(before, after)
-        change = torch.maximum(change, flatter.nan_to_num(posinf=0.0))
-    return change * focal_px > steepest * depth_m
+    is_steep[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
+    is_steep[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
+    return is_steep
 
 
 def _is_shadowed(depth_m: Depth, focal_px: float) -> Mask:
@@ -182,12 +178,12 @@ def _gaps(depth_m: Depth, share: float, generator: torch.Generator) -> Mask:
 def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
     """Read each pixel at one that is a pixel or none away: structured light blurs edges."""
     height, width = depth_m.shape
-    moves = torch.tensor([-1, 0, 0, 1])
-    dv, du = moves[torch.randint(4, (2, height, width), generator=generator)]
-    row = (torch.arange(height)[:, None] + dv).clamp_(0, height - 1)
-    column = (torch.arange(width) + du).clamp_(0, width - 1)
-    index: Int64[Tensor, "h w"] = row * width + column
-    return depth_m.reshape(-1)[index]
+    steps = torch.tensor([-1, 0, 0, 1])
+    # At the ends of a row it reads beyond; windows have a margin there.
+    moves = (steps[:, None] * width + steps).flatten()
+    index = torch.arange(height * width)
+    index += moves[torch.randint(16, (height * width,), generator=generator)]
+    return depth_m.reshape(-1)[index.clamp_(0, height * width - 1)].view(height, width)
 
 
 def _mixed(depth_m: Depth, generator: torch.Generator) -> Depth:

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.config import CloudConfig
 
 _LARGEST_CELL = 2**20
@@ -18,12 +18,15 @@ class Voxels:
     """Which cells of a grid a cloud fills, and the point that was kept in each.
 
     Attributes:
-        coordinates: cell of each kept point, ``floor((x - mean) / voxel)``; no two are equal.
+        coordinates: cell of each kept point, ``floor((x - mean) / voxel)`` of the turned cloud; no
+            two are equal.
         kept: index of that point in the cloud, ascending: the first of its cell.
+        grid_from_camera: how the cloud was turned before.
     """
 
     coordinates: Int64[Tensor, "m 3"]
     kept: Int64[Tensor, " m"]
+    grid_from_camera: Float[Tensor, "3 3"]
 
 
 def cloud_from_depth(
@@ -47,11 +50,22 @@ def cloud_from_depth(
     """
     refuse_other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
-    points_m = back_project(depth_m, K)[is_read]
+    points_m = _lifted(depth_m, is_read, K)
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+
+
+def _lifted(
+    depth_m: Float[Tensor, "h w"], is_read: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n 3"]:
+    """Do as ``back_project`` for some pixels alone, a fraction of the image."""
+    v, u = is_read.nonzero(as_tuple=True)
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    y = (v.to(depth_m) - cy) / fy
+    x = (u.to(depth_m) - cx - skew * y) / fx
+    return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
 
 
 def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> None:
@@ -93,8 +107,13 @@ def sample_points(
     return points_m[index.to(points_m.device)]
 
 
-def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
+def voxelise(
+    points_m: Float[Tensor, "n 3"], voxel_m: float, *, with_sight_axis: bool = False
+) -> Voxels:
     """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
+
+    The grid's axes are the camera's, or with ``with_sight_axis`` turned so that the third points at
+    the cloud's mean, the shortest way.
 
     Votes are cast from the kept points' own coordinates, not from the centres of cells.
 
@@ -103,7 +122,11 @@ def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
     """
     if len(points_m) == 0:
         raise InputError("voxelise: the cloud has no point; see refusal_of first.")
-    cells = torch.floor((points_m - points_m.mean(0)) / voxel_m).long()
+    mean_m = points_m.mean(0)
+    turn = torch.eye(3).to(points_m)
+    if with_sight_axis and float(mean_m.norm()) > 0:
+        turn = turn_axis_to(mean_m).mT.to(points_m)
+    cells = torch.floor((points_m - mean_m) @ turn.mT / voxel_m).long()
     extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
     if extent > _LARGEST_CELL:
         raise InputError(
@@ -116,4 +139,4 @@ def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
     order = torch.arange(len(cells), device=cells.device)
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
     kept = first.scatter_reduce_(0, cell, order, "amin").sort().values
-    return Voxels(coordinates=cells[kept], kept=kept)
+    return Voxels(coordinates=cells[kept], kept=kept, grid_from_camera=turn)

@@ -220,3 +220,26 @@ def _filled(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def _is_visible(model: Tensor, measured: Tensor, delta_m: float) -> Bool[Tensor, "h w"]:
     return (model > 0) & ((model - measured <= delta_m) | (measured == 0))
+
+
+def risk_coverage(
+    risks: Float[Tensor, " n"], is_right: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+    """Trade answers against mistakes: refuse beyond each risk in turn (El-Yaniv and Wiener 2010).
+
+    Args:
+        risks: of all inputs; infinite where there is no answer at any risk.
+        is_right: whether the answer is.
+
+    Returns:
+        Coverage, the share of all inputs that is answered, and the share of those answers that is
+        wrong; one point for each different finite risk, from the least to the greatest.
+    """
+    order = risks.argsort(stable=True)
+    ordered, wrong = risks[order], (~is_right[order]).double().cumsum(0)
+    answered = torch.arange(1, len(risks) + 1, dtype=torch.float64)
+    # Equal risks are refused together: the last of them stands for all.
+    is_last = torch.ones_like(ordered, dtype=torch.bool)
+    is_last[:-1] = ordered[1:] > ordered[:-1]
+    kept = is_last & ordered.isfinite()
+    return (answered / max(len(risks), 1))[kept], (wrong / answered)[kept]

@@ -9,15 +9,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
+from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.mesh import symmetries_from_bop, symmetries_to_bop
-from depthpose.pose.network import ResUNet, network_of
+from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel
 
+DirectionNet = ResUNet | PointNet
+"""Networks whose points vote."""
+AnyNetwork = DirectionNet | DepthImageNet
 KIND = "geoposenet"
+_NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
+    KIND: (ResUNet, ResUNetConfig),
+    "pointnet": (PointNet, PointNetConfig),
+    "depth-image": (DepthImageNet, DepthImageConfig),
+}
+"""Network and config of each kind of file: the method's, and those of its baselines."""
 _TENSORS = ("vertices_m", "faces", "normals", "keypoints_m")
 
 
@@ -26,14 +36,14 @@ class PoseWeights:
     """What a weights file of this room holds: enough to pose an object without its CAD file.
 
     Attributes:
-        network: partial cloud to directions, in eval mode where it was read.
+        network: partial cloud to directions, in eval mode where it was read; or a baseline.
         models: the objects; class k of the network is ``models[k]``.
         cloud: how the clouds were made that the network was trained on.
         refusal: when its estimates are withheld.
         facts: the card in short: ``trained_on``, ``licence``, ``terms`` and the like.
     """
 
-    network: ResUNet
+    network: AnyNetwork
     models: tuple[ObjectModel, ...]
     cloud: CloudConfig
     refusal: RefusalConfig
@@ -46,11 +56,12 @@ class PoseWeights:
                 f"the network knows {config.classes} classes, but {len(self.models)} models are "
                 "given; class k is models[k]. Give one model for each."
             )
+        wanted = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:
-            if len(model.keypoints_m) != config.keypoints:
+            if wanted not in (None, len(model.keypoints_m)):
                 raise InputError(
-                    f"the network points at {config.keypoints} keypoints, but object "
-                    f"{model.name!r} has {len(model.keypoints_m)}. Make the model with as many."
+                    f"the network points at {wanted} keypoints, but object {model.name!r} has "
+                    f"{len(model.keypoints_m)}. Make the model with as many."
                 )
         names = [model.name for model in self.models]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -78,8 +89,11 @@ def write_pose_weights(path: Path, weights: PoseWeights, *, with_half: bool = Fa
         "refusal": config_to_dict(weights.refusal),
         "models": [_record_of(model) for model in weights.models],
     }
-    facts = {**weights.facts, "norm_mode": network.config.norm}
-    save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=facts))
+    facts = dict(weights.facts)
+    if isinstance(network, ResUNet):
+        facts["norm_mode"] = network.config.norm
+    kind = next(kind for kind, (made, _) in _NETWORKS.items() if type(network) is made)
+    save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
 
 
 def read_pose_weights(path: Path) -> PoseWeights:
@@ -89,19 +103,25 @@ def read_pose_weights(path: Path) -> PoseWeights:
         InputError: no such weights, a part that is missing, or weights that do not fit their own
             config.
     """
-    checkpoint = read_checkpoint(path, KIND)
+    checkpoint = read_checkpoint(path)
+    if checkpoint.kind not in _NETWORKS:
+        raise InputError(
+            f"{path}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
+            f"{', '.join(map(repr, _NETWORKS))}."
+        )
     source = str(path)
     parts = {name: _part(checkpoint, name, source) for name in ("network", "cloud", "refusal")}
     records = checkpoint.config.get("models")
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
-    network = dataclasses.replace(
-        checkpoint, config=parts["network"], state=_under(checkpoint, "network.")
-    )
+    made, kind = _NETWORKS[checkpoint.kind]
+    network = made(config_from_dict(parts["network"], kind, source=source))
+    held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
+    load_weights(network, held, source)
     models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
     _refuse_strays(checkpoint, len(models), source)
     return PoseWeights(
-        network=network_of(network, source),
+        network=network.eval(),
         models=models,
         cloud=config_from_dict(parts["cloud"], CloudConfig, source=source),
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),

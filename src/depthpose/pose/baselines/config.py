@@ -57,8 +57,8 @@ class PointNetConfig:
     with_transforms: bool = True
     """The two T-Nets, which turn points (3x3) and features (64x64) before they go on."""
 
-    transform_weight: float = 0.001
-    """Weight in the loss of how far the features' transform is from a rotation."""
+    with_confidence: bool = False
+    """A fourth output beside each direction: the logit of how far to trust it."""
 
     unit_m: float = 0.1
     """Points are given to the network in units of so many metres: of order one for an object."""
@@ -79,11 +79,18 @@ class PointNetConfig:
                 f"classes {self.classes}, keypoints {self.keypoints} and channels {self.local}, "
                 f"{self.pooled}, {self.head} are all 1 or more"
             )
-        if not self.unit_m > 0 or self.transform_weight < 0:
-            raise InputError(
-                f"unit_m is {self.unit_m} and transform_weight {self.transform_weight}; take 0.1 "
-                "and 0.001"
-            )
+        if not self.unit_m > 0:
+            raise InputError(f"unit_m is {self.unit_m}; take 0.1")
+
+    @property
+    def components(self) -> int:
+        """Numbers for each point and keypoint: a direction, and maybe a logit."""
+        return 4 if self.with_confidence else 3
+
+    @property
+    def outputs(self) -> int:
+        """Channels of the last layer."""
+        return self.classes * self.keypoints * self.components
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,11 +30,11 @@ class PointNet(nn.Module):
         self.turn_features = _Transform(c.local[1]) if c.with_transforms else None
         self.pooled = _layers((c.local[1], *c.pooled))
         self.head = _layers((c.local[1] + c.pooled[2], *c.head))
-        self.final = nn.Linear(c.head[2], c.classes * c.keypoints * 3)
+        self.final = nn.Linear(c.head[2], c.outputs)
 
     def forward(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
-    ) -> Float[Tensor, "points classes keypoints 3"]:
+    ) -> Float[Tensor, "points classes keypoints components"]:
         """Give the raw directions of each point to the keypoints of every class.
 
         Args:
@@ -42,34 +42,42 @@ class PointNet(nn.Module):
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
         c = self.config
-        outputs = self.final(self.features(points_m, cloud)[0])
-        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
+        outputs = self.final(self.features(points_m, cloud))
+        return outputs.view(len(outputs), c.classes, c.keypoints, c.components)
+
+    def directions(
+        self,
+        points_m: Float[Tensor, "points 3"],
+        coordinates: Int[Tensor, "points 4"],
+        class_of_point: Int[Tensor, " points"],
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers.
+
+        Args:
+            points_m: of all clouds, one cloud after the other.
+            coordinates: (cloud, x, y, z) of each point's voxel; only the cloud is looked at.
+            class_of_point: which object each point belongs to.
+        """
+        cloud = coordinates[:, 0].long()
+        sizes = torch.bincount(cloud)
+        sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
+        local_m = points_m - (sums_m / sizes[:, None])[cloud]
+        rows = torch.arange(len(points_m), device=points_m.device)
+        return self(local_m, cloud)[rows, class_of_point]
 
     def features(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
-    ) -> tuple[Float[Tensor, "points width"], Float[Tensor, ""]]:
-        """Give what the last layer sees, and how far the features' transform is from a rotation."""
+    ) -> Float[Tensor, "points width"]:
+        """Give what the last layer sees of each point."""
         x = points_m / self.config.unit_m
         count = int(cloud.max()) + 1
         if self.turn_points is not None:
             x = _turned(x, self.turn_points(x, cloud, count), cloud)
-        x, strain = self.local(x), x.new_zeros(())
+        x = self.local(x)
         if self.turn_features is not None:
-            turn = self.turn_features(x, cloud, count)
-            x, strain = _turned(x, turn, cloud), _strain(turn)
+            x = _turned(x, self.turn_features(x, cloud, count), cloud)
         whole = _largest(self.pooled(x), cloud, count)
-        return self.head(torch.cat([x, whole[cloud]], 1)), strain
-
-    def forward_class(
-        self, points_m: Float[Tensor, "points 3"], number: int
-    ) -> Float[Tensor, "points keypoints 3"]:
-        """Answer for one cloud and one class alone."""
-        cloud = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        size = self.config.keypoints * 3
-        part = slice(number * size, (number + 1) * size)
-        features, _ = self.features(points_m, cloud)
-        outputs = F.linear(features, self.final.weight[part], self.final.bias[part])
-        return outputs.view(len(outputs), self.config.keypoints, 3)
+        return self.head(torch.cat([x, whole[cloud]], 1))
 
 
 class _Transform(nn.Module):
@@ -120,8 +128,3 @@ def _largest(x: Tensor, cloud: Tensor, count: int) -> Float[Tensor, "clouds c"]:
     """Maximum over the points of each cloud."""
     sizes = torch.bincount(cloud, minlength=count).tolist()
     return torch.stack([part.amax(0) for part in x.split(sizes)])
-
-
-def _strain(turn: Float[Tensor, "clouds c c"]) -> Float[Tensor, ""]:
-    eye = torch.eye(turn.shape[1], device=turn.device, dtype=turn.dtype)
-    return (turn @ turn.mT - eye).square().sum((-2, -1)).mean()

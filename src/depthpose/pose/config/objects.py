@@ -60,7 +60,7 @@ class ObjectsConfig:
     centre_px: tuple[float, float] = (325.2611, 242.04899)
     """Principal point."""
 
-    resolution: tuple[float, float] = (0.5, 1.0)
+    resolution: tuple[float, float] = (0.4, 0.8)
     """The image is so many times as large: coarser pictures are faster made."""
 
     occluded_share: float = 0.6
@@ -78,6 +78,12 @@ class ObjectsConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """What measures the depth."""
 
+    frame_objects: tuple[int, int] = (2, 6)
+    """Objects of a whole frame, no more than there are models."""
+
+    frame_clutter: tuple[int, int] = (0, 4)
+    """Boxes, balls and cans of no model among them."""
+
     def __post_init__(self) -> None:
         """Refuse counts of nothing, shares beyond one and empty ranges."""
         if self.number < 1 or (self.views is not None and self.views < 1):
@@ -93,8 +99,16 @@ class ObjectsConfig:
             raise InputError(f"occluded_share is {self.occluded_share}, but a share is 0 to 1")
         if not 0 <= self.mask_error_px <= 20:
             raise InputError(f"mask_error_px is {self.mask_error_px}; take 0 to 20, usually 3")
+        for name in ("frame_objects", "frame_clutter"):
+            low, high = getattr(self, name)
+            least = 1 if name == "frame_objects" else 0
+            if not least <= low <= high:
+                raise InputError(
+                    f"{name} is ({low}, {high}), but it goes from {least} or more upward; usual is "
+                    f"({2 * least}, {4 + 2 * least})"
+                )
         _refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
-        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.5, 1.0)")
+        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.4, 0.8)")
         _refuse_range("occlusion", self.occlusion, (0.0, 0.95), "(0.0, 0.4)")
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.errors import InputError, nearest_name
+from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.given import (
     AnyArray,
@@ -22,7 +23,6 @@ from depthpose.pose.estimator.given import (
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.refine import Surface, prepare_surface
-from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -47,6 +47,11 @@ class GeoPoseNet:
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
         self.config = EstimateConfig() if config is None else config
         self.weights = weights
+        if isinstance(weights.network, DepthImageNet):
+            raise InputError(
+                "these weights regress a depth image and cast no votes; load them as "
+                "DepthImageRegressor"
+            )
         self._network = weights.network.to(self.config.device).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
         self._surfaces: dict[int, Surface] = {}
@@ -168,8 +173,17 @@ class GeoPoseNet:
         coordinates = torch.cat([cloud.coordinates for cloud in clouds])
         rows = torch.cat([cloud_of_point[:, None], coordinates], 1).to(self.config.device)
         class_of_point = torch.tensor(numbers)[cloud_of_point].to(self.config.device)
-        outputs = self._network.forward_classes(Voxels.from_points(rows), class_of_point)
-        return list(outputs.float().cpu().split(counts)), time.perf_counter() - start
+        points_m = torch.cat([cloud.points_m @ cloud.grid_from_camera.mT for cloud in clouds])
+        outputs = (
+            self._network.directions(points_m.to(self.config.device), rows, class_of_point)
+            .float()
+            .cpu()
+        )
+        turned = [
+            _in_camera(some, cloud.grid_from_camera)
+            for some, cloud in zip(outputs.split(counts), clouds, strict=True)
+        ]
+        return turned, time.perf_counter() - start
 
     def _pose(
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
@@ -198,6 +212,14 @@ class GeoPoseNet:
                 f"object {name!r}: the weights do not know it; {nearest_name(name, self.objects)}"
             )
         return self._numbers[name]
+
+
+def _in_camera(
+    outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k c"]:
+    """Turn directions back from the network's grid; what stands behind them stays."""
+    directions = outputs[..., :3] @ grid_from_camera
+    return torch.cat([directions, outputs[..., 3:]], -1)
 
 
 def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:

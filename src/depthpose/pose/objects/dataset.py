@@ -28,6 +28,7 @@ from depthpose.pose.objects.views import (
     draw_view,
     gaze,
     make_shape,
+    pixel_to_ray,
     pose_of_middle,
     silhouette_of,
     turn_view,
@@ -226,7 +227,7 @@ class Objects:
             place.append(uniform(generator, low, high) if low < high else middle)
         roll_rad = uniform(generator, 0.0, 2 * math.pi)
         pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
-        return gaze(torch.linalg.inv(K) @ pixel, roll_rad)
+        return gaze(pixel_to_ray(K) @ pixel, roll_rad)
 
     def _before_background(
         self, clean: CleanView, shape: Shape, generator: torch.Generator
@@ -241,7 +242,7 @@ class Objects:
         )
         gap_m = max(0.0, uniform(generator, -0.2, 0.3))
         offset = float((hull_m @ normal).min()) - gap_m
-        a, b, c = (normal @ torch.linalg.inv(clean.K)).tolist()
+        a, b, c = (normal @ pixel_to_ray(clean.K)).tolist()
         height, width = clean.depth_m.shape
         slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
         behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)

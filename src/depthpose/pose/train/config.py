@@ -11,7 +11,7 @@ from depthpose.pose.network import ResUNetConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ModelsConfig:
-    """The objects that are learnt: CAD files, or models of a folder in BOP's layout."""
+    """The objects that are learnt: CAD files, or models of a data set, or parts of our own."""
 
     cad: tuple[str, ...] = ()
     """Model files; each object is called as its file."""
@@ -21,6 +21,9 @@ class ModelsConfig:
 
     bop: str | None = None
     """Folder of a data set, whose models are taken in place of CAD files."""
+
+    parts: tuple[str, ...] = ()
+    """Names of made parts (bracket, flange, mug, connector, spool), in place of either."""
 
     objects: tuple[int, ...] = ()
     """Numbers of the data set's objects; none: all."""
@@ -46,7 +49,7 @@ class FramesConfig:
     """Of the samples; the others are made."""
 
     with_roll: bool = True
-    """Turn the camera of a frame about its optical axis at random, which is as true as the frame."""
+    """Turn the camera of a frame about its optical axis at random: as true as the frame."""
 
     def __post_init__(self) -> None:
         """Refuse no folder, and shares that are none."""
@@ -75,6 +78,31 @@ class HeldOutConfig:
             raise InputError(
                 f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
                 "looked at; take 25 and (0.0, 0.3)"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationConfig:
+    """Made views by which the refusal is chosen, after the training."""
+
+    number: int = 150
+    """Of each object; 0: nothing is ever refused for its risk."""
+
+    occlusion: tuple[float, float] = (0.0, 0.6)
+    """Hidden shares of the silhouette, from easy to hard."""
+
+    max_wrong_share: float = 0.01
+    """Wrong answers among the answers that are given."""
+
+    def __post_init__(self) -> None:
+        """Refuse too few views to choose by, and shares that are none."""
+        if self.number and self.number < 20:
+            raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
+                             "views: take 150, or 0 for no refusal")  # fmt: skip
+        if not 0 < self.max_wrong_share < 1:
+            raise InputError(
+                f"max_wrong_share is {self.max_wrong_share}, but a share is between 0 and 1; take "
+                "0.01"
             )
 
 
@@ -111,12 +139,15 @@ class PoseTraining:
     """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=2e-3, schedule="cosine", warmup_steps=50)
+        default_factory=lambda: AdamConfig(learning_rate=4e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
 
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
     """What validation looks at."""
+
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """By what the refusal is chosen."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(

@@ -1,6 +1,7 @@
 """Held-out made views: how often does the network as it stands find the pose?"""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -13,13 +14,12 @@ from depthpose.pose.cloud import refusal_of
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
-from depthpose.pose.network import ResUNet, select_class
 from depthpose.pose.objects import Objects
-from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import Cloud, collate_clouds, voxelised_cloud
 from depthpose.pose.train.config import HeldOutConfig
-from depthpose.pose.types import ObjectModel, Vote
+from depthpose.pose.types import ObjectModel, PoseEstimate, PoseTruth, Vote
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
+from depthpose.pose.weights import DirectionNet
 
 HELD_OUT_SEED = 0x4E1D
 """Added to the seed of the views that are trained on."""
@@ -53,7 +53,7 @@ class HeldOut:
         self._clouds: dict[float, list[Cloud]] = {}
 
     @torch.no_grad()
-    def look(self, network: ResUNet) -> Evidence:
+    def look(self, network: DirectionNet) -> Evidence:
         """Share of ADD(-S) below a tenth of the diameter, and the median in percent of it."""
         numbers: dict[str, float] = {}
         for occlusion in self.config.occlusions:
@@ -63,7 +63,7 @@ class HeldOut:
                 numbers[f"{place}_median"] = float(errors.median())
         return Evidence(numbers=numbers)
 
-    def _errors(self, network: ResUNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
+    def _errors(self, network: DirectionNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
         methods = ["lines", "ransac"] if self.config.with_ransac else ["lines"]
         found: dict[str, list[float]] = {method: [] for method in methods}
         for cloud, directions in self._directions(network, self._of(occlusion)):
@@ -77,35 +77,25 @@ class HeldOut:
         """ADD, or ADD-S of a symmetric object, in diameters."""
         model = self.models[cloud.class_number]
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
-        measure = add_m if model.symmetries.is_none else adds_m
         truth, points = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
-        return float(measure(fit.camera_from_model, truth, points)) / model.diameter_m
+        return add_share(fit.camera_from_model, truth, model, points)
 
     def _directions(
-        self, network: ResUNet, clouds: Sequence[Cloud]
+        self, network: DirectionNet, clouds: Sequence[Cloud]
     ) -> Iterator[tuple[Cloud, Float[Tensor, "n k 3"]]]:
         device = next(network.parameters()).device
         for start in range(0, len(clouds), _TOGETHER):
             part = clouds[start : start + _TOGETHER]
             batch = collate_clouds(part)
-            voxels = Voxels.from_points(batch.coordinates.to(device))
             classes = batch.class_of[batch.instance].to(device)
-            outputs = select_class(network(voxels), classes).float()[..., :3]
+            points_m, rows = batch.points_m.to(device), batch.coordinates.to(device)
+            outputs = network.directions(points_m, rows, classes).float()[..., :3]
             sizes = [len(cloud.points_m) for cloud in part]
             yield from zip(part, outputs.split(sizes), strict=True)
 
     def _of(self, occlusion: float) -> list[Cloud]:
         if occlusion not in self._clouds:
-            config = dataclasses.replace(
-                self._made,
-                number=self.config.number * len(self.models),
-                seed=self._made.seed + HELD_OUT_SEED,
-                views=None,
-                resolution=(1.0, 1.0),
-                occluded_share=1.0,
-                occlusion=(occlusion, occlusion),
-            )
-            objects = Objects(self.models, config, self._cloud)
+            objects = held_out_objects(self.models, self._made, self._cloud, self.config, occlusion)
             self._clouds[occlusion] = list(self._voxelised(objects))
         return self._clouds[occlusion]
 
@@ -116,3 +106,39 @@ class HeldOut:
                 generator = ticket_generator(index, HELD_OUT_SEED)
                 number = index % len(self.models)
                 yield voxelised_cloud(sample, number, self._cloud, generator)
+
+
+def held_out_objects(
+    models: Sequence[ObjectModel],
+    made: ObjectsConfig,
+    cloud: CloudConfig,
+    config: HeldOutConfig,
+    occlusion: float,
+) -> Objects:
+    """Make the views that no training sees, all of one occlusion."""
+    config_here = dataclasses.replace(
+        made,
+        number=config.number * len(models),
+        seed=made.seed + HELD_OUT_SEED,
+        views=None,
+        resolution=(1.0, 1.0),
+        occluded_share=1.0,
+        occlusion=(occlusion, occlusion),
+    )
+    return Objects(models, config_here, cloud)
+
+
+def pose_error(estimate: PoseEstimate, truth: PoseTruth, model: ObjectModel) -> float:
+    """ADD, or ADD-S of a symmetric object, in diameters; infinite where there is no answer."""
+    if estimate.camera_from_model is None:
+        return math.inf
+    points = sample_surface(model, _SURFACE)[0]
+    return add_share(estimate.camera_from_model, truth.camera_from_model, model, points)
+
+
+def add_share(
+    found: Rigid, truth: Rigid, model: ObjectModel, points_m: Float[Tensor, "n 3"]
+) -> float:
+    """ADD, or ADD-S of a symmetric object, in diameters."""
+    measure = add_m if model.symmetries.is_none else adds_m
+    return float(measure(found, truth, points_m)) / model.diameter_m

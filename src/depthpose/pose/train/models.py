@@ -11,6 +11,7 @@ from depthpose.pose.mesh import (
     read_model,
     symmetries_from_proposals,
 )
+from depthpose.pose.objects import make_part
 from depthpose.pose.train.config import ModelsConfig
 from depthpose.pose.types import ObjectModel
 
@@ -25,10 +26,13 @@ def read_models(
         tell: told of symmetries that were found in CAD files, taken or not.
 
     Raises:
-        InputError: none is named, both kinds are, two have one name, or a file is damaged.
+        InputError: none is named, or of two kinds, two have one name, or a file is damaged.
     """
-    if config.cad and config.bop:
-        raise InputError("cad and bop are both given; take the models from one of them")
+    given = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} are given; take the models from one of them")
+    if config.parts:
+        return tuple(make_part(p, n, config.mesh) for n, p in enumerate(config.parts, start=1))
     if config.bop:
         return _from_bop(Path(config.bop), config)
     if not config.cad:

@@ -9,12 +9,11 @@ from torch import Tensor, nn
 from depthpose.core.loop import Evidence, Turn, make_adam
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.network import ResUNet, select_class
-from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import CloudBatch
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.held_out import HeldOut
 from depthpose.pose.types import ObjectModel
+from depthpose.pose.weights import DirectionNet
 
 _SYMMETRY_STEP = 0.05
 """Turns about a continuous axis are tried every 5.7 degrees; the vote's own error is larger."""
@@ -28,7 +27,7 @@ class PoseTask:
 
     def __init__(
         self,
-        network: ResUNet,
+        network: DirectionNet,
         models: Sequence[ObjectModel],
         config: PoseTraining,
         held_out: HeldOut | None,
@@ -41,9 +40,10 @@ class PoseTask:
 
     def step(self, batch: CloudBatch) -> Iterator[Turn]:
         """One turn: all clouds at once."""
-        voxels = Voxels.from_points(batch.coordinates)
         instance = batch.instance
-        outputs = select_class(self.network(voxels), batch.class_of[instance]).float()
+        outputs = self.network.directions(
+            batch.points_m, batch.coordinates, batch.class_of[instance]
+        ).float()
         found, copies_m = outputs[..., :3], self._posed(batch)
         loss = direction_loss(found, batch.points_m, copies_m, instance, self.config.loss)
         facts: dict[str, Tensor] = {"directions": loss.detach()}

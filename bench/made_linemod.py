@@ -1,0 +1,209 @@
+"""Held-out made views of known objects: success over occlusion, sensor noise and resolution.
+
+    python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
+        --ours pose.safetensors --pointnet pointnet.safetensors \
+        --depth-image depth-image.safetensors --open3d 100
+
+Every view is a rendering of its own, by a seed that no training has. A method is given one view at
+a time, on one thread; of several weights each answers for the objects that it knows. Success is ADD
+(ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. Writes rows.csv,
+rows.json, table.md and a picture of each curve.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from curves import draw_curves
+
+from depthpose.core.report import markdown_table, write_table
+from depthpose.pose.baselines import FpfhRegistration
+from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.objects import Objects
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput, ViewSample
+
+SEED = 0x7E57ED
+POINTS = 1000
+OCCLUSIONS = (0.0, 0.2, 0.4, 0.6)
+NOISES = (0.0, 1.0, 2.0, 4.0, 8.0)
+RESOLUTIONS = (1.0, 0.5, 0.25, 0.125)
+
+Row = dict[str, Any]
+
+
+class Condition(NamedTuple):
+    """How the views of one point of a curve look."""
+
+    occlusion: float = 0.0
+    noise: float = 1.0
+    resolution: float = 1.0
+
+
+class Method(NamedTuple):
+    """One way to pose a view, and how many views of each object it is given."""
+
+    name: str
+    pose: Callable[[ViewInput], PoseEstimate]
+    objects: frozenset[str]
+    limit: int
+
+
+def made_views(models: Sequence[ObjectModel], at: Condition, number: int) -> Objects:
+    """Make ``number`` views of each object under a condition."""
+    config = ObjectsConfig(
+        number=number * len(models), seed=SEED, views=None,
+        resolution=(at.resolution, at.resolution),
+        occluded_share=1.0 if at.occlusion else 0.0, occlusion=(at.occlusion, at.occlusion),
+        sensor=dataclasses.replace(SensorConfig(), noise=(at.noise, at.noise)),
+    )  # fmt: skip
+    return Objects(models, config)
+
+
+def loaded(
+    name: str, files: Sequence[str], number: int, kind: type[GeoPoseNet | DepthImageRegressor]
+) -> Iterator[Method]:
+    """Give a method of trained weights, with and without ICP."""
+    for with_icp in (False, True):
+        nets = [kind.load(file, EstimateConfig(with_icp=with_icp)) for file in files]
+        by_object = {which: net for net in nets for which in net.objects}
+
+        def pose(given: ViewInput, known: dict[str, Any] = by_object) -> PoseEstimate:
+            return known[given.object].estimate_many([given])[0]
+
+        if by_object:
+            called = f"{name} + ICP" if with_icp else name
+            yield Method(called, pose, frozenset(by_object), number)
+
+
+def registration(models: Sequence[ObjectModel], number: int) -> Iterator[Method]:
+    """Give Open3D's registration, where it is asked for."""
+    if not number:
+        return
+    peers = {model.name: FpfhRegistration(model) for model in models}
+    diameter_m = {model.name: model.diameter_m for model in models}
+
+    def pose(given: ViewInput) -> PoseEstimate:
+        points_m = cloud_from_depth(
+            given.depth_m, given.mask, given.K, diameter_m[given.object]
+        ).float()
+        cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
+        return peers[given.object].estimate(cloud)
+
+    yield Method("Open3D FPFH + RANSAC + ICP", pose, frozenset(peers), number)
+
+
+def measure(method: Method, view: ViewSample, model: ObjectModel, points_m: torch.Tensor) -> Row:
+    """Pose one view."""
+    began = time.perf_counter()
+    estimate = method.pose(view.input)
+    seconds = time.perf_counter() - began
+    error = torch.inf
+    if estimate.camera_from_model is not None:
+        metric = add_m if model.symmetries.is_none else adds_m
+        truth = view.truth.camera_from_model
+        error = float(metric(estimate.camera_from_model, truth, points_m)) / model.diameter_m
+    return {"object": model.name, "error": error, "refused": not estimate.is_ok, "s": seconds}
+
+
+def run_condition(
+    methods: Sequence[Method], models: Sequence[ObjectModel], at: Condition, number: int
+) -> Iterator[Row]:
+    """Give a row for each method and object, and one for all objects together."""
+    objects = made_views(models, at, number)
+    surfaces = [sample_surface(model, POINTS)[0] for model in models]
+    found: dict[str, list[Row]] = {method.name: [] for method in methods}
+    for index in range(len(objects)):
+        view, which = objects.view(index), index % len(models)
+        for method in methods:
+            if index // len(models) < method.limit and models[which].name in method.objects:
+                row = measure(method, view, models[which], surfaces[which])
+                found[method.name].append(row)
+    for method in methods:
+        for name in (*(model.name for model in models), "all"):
+            rows = [r for r in found[method.name] if name in (r["object"], "all")]
+            if rows:
+                yield {**at._asdict(), "method": method.name, "object": name, **shares(rows)}
+
+
+def shares(rows: Sequence[Row]) -> Row:
+    """Count successes, refusals and wrong answers, and take medians."""
+    errors = torch.tensor([row["error"] for row in rows])
+    refused = sum(row["refused"] for row in rows)
+    right, middle = int((errors < 0.1).sum()), float(errors.median())
+    return {
+        "views": len(rows),
+        "success": right / len(rows),
+        "refused": refused / len(rows),
+        "wrong": (len(rows) - right - refused) / len(rows),
+        # Where more than half is refused, the median is no number.
+        "median error [diameters]": round(middle, 4) if middle < torch.inf else None,
+        "median ms": round(1000 * float(torch.tensor([row["s"] for row in rows]).median()), 1),
+    }
+
+
+def conditions(words: argparse.Namespace) -> Iterator[tuple[Condition, int]]:
+    """List what is measured, each once."""
+    for occlusion in OCCLUSIONS:
+        yield Condition(occlusion=occlusion), words.number
+    if words.sweep:
+        yield from ((Condition(noise=n), words.sweep) for n in NOISES if n != 1)
+        yield from ((Condition(resolution=r), words.sweep) for r in RESOLUTIONS if r != 1)
+
+
+def draw(rows: Sequence[Row], out: Path) -> None:
+    """Draw success of all objects over each knob, the others at their usual value."""
+    usual = Condition()._asdict()
+    for knob, what in (("occlusion", "share of the silhouette that is hidden"),
+                       ("noise", "times the sensor's usual noise"),
+                       ("resolution", "times 640 x 480")):  # fmt: skip
+        curves: dict[str, list[tuple[float, float]]] = {}
+        for row in rows:
+            others_usual = all(row[k] == v for k, v in usual.items() if k != knob)
+            if row["object"] == "all" and others_usual:
+                curves.setdefault(row["method"], []).append((row[knob], row["success"]))
+        if any(len(points) > 1 for points in curves.values()):
+            draw_curves(out / f"{knob}.png", f"ADD(-S) < 10 % over {knob}", what, curves)
+
+
+def main() -> None:
+    """Run every method under every condition."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bop", type=Path, required=True, help="data set whose models are shown")
+    parser.add_argument("--objects", type=int, nargs="*", help="their numbers; all by default")
+    parser.add_argument("--ours", nargs="*", default=[])
+    parser.add_argument("--pointnet", nargs="*", default=[])
+    parser.add_argument("--depth-image", nargs="*", default=[])
+    parser.add_argument("--open3d", type=int, default=0, help="views of each object; 0: not run")
+    parser.add_argument("--number", type=int, default=250, help="views of each object")
+    parser.add_argument("--sweep", type=int, default=50, help="views at each noise and resolution")
+    parser.add_argument("--out", type=Path, default=Path("out/made_linemod"))
+    words = parser.parse_args()
+    torch.set_num_threads(1)
+    numbers = words.objects or sorted(read_models_info(models_folder(words.bop)))
+    models = list(read_bop_models(words.bop, numbers).values())
+    methods = [
+        *loaded("Geo-PoseNet", words.ours, words.number, GeoPoseNet),
+        *loaded("PointNet", words.pointnet, words.number, GeoPoseNet),
+        *loaded("depth image", words.depth_image, words.number, DepthImageRegressor),
+        *registration(models, words.open3d),
+    ]
+    rows: list[Row] = []
+    for at, number in conditions(words):
+        rows += run_condition(methods, models, at, number)
+        print(markdown_table([row for row in rows if row["object"] == "all"][-len(methods) :]),
+              flush=True)  # fmt: skip
+        write_table(words.out, rows)
+        draw(rows, words.out)
+
+
+if __name__ == "__main__":
+    main()

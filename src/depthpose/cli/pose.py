@@ -1,0 +1,198 @@
+"""``depthpose pose ...``."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from depthpose.core.errors import InputError
+from depthpose.pose.config import (
+    DiameterTable,
+    EstimateConfig,
+    EvaluationConfig,
+    SymmetryRule,
+    Unit,
+    VotingConfig,
+    VotingMethod,
+)
+
+Voting = Literal["ransac", "least-squares"]
+
+
+def voting_method(word: Voting) -> VotingMethod:
+    """Give the method of a word, which a shell takes without quotes."""
+    return "least squares" if word == "least-squares" else "ransac"
+
+
+def predict(
+    out: Path,
+    weights: str = "default",
+    cloud: Path | None = None,
+    unit: Unit = "m",
+    depth: Path | None = None,
+    mask: Path | None = None,
+    camera: Path | None = None,
+    object: str | None = None,
+    bop: Path | None = None,
+    split: str = "test",
+    masks: str = "truth",
+    voting: Voting = "ransac",
+    hypotheses: int = 128,
+    icp: bool = True,
+    batch: int = 16,
+    device: str = "cpu",
+) -> int:
+    """The pose of known objects from clouds, depth images or a data set; or the reason for none.
+
+    poses.json holds for each input camera_from_model (metres), its covariance, status and reason,
+    and the seconds of each stage. A cloud or depth image NAME gives NAME.ply, the posed model
+    beside the cloud, and NAME.png over the depth image; a data set gives
+    depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. A rerun skips what is finished; other settings
+    need another --out; processes of torchrun share the work.
+
+        depthpose pose predict --cloud part.ply --unit mm --object part --out out
+        depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
+        depthpose pose predict --bop lm --split test --weights linemod-nc --out out
+
+    Args:
+        out: folder for the results.
+        weights: of a pose network, by name or file ('depthpose weights list').
+        cloud: points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z
+            forward; or a folder of such files.
+        unit: of the clouds.
+        depth: 16-bit PNG in the camera's depth_unit_m, or a folder of them.
+        mask: not black is the object; or a folder of masks with the names of the depth images.
+        camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}.
+        object: which of the objects that the weights know.
+        bop: folder of a data set in BOP's layout, or of Linemod_preprocessed.
+        split: of the data set.
+        masks: truth (the annotated ones), predicted (those that came with Linemod_preprocessed),
+            a JSON file of BOP detections, or weights of a segmentation, by name or file.
+        voting: ransac, or least-squares.
+        hypotheses: of RANSAC, for each keypoint.
+        icp: slide the voted pose onto the cloud.
+        batch: inputs in one call of the network.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli.pose_methods import pose_method
+    from depthpose.core.run import claim_names, own_device
+
+    _refuse_mixture(cloud, depth, bop)
+    config = EstimateConfig(
+        voting=VotingConfig(method=voting_method(voting), hypotheses=hypotheses),
+        with_icp=icp,
+        device=own_device(device),
+    )
+    method = pose_method(weights, config)
+    if bop is not None:
+        return _predict_bop(method, (bop, split, masks), out, batch)
+    name = posing.object_named(object, method)
+    settings: dict[str, Any] = {"object": name}
+    if cloud is not None:
+        jobs = posing.cloud_jobs(cloud, unit, name)
+        settings |= {"unit": unit}
+    else:
+        assert depth is not None
+        if mask is None or camera is None:
+            raise InputError("--depth needs --mask and --camera beside it")
+        jobs = posing.view_jobs(depth, mask, camera, name)
+        settings |= {"camera": str(camera.resolve()), "mask": str(mask.resolve())}
+    claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
+    predictions = posing.predict_all(method, jobs, out, settings, batch)
+    if predictions is None:
+        return 0
+    posing.write_files(predictions, jobs, out, method)
+    return posing.say_result(predictions, out)
+
+
+def evaluate(
+    bop: Path,
+    out: Path,
+    split: str = "test",
+    weights: tuple[str, ...] = (),
+    csv: tuple[Path, ...] = (),
+    predictions: tuple[Path, ...] = (),
+    masks: tuple[str, ...] = ("truth",),
+    objects: tuple[str, ...] = (),
+    targets: Path | None = None,
+    diameters: DiameterTable = "bop",
+    adds: SymmetryRule = "declared",
+    vsd: bool = True,
+    voting: Voting = "ransac",
+    icp: bool = True,
+    device: str = "cpu",
+) -> int:
+    """Measure poses on a BOP or Linemod_preprocessed data set, and write rows, a table and a page.
+
+    Predictions are made once, as files in OUT/predictions/METHOD_MASKS (poses.json and BOP's csv),
+    and measured from there; a second run measures without predicting anew. Several weights and
+    kinds of masks may be named at once: their rows share the table. What is not estimated, or
+    refused, counts as a failure.
+
+        depthpose pose evaluate --bop lm --split test --weights W.safetensors --out out/lm
+
+    Args:
+        bop: folder of the data set.
+        out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
+        split: train, test, ...
+        weights: files or names, of the method or of a baseline.
+        csv: BOP results of any method.
+        predictions: folders with poses.json.
+        masks: truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP
+            detections; or weights of a segmentation. Each is a column of its own.
+        objects: keep these alone, by name or number.
+        targets: a BOP list of targets, such as test_targets_bop19.json; by default all instances.
+        diameters: bop: as the data set declares them; pvnet: PVNet's table of LineMOD.
+        adds: declared: ADD-S for objects declared symmetric (of LineMOD eggbox and glue); all.
+        vsd: draw poses for VSD and BOP's average recall, which takes most of the time.
+        voting: ransac, or least-squares.
+        icp: refine each pose by ICP.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from depthpose.cli import pose_evaluating, pose_methods
+
+    if not (weights or csv or predictions):
+        raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
+    dataset = pose_evaluating.open_instances(bop, split, objects, targets)
+    config = EstimateConfig(
+        voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
+    )
+    methods = [pose_methods.pose_method(word, config) for word in weights]
+    shown = [pose_methods.find_masks(word, dataset, out) for word in masks] if methods else []
+    paths = [
+        pose_methods.predict_all(dataset, method, one, out) for method in methods for one in shown
+    ]
+    rule = EvaluationConfig(diameters=diameters, adds=adds, with_vsd=vsd)
+    measured = pose_evaluating.measure_all(dataset, [*paths, *csv, *predictions], rule)
+    return pose_evaluating.report(dataset, measured, out)
+
+
+def _predict_bop(
+    method: Any,  # noqa: ANN401  a type of this would load torch for --help
+    given: tuple[Path, str, str],
+    out: Path,
+    batch: int,
+) -> int:
+    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli.pose_methods import find_masks
+    from depthpose.pose.bop import open_bop
+
+    folder, split, word = given
+    dataset = open_bop(folder, split)
+    dataset = dataset.of_objects(*posing.known_objects(dataset, method))
+    masks = find_masks(word, dataset, out)
+    settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
+    jobs = posing.bop_jobs(dataset, masks, method)
+    predictions = posing.predict_all(method, jobs, out, {**settings, **masks.settings}, batch)
+    if predictions is None:
+        return 0
+    posing.write_bop_files(predictions, dataset, out, method)
+    return posing.say_result(predictions, out)
+
+
+def _refuse_mixture(cloud: Path | None, depth: Path | None, bop: Path | None) -> None:
+    given = sum(word is not None for word in (cloud, depth, bop))
+    if given != 1:
+        raise InputError(
+            f"{given} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
+            "with --mask and --camera, or a data set"
+        )

@@ -1,0 +1,281 @@
+"""The work behind ``depthpose pose predict``."""
+
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+from tqdm import tqdm
+
+from depthpose.cli.pose_methods import Masks, PoseMethod, match_names
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import (
+    list_images,
+    read_depth_png,
+    read_image,
+    write_cloud,
+    write_image,
+)
+from depthpose.core.run import Shard, claim_folder, find_shard, wait_for
+from depthpose.pose.bop import BopDataset, Instance
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import Unit
+from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
+from depthpose.pose.predictions import (
+    Job,
+    Prediction,
+    is_started,
+    predict,
+    read_predictions,
+    results_name,
+    write_bop_results,
+    write_predictions,
+)
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+
+CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unreadable:
+    """An input that could not be read, in the place of what it would have been."""
+
+    name: str
+    object: str
+    reason: str
+
+
+def object_named(name: str | None, method: PoseMethod) -> str:
+    """Give the object that is meant.
+
+    Raises:
+        InputError: none of that name, or several and none is named.
+    """
+    known = [model.name for model in method.models]
+    if name is None and len(known) > 1:
+        raise InputError(f"the weights know {', '.join(known)}; say which by --object")
+    if name is not None and name not in known:
+        raise InputError(
+            f"--object {name}: the weights do not know it; {nearest_name(name, known)}"
+        )
+    return known[0] if name is None else name
+
+
+def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
+    """Take a cloud, or every one of a folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    if word.is_dir():
+        files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
+    else:
+        files = [word]
+    if not files:
+        raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
+    return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+
+
+def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[Any]]:
+    """Take a depth image and its mask, or those of one name in two folders.
+
+    Raises:
+        InputError: there is none, or a depth image has no mask.
+    """
+    depths = list_images(depth)
+    masks = {path.stem: path for path in list_images(mask)}
+    if len(depths) == len(masks) == 1 and not depth.is_dir():
+        masks = {depths[0].stem: next(iter(masks.values()))}
+    lost = [path.stem for path in depths if path.stem not in masks]
+    if lost:
+        raise InputError(
+            f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
+        )
+    return [
+        _job(p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem))
+        for p in depths
+    ]
+
+
+def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
+    """Number the objects of a data set that the weights know; say which are left out.
+
+    Raises:
+        InputError: they know none.
+    """
+    numbers = {model.number for model in method.models}
+    words = {model.name for model in method.models}
+    there = sorted({instance.object_id for instance in dataset.instances})
+    known = [n for n in there if n in numbers or dataset.objects[n].name in words]
+    left = sorted(set(there) - set(known))
+    if not known:
+        raise InputError(
+            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(words)}; "
+            "give weights of its objects"
+        )
+    if left:
+        print(f"left out, as the weights do not know them: objects {left}", file=sys.stderr)
+    return known
+
+
+def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:
+    """Take the instances of a data set by some masks.
+
+    Raises:
+        InputError: the weights do not know an object of it.
+    """
+    names = match_names(dataset, method.models)
+    jobs = masks.jobs(names)
+    return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
+
+
+def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
+                batch: int) -> list[Prediction] | None:  # fmt: skip
+    """Estimate what is not finished; several processes share the work and meet in the files.
+
+    Returns:
+        All predictions in the order of the jobs; None in a process that is not the first.
+    """
+    shard = find_shard()
+    settings = {**method.settings, **settings}
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
+        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
+
+    claim_folder(out, settings)
+    home = out if shard.world == 1 else out / f"part-{shard.rank}"
+    done = _known(out)
+    left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
+    if left:
+        names = predict(estimate_many, left, home, settings, batch)
+        for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
+            pass
+    if shard.rank:
+        return None
+    return _gather(jobs, out, shard)
+
+
+def say_result(predictions: list[Prediction], out: Path) -> int:
+    """Print how many were posed and why others were not; give the exit code."""
+    reasons: dict[str, int] = defaultdict(int)
+    failed = [p.estimate for p in predictions if p.estimate.reason.startswith(_FAILED)]
+    for prediction in predictions:
+        if prediction.estimate not in failed:
+            reasons[prediction.estimate.status] += 1
+    for estimate in failed:
+        print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
+    if len(predictions) == 1 and not failed and not predictions[0].estimate.is_ok:
+        print(f"refused: {predictions[0].estimate.reason}")
+    said = ", ".join(f"{count} {status}" for status, count in sorted(reasons.items()))
+    print(f"{len(predictions)} inputs: {said or 'none readable'}; {out / 'poses.json'}")
+    return 1 if failed else 0
+
+
+def write_files(
+    predictions: list[Prediction], jobs: list[Job[Any]], out: Path, method: PoseMethod
+) -> None:
+    """Write NAME.ply, and NAME.png where there is a depth image."""
+    for prediction, job in zip(predictions, jobs, strict=True):
+        estimate = prediction.estimate
+        pose = estimate.camera_from_model
+        if pose is None:
+            continue
+        given, model = job.read(), _model(method, estimate.object)
+        points_m = given.points_m if not isinstance(given, ViewInput) else cloud_from_depth(
+            given.depth_m, given.mask, given.K, model.diameter_m
+        )  # fmt: skip
+        finite_m = points_m[points_m.isfinite().all(-1)]
+        write_cloud(out / f"{job.name}.ply", posed_cloud(finite_m, pose, model))
+        if isinstance(given, ViewInput):
+            picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
+            write_image(out / f"{job.name}.png", picture)
+
+
+def write_bop_files(
+    predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
+) -> None:
+    """Write BOP's csv, and a picture SCENE_IMAGE.png of each image."""
+    write_bop_results(out / results_name(dataset), predictions)
+    image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    found: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
+    for prediction in predictions:
+        if prediction.place is not None and prediction.estimate.is_ok:
+            found[prediction.place[:2]].append(prediction.estimate)
+    for (scene, image), estimates in found.items():
+        path = out / f"{scene:06d}_{image:06d}.png"
+        if not path.is_file():
+            write_image(path, _overlay(image_of[scene, image], estimates, method))
+
+
+def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
+    if instance.rgb is not None:
+        picture = read_image(instance.rgb)
+    else:
+        picture = grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
+    for estimate in estimates:
+        assert estimate.camera_from_model is not None
+        model = _model(method, estimate.object)
+        picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
+    return picture
+
+
+def _known(out: Path) -> dict[str, Prediction]:
+    folders = [out, *sorted(out.glob("part-*"))]
+    return {p.estimate.name: p for f in folders if is_started(f) for p in read_predictions(f)}
+
+
+def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
+    if shard.world > 1:
+        seen: dict[str, Any] = {"at": -10.0, "names": set()}
+
+        def is_there(name: str) -> bool:
+            # Files of all parts are read for all names at once, every second.
+            if name not in seen["names"] and time.monotonic() - seen["at"] > 1:
+                seen["names"], seen["at"] = set(_known(out)), time.monotonic()
+            return name in seen["names"]
+
+        wait_for([job.name for job in jobs], is_there)
+    known = _known(out)
+    predictions = [known[job.name] for job in jobs]
+    write_predictions(out, predictions)
+    return predictions
+
+
+def _model(method: PoseMethod, name: str) -> ObjectModel:
+    return next(model for model in method.models if model.name == name)
+
+
+_FAILED = "cannot be read: "
+
+
+def _unread(given: Unreadable) -> PoseEstimate:
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status="unusable input",
+        reason=f"{_FAILED}{given.reason}",
+    )
+
+
+def _job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+    return _safe(Job(name=name, read=read), object)
+
+
+def _safe(job: Job[Any], object: str) -> Job[Any]:
+    """Let an input that cannot be read stop no other."""
+
+    def read() -> AnyInput | Unreadable:
+        try:
+            return job.read()
+        except InputError as error:
+            return Unreadable(name=job.name, object=object, reason=str(error))
+
+    return replace(job, read=read)

@@ -1,0 +1,111 @@
+"""``depthpose pose train``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+from depthpose.cli.training import changed, progress_bar
+from depthpose.core.errors import InputError
+
+
+def train(
+    out: Path,
+    cad: tuple[str, ...] = (),
+    unit: Literal["m", "mm"] | None = None,
+    symmetries: Literal["none", "found"] | None = None,
+    config: Path | None = None,
+    data: str | None = None,
+    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose",
+    start: str | None = None,
+    steps: int | None = None,
+    workers: int | None = None,
+    seed: int | None = None,
+    device: Literal["auto", "cpu"] | None = None,
+    precision: Literal["fp32", "bf16", "fp16"] | None = None,
+    resume: bool = False,
+) -> int:
+    """Train a network on your CAD file, or by a config.
+
+    Views of the object are made while it trains: no photograph is needed. At the end the refusal
+    is calibrated and the whole is judged on views that it has not seen; OUT holds the weights with
+    the model in them, their card, and all that led there. What stopped a training is made good by
+    --resume.
+
+        depthpose pose train --cad part.stl --unit mm --out my_part
+        depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
+
+    Args:
+        out: the run folder.
+        cad: model files; one network learns them all.
+        unit: of the numbers in the files.
+        symmetries: found looks whether the part looks alike from several sides, and counts these
+            poses as one; without, you are told of what is found.
+        config: YAML with what differs from the defaults.
+        data: folder of a data set; it takes the place of the config's, for models and frames.
+        what: which network; all but pose are compared with it, or cut the object out for it.
+        start: weights to begin with.
+        steps: optimiser steps in place of the config's length.
+        workers: processes that make views beside the one that trains.
+        seed: decides initial weights, views and their order.
+        device: auto takes what accelerate finds; cpu takes no GPU.
+        precision: arithmetic of the forward pass.
+        resume: go on from the state that OUT holds.
+    """
+    from depthpose.core.config import read_config
+    from depthpose.core.run import find_shard
+    from depthpose.pose.train import STAGES, Run
+
+    kind, run_stage = STAGES[what]
+    chosen = kind() if config is None else read_config(config, kind)
+    if cad and unit is None:
+        raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
+    loop = changed(chosen.loop, seed=seed, device=device, precision=precision, workers=workers)
+    if steps is not None:
+        loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    chosen = changed(dataclasses.replace(chosen, loop=loop), start=start)
+    if cad or unit or symmetries:
+        chosen = dataclasses.replace(chosen, models=_models(chosen, what, cad, unit, symmetries))
+    if data is not None:
+        chosen = _with_data(chosen, data)
+    is_first = find_shard().rank == 0
+    with progress_bar() as on_step:
+        run = Run(folder=out, resume=resume, on_step=on_step, tell=print if is_first else None)
+        path = run_stage(chosen, run)
+    if is_first:
+        print(f"trained weights: {path}")
+        card = path.with_suffix(".md")
+        print(card.read_text() if card.is_file() else "", end="")
+    return 0
+
+
+def _with_data(chosen: Any, data: str) -> Any:  # noqa: ANN401 - any config of a training
+    """Name the data set wherever the config names one."""
+    changes = {}
+    if (models := getattr(chosen, "models", None)) is not None and models.bop is not None:
+        changes["models"] = dataclasses.replace(models, bop=data)
+    for part in ("frames", "images"):
+        if getattr(chosen, part, None) is not None:
+            changes[part] = dataclasses.replace(getattr(chosen, part), folder=data)
+    if not changes:
+        raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
+    return dataclasses.replace(chosen, **changes)
+
+
+def _models(
+    chosen: Any,  # noqa: ANN401 - any config of a training
+    what: str,
+    cad: tuple[str, ...],
+    unit: str | None,
+    symmetries: str | None,
+) -> Any:  # noqa: ANN401
+    if what == "segmentation":
+        raise InputError(
+            "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
+            "'depthpose data make objects --cad ...' and name the folder in the config"
+        )
+    taken = changed(chosen.models, cad=cad or None, unit=unit)
+    if cad:  # they take the place of a data set's models
+        taken = dataclasses.replace(taken, bop=None, objects=(), parts=())
+    return changed(
+        taken, with_found_symmetries=None if symmetries is None else symmetries == "found"
+    )

@@ -1,0 +1,240 @@
+"""CAD parts of our own, made by formula: for the demo, the default weights, and tests.
+
+Each is a few closed surfaces that run into one another, as assemblies are exported; the sizes are
+in millimetres, as CAD files are.
+"""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files.disk import write_bytes
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import METRES, MeshConfig
+from depthpose.pose.mesh import make_model, turn_about
+from depthpose.pose.types import Axis, ObjectModel, Symmetries
+
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Corners (n, 3) [mm] and faces (m, 3), counter-clockwise seen from outside."""
+
+_ROUND = 96
+"""Corners of a circle."""
+_TEETH = 6
+
+
+def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> ObjectModel:
+    """Make a part of our own by its name, with the symmetries that it has by construction.
+
+    Raises:
+        InputError: there is no such part.
+    """
+    if name not in PARTS:
+        raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
+    vertices, faces = PARTS[name]()
+    return make_model(
+        torch.from_numpy(vertices) * METRES["mm"],
+        torch.from_numpy(faces),
+        name=name,
+        number=number,
+        symmetries=_symmetries(name),
+        config=config,
+    )
+
+
+def write_part(name: str, folder: Path) -> Path:
+    """Write a part as an STL file in millimetres, as a CAD program would; give the file.
+
+    Raises:
+        InputError: there is no such part, or the disk refuses.
+    """
+    import trimesh
+
+    if name not in PARTS:
+        raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
+    data = trimesh.Trimesh(*PARTS[name](), process=False).export(file_type="stl")
+    assert isinstance(data, bytes)
+    path = folder / f"{name}.stl"
+    write_bytes(path, data)
+    return path
+
+
+def _bracket() -> Mesh:
+    """An angle of two plates with an off-centre hole each, and a rib: no symmetry."""
+    base = _plate((120.0, 70.0, 8.0), (25.0, 5.0), 12.0)
+    wall = _turned(_plate((70.0, 80.0, 8.0), (-10.0, 12.0), 20.0), (0.0, 1.0, 0.0), 90.0)
+    rib = _box((45.0, 8.0, 40.0))
+    return _joined(
+        base,
+        _moved(wall, (-56.0, 0.0, 36.0)),
+        _moved(rib, (-32.0, 24.0, 22.0)),
+        _moved(_tube(9.0, 4.0, 22.0), (38.0, -18.0, 12.0)),
+    )
+
+
+def _flange() -> Mesh:
+    """A disc with six teeth and a hub on one side: it looks alike after sixths of a turn."""
+    angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+    radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
+    outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    disc = _ring(outer, _circle(14.0), 14.0)
+    return _joined(disc, _moved(_tube(26.0, 14.0, 30.0), (0.0, 0.0, 20.0)))
+
+
+def _mug() -> Mesh:
+    """A cup with a handle, wider above than below: no turn leaves it as it is."""
+    cup = _revolved(
+        [(0.0, 0.0), (32.0, 0.0), (36.0, 6.0), (42.0, 95.0), (38.0, 95.0), (33.0, 10.0), (0.0, 6.0)]
+    )
+    bow = np.linspace(-1.25, 1.25, 24)
+    path = np.stack([37 + 30 * np.cos(bow), 0 * bow, 52 + 30 * np.sin(bow)], 1)
+    return _joined(cup, _hose(path, 5.5))
+
+
+def _connector() -> Mesh:
+    """A plug: a body with a key, pins of two lengths and a bent cable: no symmetry."""
+    body, key = _box((60.0, 34.0, 26.0)), _box((26.0, 8.0, 7.0))
+    pins = [
+        _moved(
+            _turned(_tube(3.5, 1.5, length), (0.0, 1.0, 0.0), 90.0), (30.0 + length / 2.0, y, 4.0)
+        )
+        for y, length in ((-9.0, 24.0), (3.0, 14.0))
+    ]
+    bend = np.linspace(0, 1.4, 20)
+    path = np.stack([-28 - 40 * np.sin(bend), 6 + 0 * bend, 40 * (1 - np.cos(bend))], 1)
+    collar = _moved(_box((14.0, 44.0, 16.0)), (22.0, 0.0, -3.0))
+    return _joined(body, _moved(key, (-8.0, 6.0, 16.0)), collar, *pins, _hose(path, 7.0))
+
+
+def _spool() -> Mesh:
+    """A body of revolution with unlike ends: only its axis can be known."""
+    profile = [
+        (0.0, 0.0),
+        (34.0, 0.0),
+        (34.0, 7.0),
+        (14.0, 14.0),
+        (12.0, 55.0),
+        (24.0, 62.0),
+        (24.0, 70.0),
+        (8.0, 70.0),
+        (8.0, 50.0),
+        (0.0, 50.0),
+    ]
+    return _revolved(profile)
+
+
+PARTS: dict[str, Callable[[], Mesh]] = {
+    "bracket": _bracket,
+    "flange": _flange,
+    "mug": _mug,
+    "connector": _connector,
+    "spool": _spool,
+}
+"""Parts by name."""
+
+
+def _symmetries(name: str) -> Symmetries:
+    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+    if name == "flange":
+        angle = torch.arange(1, _TEETH).double() * (2 * math.pi / _TEETH)
+        turns = turn_about(up, origin, angle)
+        return Symmetries(discrete=Rigid(turns.R, turns.t_m))
+    if name == "spool":
+        return Symmetries(continuous=(Axis(direction=up, point_m=origin),))
+    return Symmetries()
+
+
+def _circle(radius: float) -> np.ndarray:
+    angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+    return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole: float) -> Mesh:
+    """A plate with a round hole of a diameter; the outline is seen from the hole."""
+    unit, at = _circle(1.0), np.array(hole_at)
+    low, high = -np.array(size[:2]) / 2 - at, np.array(size[:2]) / 2 - at
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
+    corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    outline = unit * reach[:, None]
+    # The ray nearest to each corner goes to the corner itself, or the plate would lack its corners.
+    for corner in corners:
+        outline[np.argmax(unit @ (corner / np.linalg.norm(corner)))] = corner
+    return _moved(_ring(outline, _circle(hole / 2), size[2]), (*hole_at, 0.0))
+
+
+def _ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
+    """What lies between two outlines of as many corners, from -height/2 to height/2."""
+    low, high = (np.full((len(outer), 1), z) for z in (-height / 2, height / 2))
+    loops = [
+        np.hstack([outer, low]),
+        np.hstack([outer, high]),
+        np.hstack([inner, high]),
+        np.hstack([inner, low]),
+    ]
+    return _skin([*loops, loops[0]])
+
+
+def _tube(radius: float, bore: float, height: float) -> Mesh:
+    return _ring(_circle(radius), _circle(bore), height)
+
+
+def _box(size: tuple[float, float, float]) -> Mesh:
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return signs * (np.array(size) / 2), np.array(faces)
+
+
+def _revolved(profile: list[tuple[float, float]]) -> Mesh:
+    """Turn (radius, height) about z, from the lower end of the axis along the outside and back."""
+    loops = [np.hstack([_circle(r), np.full((_ROUND, 1), z)]) for r, z in profile]
+    return _skin(loops)
+
+
+def _hose(path: np.ndarray, radius: float) -> Mesh:
+    """A round hose along a path in a plane y = constant, closed at its ends."""
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    side = np.array([0.0, 1.0, 0.0])
+    circle, loops = _circle(radius), []
+    for point, direction in zip(path, along, strict=True):
+        across = np.cross(side, direction)
+        loops.append(point + circle[:, :1] * across + circle[:, 1:] * side)
+    ends = [np.repeat(path[i][None], _ROUND, 0) for i in (0, -1)]
+    return _skin([ends[0], *loops, ends[1]])
+
+
+def _skin(loops: list[np.ndarray]) -> Mesh:
+    """Join loops of as many corners, counter-clockwise seen against their order."""
+    count, vertices = len(loops[0]), np.concatenate(loops)
+    i, j = np.meshgrid(np.arange(len(loops) - 1), np.arange(count), indexing="ij")
+    a, b = i * count + j, i * count + (j + 1) % count
+    quads = np.stack([a, b, b + count, a, b + count, a + count], -1).reshape(-1, 3)
+    corners = vertices[quads]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    return vertices, quads[area > 1e-9]
+
+
+def _moved(mesh: Mesh, shift: tuple[float, ...]) -> Mesh:
+    return mesh[0] + np.array(shift), mesh[1]
+
+
+def _turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mesh:
+    turn = turn_about(
+        torch.tensor(axis, dtype=torch.float64),
+        torch.zeros(3).double(),
+        torch.tensor(math.radians(degrees)).double(),
+    )
+    return mesh[0] @ turn.R.numpy().T, mesh[1]
+
+
+def _joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+    faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)

@@ -1,0 +1,197 @@
+"""The regressed depth image as a task of the loop."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.errors import InputError
+from depthpose.core.loop import Evidence, Turn, make_adam, shuffled_index, ticket_generator, train
+from depthpose.core.rigid import Rigid
+from depthpose.core.run import find_shard
+from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
+from depthpose.pose.bop import open_bop
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.estimator import DepthImageRegressor
+from depthpose.pose.losses import model_point_loss
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.objects import Objects
+from depthpose.pose.train.baselines_config import DepthImageTraining
+from depthpose.pose.train.held_out import held_out_objects, pose_error
+from depthpose.pose.train.models import read_models
+from depthpose.pose.train.run import Run, claim_run, packed, with_classes
+from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+
+_TRIES = 20
+_SYMMETRY_STEP = 0.2
+"""Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
+that this network is left with."""
+
+
+class CropSample(NamedTuple):
+    """A crop, or a batch of them, with truth."""
+
+    crop: DepthCrop
+    class_of: Int[Tensor, "*b"]
+    R: Float[Tensor, "*b 3 3"]
+    t_m: Float[Tensor, "*b 3"]
+
+
+class TrainingCrops:
+    """Each ticket a crop of a view, made or of a frame.
+
+    Args:
+        models: the objects; class k is ``models[k]``.
+        config: which views, and how they are cut.
+        seed: of the order of frames.
+    """
+
+    def __init__(
+        self, models: Sequence[ObjectModel], config: DepthImageTraining, seed: int
+    ) -> None:
+        self.config, self.seed = config, seed
+        self.models = models
+        self.made = Objects(models, config.objects, config.cloud)
+        self._class_of = {model.name: k for k, model in enumerate(models)}
+        self._real = None
+        if config.frames is not None:
+            frames = open_bop(config.frames.folder, config.frames.split, cloud=config.cloud)
+            self._real = frames.of_objects(*self._class_of)
+
+    def __len__(self) -> int:
+        """Tickets of an epoch: each frame comes once, or as many as views are made."""
+        if self._real is None or self.config.frames is None:
+            return len(self.made)
+        return max(1, round(len(self._real) / self.config.frames.share))
+
+    def __getitem__(self, ticket: int) -> CropSample:
+        """Make the sample of a ticket; one with too few pixels gives way to another.
+
+        Raises:
+            InputError: so many in a row have too few pixels that the config must be wrong.
+        """
+        for attempt in range(_TRIES):
+            # Far beyond any training, and the same object.
+            sample = self._view(ticket + attempt * len(self.models) * 2**32)
+            number = self._class_of[sample.input.object]
+            crop = cut_depth(sample.input, self.config.network, self.models[number].diameter_m)
+            if crop is not None:
+                pose = sample.truth.camera_from_model
+                return CropSample(crop, torch.tensor(number), pose.R.float(), pose.t_m.float())
+        raise InputError(
+            f"{_TRIES} views in a row have fewer than {self.config.network.min_points} masked "
+            "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
+        )
+
+    def _view(self, ticket: int) -> ViewSample:
+        if self._real is None or self.config.frames is None:
+            return self.made.view(ticket)
+        generator = ticket_generator(ticket, self.seed)
+        if float(torch.rand((), generator=generator)) >= self.config.frames.share:
+            return self.made.view(ticket)
+        place = shuffled_index(ticket, len(self._real), self.seed)
+        return self._real.view(self._real.instances[place])
+
+
+class DepthImageTask:
+    """ADD of the regressed pose against the nearest symmetric copy of the truth."""
+
+    def __init__(
+        self,
+        network: DepthImageNet,
+        models: tuple[ObjectModel, ...],
+        config: DepthImageTraining,
+    ) -> None:
+        self.config, self.models = config, models
+        self.network = network.train()
+        self.modules: dict[str, nn.Module] = {"network": network}
+        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
+        self._points_m = surface_points(models, config.surface_points)
+        self._copies = symmetric_copies(models)
+        self._diameter_m = torch.tensor([model.diameter_m for model in models])
+        self._views: dict[float, list[ViewSample]] = {}
+
+    def step(self, batch: CropSample) -> Iterator[Turn]:
+        """One turn: regress, move the model's points, compare; in diameters."""
+        which, device = batch.class_of, batch.R.device
+        outputs = self.network(batch.crop.image, which).float()
+        copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])
+        points_m = self._points_m.to(device)[which]
+        truth = Rigid(batch.R, batch.t_m)
+        error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
+        yield Turn("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
+
+    @torch.no_grad()
+    def validate(self) -> Evidence:
+        """Pose held-out views with the network as it stands, without ICP."""
+        cpu = DepthImageNet(self.network.config)
+        cpu.load_state_dict(self.network.state_dict())
+        weights = PoseWeights(network=cpu, models=self.models, cloud=self.config.cloud,
+                              refusal=RefusalConfig(), facts={})  # fmt: skip
+        regressor = DepthImageRegressor(weights, EstimateConfig(with_icp=False))
+        numbers: dict[str, float] = {}
+        for occlusion in self.config.held_out.occlusions:
+            views = self._held_out(occlusion)
+            found = regressor.estimate_many([view.input for view in views])
+            errors = torch.tensor([
+                pose_error(estimate, view.truth, self.models[index % len(self.models)])
+                for index, (estimate, view) in enumerate(zip(found, views, strict=True))
+            ])  # fmt: skip
+            place = f"held_out/occluded_{round(100 * occlusion)}/regressed"
+            numbers[f"{place}_add_10"] = float((errors < 0.1).float().mean())
+            numbers[f"{place}_median"] = float(errors.median())
+        return Evidence(numbers=numbers)
+
+    def _held_out(self, occlusion: float) -> list[ViewSample]:
+        if occlusion not in self._views:
+            c = self.config
+            made = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
+            self._views[occlusion] = [made.view(index) for index in range(len(made))]
+        return self._views[occlusion]
+
+
+def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
+    """Train the regression of depth images; give its weights file."""
+    torch.manual_seed(config.loop.seed)
+    models = read_models(config.models, run.tell)
+    config = dataclasses.replace(config, network=with_classes(config.network, models))
+    network = DepthImageNet(config.network)
+    if config.start is not None:
+        found = read_pose_weights(find_weights(config.start)).network
+        if found.config != config.network:
+            raise InputError(
+                f"{config.start}: holds {found.config}, but the config says {config.network}. Give "
+                "the config the weights' own."
+            )
+        network.load_state_dict(found.state_dict())
+    claim_run(config, run, config.models.cad)
+    crops = TrainingCrops(models, config, config.loop.seed)
+    task = DepthImageTask(network, models, config)
+    train(task, crops, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    path = run.folder / "depth-image.safetensors"
+    if not find_shard().rank:
+        write_pose_weights(path, packed(network, models, config), with_half=config.with_half)
+    return path
+
+
+def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "classes n 3"]:
+    """Points of each object's surface; those of a sparse model of points come again."""
+    every = [sample_surface(model, count)[0] for model in models]
+    return torch.stack([points[torch.arange(count) % len(points)] for points in every])
+
+
+def symmetric_copies(models: Sequence[ObjectModel]) -> Rigid:
+    """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
+    every = [symmetry_transforms(model.symmetries, _SYMMETRY_STEP) for model in models]
+    most = max(len(copies.R) for copies in every)
+    R = torch.eye(3).repeat(len(models), most, 1, 1)
+    t_m = torch.zeros(len(models), most, 3)
+    for k, copies in enumerate(every):
+        R[k, : len(copies.R)], t_m[k, : len(copies.R)] = copies.R.float(), copies.t_m.float()
+    return Rigid(R, t_m)

@@ -1,0 +1,215 @@
+"""Annotated images by ticket, randomly changed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image
+from depthpose.core.loop import shuffled_index, ticket_generator
+from depthpose.pose.augment import uniform, whole
+from depthpose.pose.bop import Instance, open_bop
+from depthpose.pose.bop.dataset import read_instance_mask
+from depthpose.pose.bop.models import models_folder, object_name, read_models_info
+from depthpose.pose.segmentation import SegmentationConfig
+from depthpose.pose.train.segmentation_config import ImageAugmentConfig, ImagesConfig
+
+_LUMA = (0.299, 0.587, 0.114)
+
+
+class LabelledImage(NamedTuple):
+    """An image with the class of each pixel, or a batch of them.
+
+    Attributes:
+        image: RGB in [0, 1].
+        labels: 0 is the background, ``1 + i`` object i.
+    """
+
+    image: Float[Tensor, "*b 3 h w"]
+    labels: Int[Tensor, "*b h w"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownObjects:
+    """The objects that a data set shows, in the order of the classes."""
+
+    names: tuple[str, ...]
+    numbers: tuple[int, ...]
+
+
+class AnnotatedImages:
+    """Images of a data set with their labels.
+
+    Args:
+        config: which.
+        objects: classes that are given; None: those that the images show.
+
+    Raises:
+        InputError: no picture, or no object in any.
+    """
+
+    def __init__(self, config: ImagesConfig, objects: KnownObjects | None = None) -> None:
+        if not config.folder:
+            raise InputError("there is no image to learn from; name a folder in BOP's layout")
+        dataset = open_bop(config.folder, config.split)
+        images: dict[tuple[int, int], list[Instance]] = {}
+        for instance in dataset.instances:
+            if instance.rgb is not None:
+                images.setdefault((instance.scene_id, instance.image_id), []).append(instance)
+        if not images:
+            raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
+        self.objects = _known(config, images) if objects is None else objects
+        self._class_of = {number: k for k, number in enumerate(self.objects.numbers, 1)}
+        self._images = _evenly(list(images.values()), config.limit)
+        self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
+        self._with_cache = config.with_cache
+
+    def __len__(self) -> int:
+        """How many images."""
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        """Read one whole image.
+
+        Raises:
+            IndexError: there is no such image.
+            InputError: a file is missing or damaged, or a mask is of another size.
+        """
+        held = self._cache.get(index)
+        if held is None:
+            held = self._read(self._images[index])
+            if self._with_cache:
+                self._cache[index] = held
+        return LabelledImage(held[0].float() / 255, held[1].long())
+
+    def _read(
+        self, instances: Sequence[Instance]
+    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
+        path = instances[0].rgb
+        assert path is not None
+        image = read_image(path)
+        labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
+        for instance in instances:
+            number = self._class_of.get(instance.object_id)
+            if number is not None:
+                mask = read_instance_mask(instance)
+                if mask.shape != labels.shape:
+                    raise InputError(
+                        f"{instance.name}: the mask is {mask.shape[1]}x{mask.shape[0]}, but the "
+                        f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
+                    )
+                labels[mask] = number
+        return (image * 255).round().to(torch.uint8), labels
+
+
+class TrainingImages:
+    """Each ticket an image, randomly changed and cut.
+
+    Args:
+        images: to draw from.
+        config: how they are changed.
+        network: at what size it sees them.
+        seed: decides order and changes.
+    """
+
+    def __init__(
+        self,
+        images: AnnotatedImages,
+        config: ImageAugmentConfig,
+        network: SegmentationConfig,
+        seed: int,
+    ) -> None:
+        self.images, self.config, self.seed = images, config, seed
+        self._long_side_px = network.long_side_px
+
+    def __len__(self) -> int:
+        """Images of an epoch."""
+        return len(self.images)
+
+    def __getitem__(self, ticket: int) -> LabelledImage:
+        """Make the sample of a ticket."""
+        generator = ticket_generator(ticket, self.seed)
+        given = self.images[shuffled_index(ticket, len(self), self.seed)]
+        scale = self._long_side_px / max(given.image.shape[-2:])
+        scale *= uniform(generator, *self.config.scale)
+        changed = cut_window(given, scale, self.config.crop_px, generator)
+        if uniform(generator, 0.0, 1.0) < self.config.flip_share:
+            changed = LabelledImage(*(part.flip(-1) for part in changed))
+        image = jitter_colors(changed.image, self.config.jitter, generator)
+        return LabelledImage(image, changed.labels)
+
+
+def cut_window(
+    given: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
+) -> LabelledImage:
+    """Scale an image and cut a window out of it; what lies beside a small image is background.
+
+    Half of the windows show the middle of an object: most of an image is background.
+    """
+    rows, columns = (max(1, round(side * scale)) for side in given.image.shape[-2:])
+    image = F.interpolate(given.image[None], (rows, columns), mode="bilinear", antialias=scale < 1)[
+        0
+    ].clamp(0, 1)
+    labels = F.interpolate(given.labels[None, None].float(), (rows, columns), mode="nearest-exact")
+    labels = labels[0, 0].long()
+    bottom, right = max(0, size[0] - rows), max(0, size[1] - columns)
+    image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
+    labels = F.pad(labels, (0, right, 0, bottom))
+    top, left = _corner(labels, size, generator)
+    window = (slice(top, top + size[0]), slice(left, left + size[1]))
+    return LabelledImage(image[:, *window], labels[window])
+
+
+def jitter_colors(
+    image: Float[Tensor, "3 h w"], strength: float, generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    """Change brightness, contrast, saturation by 1 +- ``strength``, each color by a third of it."""
+    changes = 1 + strength * (2 * torch.rand(6, generator=generator) - 1)
+    brightness, contrast, saturation = changes[:3].tolist()
+    balance = 1 + (changes[3:, None, None] - 1) / 3
+    bright = image * brightness * balance
+    bright = (bright - bright.mean()) * contrast + bright.mean()
+    grey = (bright * bright.new_tensor(_LUMA)[:, None, None]).sum(0)
+    return (grey + (bright - grey) * saturation).clamp(0, 1)
+
+
+def _corner(
+    labels: Int[Tensor, "h w"], size: tuple[int, int], generator: torch.Generator
+) -> tuple[int, int]:
+    room = [side - part for side, part in zip(labels.shape, size, strict=True)]
+    shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
+    if not len(shown):
+        return whole(generator, room[0] + 1), whole(generator, room[1] + 1)
+    chosen = labels == shown[whole(generator, len(shown))]
+    middle = chosen.nonzero().float().mean(0).tolist()
+    corner = [
+        min(max(round(at - part / 2), 0), most)
+        for at, part, most in zip(middle, size, room, strict=True)
+    ]
+    return corner[0], corner[1]
+
+
+def _known(config: ImagesConfig, images: dict[tuple[int, int], list[Instance]]) -> KnownObjects:
+    numbers = sorted({i.object_id for shown in images.values() for i in shown})
+    wanted = [n for n in numbers if not config.objects or n in config.objects]
+    if not wanted:
+        raise InputError(
+            f"{config.folder}: shows none of the objects {list(config.objects)}; it has {numbers}"
+        )
+    infos = read_models_info(models_folder(Path(config.folder)))
+    names = tuple(object_name(number, infos.get(number, {})) for number in wanted)
+    return KnownObjects(names=names, numbers=tuple(wanted))
+
+
+def _evenly(
+    images: Sequence[Sequence[Instance]], limit: int | None
+) -> Sequence[Sequence[Instance]]:
+    if limit is None or limit >= len(images):
+        return images
+    return [images[k * len(images) // limit] for k in range(limit)]

@@ -1,0 +1,104 @@
+"""What a trained network is worth: its refusal calibrated, its success on views that nobody saw."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from depthpose.core.errors import InputError
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, RefusalConfig
+from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
+from depthpose.pose.objects import Objects
+from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig
+from depthpose.pose.train.held_out import held_out_objects, pose_error
+from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.weights import PoseWeights
+
+_CALIBRATION_SEED = 0xCA11B
+_RIGHT = 0.1
+"""Of the diameter: ADD, or ADD-S of a symmetric object."""
+_TOGETHER = 32
+
+Table = Mapping[str, Mapping[str, float | None]]
+"""By occlusion in percent: shares of right, wrong and refused, and the median error of the answers
+in diameters, None where there is no answer."""
+
+
+def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationConfig) -> PoseWeights:
+    """Choose when answers are withheld, on made views from easy to hard.
+
+    Where not one view is answered there is nothing to choose by, and the weights stay as they are.
+    """
+    if config.number == 0:
+        return weights
+    open_weights = dataclasses.replace(weights, refusal=RefusalConfig())
+    views = dataclasses.replace(
+        made,
+        number=config.number * len(weights.models),
+        seed=made.seed + _CALIBRATION_SEED,
+        views=None,
+        resolution=(1.0, 1.0),
+        occluded_share=1.0,
+        occlusion=config.occlusion,
+    )
+    estimates, errors = _posed(open_weights, Objects(weights.models, views, weights.cloud))
+    try:
+        refusal = calibrate_refusal(
+            estimates, [error < _RIGHT for error in errors], config.max_wrong_share
+        )
+    except InputError:
+        return open_weights
+    return dataclasses.replace(weights, refusal=refusal)
+
+
+def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:
+    """Count right, wrong and refused answers of the whole estimator, by occlusion."""
+    table: dict[str, dict[str, float | None]] = {}
+    for occlusion in config.occlusions:
+        objects = held_out_objects(weights.models, made, weights.cloud, config, occlusion)
+        estimates, errors = _posed(weights, objects)
+        answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
+        right = sum(error < _RIGHT for error in answered)
+        table[f"{round(100 * occlusion)}"] = {
+            "right": right / len(errors),
+            "wrong": (len(answered) - right) / len(errors),
+            "refused": 1 - len(answered) / len(errors),
+            "median": sorted(answered)[len(answered) // 2] if answered else None,
+        }
+    return table
+
+
+def card_text(
+    models: Sequence[ObjectModel],
+    facts: Mapping[str, str],
+    table: Table,
+) -> str:
+    """Say what the weights know, and what was measured, for people."""
+    names = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in models)
+    lines = ["# Pose weights", "", f"Objects: {names}."]
+    lines += [f"{name.replace('_', ' ').capitalize()}: {fact}." for name, fact in facts.items()]
+    if table:
+        lines += [
+            "",
+            "Made views that no training saw, posed with voting, ICP and refusal; right is an "
+            "ADD(-S) below a tenth of the diameter.",
+            "",
+            "| hidden % | right % | wrong % | refused % | median error, % of diameter |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+    for hidden, row in table.items():
+        given = [row[k] for k in ("right", "wrong", "refused", "median")]
+        values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
+        lines.append(f"| {hidden} | {values} |")
+    return "\n".join(lines) + "\n"
+
+
+def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+    net = GeoPoseNet(weights, EstimateConfig())
+    estimates, errors = [], []
+    for start in range(0, len(objects), _TOGETHER):
+        samples = [objects[i] for i in range(start, min(start + _TOGETHER, len(objects)))]
+        found = net.estimate_many([sample.input for sample in samples])
+        estimates += found
+        for offset, (estimate, sample) in enumerate(zip(found, samples, strict=True)):
+            model = weights.models[(start + offset) % len(weights.models)]
+            errors.append(pose_error(estimate, sample.truth, model))
+    return estimates, errors

@@ -1,0 +1,89 @@
+"""Where a training lives: its folder, claimed for one config, and the weights it leaves."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.config import config_to_dict, write_config
+from depthpose.core.loop import Progress
+from depthpose.core.run import claim_folder, find_shard
+from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.train.config import FramesConfig
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.weights import AnyNetwork, PoseWeights
+
+_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
+"""Knobs of the loop that change no weight: a resumed run may have others."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Where a training lives, and who watches.
+
+    Attributes:
+        folder: the run folder; the weights lie in it, named after what was trained.
+        resume: go on from its last state.
+        on_step: told after each step.
+        tell: told what a person should know before it begins.
+    """
+
+    folder: Path
+    resume: bool = False
+    on_step: Callable[[Progress], None] | None = None
+    tell: Callable[[str], None] | None = None
+
+
+def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
+    """Make the folder this config's own.
+
+    Args:
+        config: of any training; it has ``loop``, ``start`` and perhaps ``held_out``.
+        run: where.
+        files: that decide what is learnt, beside the config: their content is remembered.
+
+    Raises:
+        InputError: the folder is another config's.
+    """
+    settings = {"stage": type(config).__name__, **config_to_dict(config)}
+    settings["loop"] = {k: v for k, v in settings["loop"].items() if k not in _FREE}
+    settings["loop"]["processes"] = find_shard().world
+    for judged in ("held_out", "calibration"):  # no weight of the network follows from these
+        settings.pop(judged, None)
+    settings["sha256"] = [file_sha256(Path(path)) for path in files]
+    if config.start is not None:
+        settings["start_sha256"] = file_sha256(find_weights(config.start))
+    claim_folder(run.folder, settings)
+    write_config(run.folder / "config.yaml", config)
+
+
+def packed(
+    network: AnyNetwork,
+    models: tuple[ObjectModel, ...],
+    config: Any,  # noqa: ANN401
+) -> PoseWeights:
+    """Put a trained network and its objects together, with what the card says of them."""
+    frames: FramesConfig | None = config.frames
+    cloud: CloudConfig = config.cloud
+    names = ", ".join(model.name for model in models)
+    source = "made views" if frames is None else f"{Path(frames.folder).name} and made views"
+    return PoseWeights(
+        network=network.cpu().eval(),
+        models=models,
+        cloud=cloud,
+        refusal=RefusalConfig(),
+        facts={
+            "trained_on": f"{source} of {names}",
+            "stage": type(config).__name__,
+            "licence": "not stated; that of the models binds",
+        },
+    )
+
+
+def with_classes(network: Any, models: Sequence[ObjectModel]) -> Any:  # noqa: ANN401
+    """Give a network's config as many classes as there are objects, and as many keypoints."""
+    sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m)}
+    known = {field.name for field in dataclasses.fields(network)}
+    return dataclasses.replace(network, **{k: v for k, v in sizes.items() if k in known})

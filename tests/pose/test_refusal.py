@@ -1,0 +1,135 @@
+"""The risk of an estimate and its limit, on made signals whose truth is known."""
+
+import math
+
+import pytest
+import torch
+from tests.pose.made_object import bracket, cloud_of, pose_at
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.estimator import calibrate_refusal, risk_of
+from depthpose.pose.estimator.evidence import SIGNALS, hold_of, surface_signals
+from depthpose.pose.metrics import risk_coverage
+from depthpose.pose.refine import prepare_surface
+from depthpose.pose.types import PoseEstimate
+
+EYE = Rigid(torch.eye(3), torch.zeros(3))
+
+
+def answer(**signals: float) -> PoseEstimate:
+    every = {name: signals.get(name, 0.0) for name in SIGNALS}
+    return PoseEstimate(name="a", object="b", status="ok", camera_from_model=EYE, signals=every)
+
+
+def made(count: int, seed: int) -> tuple[list[PoseEstimate], list[bool]]:
+    """Wrong with the odds ``exp(20 far - 6)``, whatever ``gap`` says."""
+    generator = torch.Generator().manual_seed(seed)
+    far, gap, luck = torch.rand(3, count, generator=generator)
+    is_right = luck > (20 * far - 6).sigmoid()
+    answers = [answer(far=float(f), gap=float(g)) for f, g in zip(far, gap, strict=True)]
+    return answers, is_right.tolist()
+
+
+def test_the_risk_is_the_logistic_of_the_signals() -> None:
+    config = RefusalConfig(bias=-1.0, slopes={"far": 2.0, "gap": 3.0})
+    signals = answer(far=0.25, gap=0.5).signals
+    assert risk_of(signals, config) == pytest.approx(1 / (1 + math.exp(-1)))
+    assert risk_of(signals, RefusalConfig()) is None
+    assert risk_of(signals, RefusalConfig(bias=1e9, slopes={"far": 1.0})) == 1.0
+
+
+def test_calibration_finds_what_makes_answers_wrong() -> None:
+    config = calibrate_refusal(*made(4000, 0), max_wrong_share=0.02)
+    assert config.slopes["far"] == pytest.approx(20, rel=0.15)
+    assert config.bias == pytest.approx(-6, rel=0.15)
+    assert 0 <= config.slopes["gap"] < 0.5
+    assert all(slope >= 0 for slope in config.slopes.values())
+
+
+def test_wrong_answers_stay_below_the_settled_share_on_other_data() -> None:
+    config = calibrate_refusal(*made(4000, 0), max_wrong_share=0.02)
+    answers, is_right = made(4000, 1)
+    risks = [risk_of(a.signals, config) or 0.0 for a in answers]
+    kept = [ok for ok, risk in zip(is_right, risks, strict=True) if risk <= config.max_risk]
+    assert 500 < len(kept) < 1600
+    assert kept.count(False) / len(kept) < 0.03
+
+
+def test_too_few_data_for_the_share_allow_no_mistake() -> None:
+    answers = [answer(far=k / 20) for k in range(20)]
+    config = calibrate_refusal(answers, [k < 12 for k in range(20)], max_wrong_share=0.01)
+    risks = [risk_of(a.signals, config) or 0.0 for a in answers]
+    kept = [k for k, risk in enumerate(risks) if risk <= config.max_risk]
+    assert set(kept) <= set(range(13))
+    assert len(kept) > 6
+
+
+def test_answers_that_are_all_right_are_all_given() -> None:
+    answers, _ = made(200, 0)
+    config = calibrate_refusal(answers, [True] * 200)
+    assert all((risk_of(a.signals, config) or 0) <= config.max_risk for a in answers)
+
+
+def test_what_cannot_be_calibrated_is_an_error() -> None:
+    with pytest.raises(InputError, match="2 estimates, 1 verdicts and a share"):
+        calibrate_refusal([answer()] * 2, [True])
+    refused = PoseEstimate(name="a", object="b", status="doubtful", reason="so")
+    with pytest.raises(InputError, match="not one estimate is an answer"):
+        calibrate_refusal([refused], [False])
+
+
+@pytest.mark.parametrize(
+    ("knobs", "text"),
+    [
+        ({"max_risk": 1.5}, "max_risk is 1.5, but a risk lies between 0 and 1"),
+        ({"min_hold": -0.1}, "min_hold is -0.1, but it is a share"),
+    ],
+)
+def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        RefusalConfig(**knobs)
+    with pytest.raises(InputError, match="batch_voxels 0; take 100 and 1 at least"):
+        EstimateConfig(batch_voxels=0)
+    with pytest.raises(InputError, match="icp_starts is 5; take 1, the voted pose, to 4"):
+        EstimateConfig(icp_starts=5)
+
+
+def test_a_wrong_pose_has_worse_signals_than_the_true_one() -> None:
+    model, truth = bracket(), pose_at()
+    surface, cloud = prepare_surface(model), cloud_of(model, truth)
+    true = surface_signals(cloud, Rigid(truth.R.double(), truth.t_m.double()), surface)
+    nearer = Rigid(truth.R.double(), truth.t_m.double() - torch.tensor([0.0, 0, 0.04]))
+    turned = Rigid(pose_at(seed=5).R.double(), truth.t_m.double())
+    assert true["far"] == 0
+    assert true["front"] < 0.1
+    assert true["gap"] < 0.01
+    assert true["unseen"] < 0.1
+    assert surface_signals(cloud, nearer, surface)["front"] > 0.5
+    for name in ("far", "unseen"):
+        assert surface_signals(cloud, turned, surface)[name] > true[name] + 0.1
+
+
+def test_the_hold_of_a_plane_is_nothing_and_of_a_corner_is_firm() -> None:
+    model = bracket()
+    surface = prepare_surface(model)
+    pose = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, 0.8]).double())
+    flat = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    side = flat * torch.tensor([0.19, 0.05, 0]) + torch.tensor([0.0, 0, -0.025])
+    none = torch.zeros(0, 6)
+    hold, motion = hold_of(pose.apply(side.double()), pose, surface, none)
+    assert hold < 1e-6
+    assert float(motion.norm()) == pytest.approx(1)
+    whole, _ = hold_of(pose.apply(surface.points_m), pose, surface, none)
+    assert whole > 0.15
+    away, _ = hold_of(torch.ones(100, 3), pose, surface, none)
+    assert away == 0
+
+
+def test_risk_and_coverage_of_a_toy() -> None:
+    risks = torch.tensor([0.3, 0.1, 0.1, torch.inf, 0.9])
+    is_right = torch.tensor([True, True, False, False, False])
+    coverage, wrong = risk_coverage(risks, is_right)
+    assert coverage.tolist() == pytest.approx([0.4, 0.6, 0.8])
+    assert wrong.tolist() == pytest.approx([1 / 2, 1 / 3, 2 / 4])

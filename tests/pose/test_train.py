@@ -1,0 +1,325 @@
+"""Training of the direction network: samples by ticket, truth, judgement, the run."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_object import bottle, bracket
+
+from depthpose.core.config import read_config
+from depthpose.core.errors import InputError
+from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import write_bop_models, write_bop_scene
+from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.losses import unit_directions
+from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.objects import Objects, make_frames, write_part
+from depthpose.pose.train import (
+    STAGES,
+    FramesConfig,
+    HeldOutConfig,
+    ModelsConfig,
+    PoseTask,
+    PoseTraining,
+    Run,
+    TrainingClouds,
+    read_models,
+    train_pose,
+)
+from depthpose.pose.train.config import CalibrationConfig
+from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut
+from depthpose.pose.train.judge import calibrated, card_text, judged
+from depthpose.pose.train.task import keypoint_copies
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.weights import read_pose_weights
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
+_SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
+_CLOUD = CloudConfig(voxel_m=0.01, max_points=300)
+_MADE = ObjectsConfig(views=2, number=6)
+
+
+def _models() -> tuple[ObjectModel, ...]:
+    return (
+        dataclasses.replace(bracket(), number=1),
+        dataclasses.replace(bottle(), number=2),
+    )
+
+
+def _training(**changes: object) -> PoseTraining:
+    config = PoseTraining(
+        models=ModelsConfig(parts=("bracket",)),
+        objects=_MADE,
+        cloud=_CLOUD,
+        network=_SMALL,
+        held_out=HeldOutConfig(number=2, occlusions=(0.0,)),
+        calibration=CalibrationConfig(number=0),
+        loop=LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1),
+    )
+    return dataclasses.replace(config, **changes)
+
+
+def test_a_ticket_gives_the_same_cloud_whenever_it_is_asked_for() -> None:
+    one, other = (TrainingClouds(_models(), _MADE, None, _CLOUD, 0) for _ in range(2))
+    for ticket in (0, 5, 17):
+        first, second = one[ticket], other[ticket]
+        assert torch.equal(first.points_m, second.points_m)
+        assert first.class_number == ticket % 2
+    assert not torch.equal(one[0].R, one[2].R)
+
+
+def test_a_batch_keeps_clouds_apart_and_points_in_their_voxels() -> None:
+    clouds = TrainingClouds(_models(), _MADE, None, _CLOUD, 0)
+    parts = [clouds[i] for i in range(3)]
+    batch = TrainingClouds.collate(parts)
+    assert batch.class_of.tolist() == [0, 1, 0]
+    for number, part in enumerate(parts):
+        own = batch.instance == number
+        assert torch.equal(batch.points_m[own], part.points_m)
+        # Points of one cloud have voxels of their own: none is kept twice.
+        assert len(torch.unique(part.coordinates, dim=0)) == len(part.coordinates)
+        spread = part.points_m.amax(0) - part.points_m.amin(0)
+        cells = part.coordinates.amax(0) - part.coordinates.amin(0)
+        assert bool(((cells * 0.01 - spread).abs() <= 0.0101).all())
+
+
+class _Oracle(ResUNet):
+    """Answers with the true directions, whatever it is shown."""
+
+    truth: torch.Tensor
+    seen: tuple[torch.Tensor, ...] = ()
+
+    def directions(
+        self, points_m: torch.Tensor, coordinates: torch.Tensor, class_of_point: torch.Tensor
+    ) -> torch.Tensor:
+        self.seen = (points_m, coordinates, class_of_point)
+        return self.truth
+
+
+def _truth_of(batch, models, copy: int) -> torch.Tensor:  # noqa: ANN001
+    copies = keypoint_copies(models)[batch.class_of, copy]
+    posed = copies @ batch.R.mT + batch.t_m[:, None]
+    return unit_directions(batch.points_m, posed[batch.instance])
+
+
+@pytest.mark.parametrize("copy", [0, 7])
+def test_true_directions_cost_nothing_whichever_copy_they_point_at(copy: int) -> None:
+    models = _models()
+    clouds = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    batch = TrainingClouds.collate([clouds[0], clouds[1]])
+    network = _Oracle(_SMALL)
+    task = PoseTask(network, models, _training(), None)
+    network.truth = _truth_of(batch, models, copy)
+    # The bracket has one copy alone, which is repeated.
+    (turn,) = list(task.step(batch))
+    assert turn.loss.item() < 1e-9
+    network.truth = -network.truth
+    (turn,) = list(task.step(batch))
+    assert turn.loss.item() > 0.5
+
+
+def test_copies_of_the_keypoints_lie_on_the_turned_object() -> None:
+    copies = keypoint_copies(_models())
+    assert copies.shape == (2, 63, 8, 3)
+    assert torch.equal(copies[0], copies[0, :1].expand(63, -1, -1))
+    height, radius = copies[1, ..., 2], copies[1, ..., :2].norm(dim=-1)
+    assert torch.allclose(height, height[:1].expand(63, -1), atol=1e-6)
+    assert torch.allclose(radius, radius[:1].expand(63, -1), atol=1e-6)
+
+
+def test_the_loss_falls() -> None:
+    torch.manual_seed(0)
+    models = _models()
+    clouds = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    batch = TrainingClouds.collate([clouds[i] for i in range(4)])
+    config = _training(adam=AdamConfig(learning_rate=0.01))
+    task = PoseTask(ResUNet(_SMALL), models, config, None)
+    optimizer, _ = task.optimizers["network"]
+    losses = []
+    for _ in range(40):
+        (turn,) = list(task.step(batch))
+        turn.loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(turn.loss.item())
+    assert losses[0] < 0.5
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def _frames_folder(folder: Path) -> Path:
+    models = _models()
+    config = ObjectsConfig(
+        image_px=(160, 120),
+        focal_px=(143.0, 143.0),
+        centre_px=(81.0, 60.0),
+        frame_clutter=(0, 0),
+        sensor=SensorConfig(kinds=("laser",), missing=(0.0, 0.0)),
+    )
+    write_bop_models(folder, models)
+    write_bop_scene(folder, "train", 0, list(make_frames(models, config, 4)))
+    return folder
+
+
+def test_frames_and_made_views_mix_and_frames_stay_true(tmp_path: Path) -> None:
+    folder = _frames_folder(tmp_path)
+    models = read_models(ModelsConfig(bop=str(folder)))
+    frames = FramesConfig(folder=str(folder), share=0.5)
+    clouds = TrainingClouds(models, _MADE, frames, _CLOUD, 0)
+    real = TrainingClouds(models, _MADE, dataclasses.replace(frames, share=1.0), _CLOUD, 0)
+    assert len(clouds) == 2 * len(real)
+    made = Objects(models, _MADE, _CLOUD)
+    is_made = [
+        torch.allclose(clouds[i].t_m.norm(), made.sample(i).truth.camera_from_model.t_m.norm())
+        for i in range(30)
+    ]
+    assert 5 < sum(is_made) < 25
+    for index in range(4):
+        cloud = real[index]
+        local = Rigid(cloud.R, cloud.t_m).inverse().apply(cloud.points_m)
+        surface = models[cloud.class_number].vertices_m
+        low, high = surface.amin(0) - 0.005, surface.amax(0) + 0.005
+        assert float(((local > low) & (local < high)).all(1).float().mean()) > 0.9
+
+
+def test_frames_of_other_names_are_refused(tmp_path: Path) -> None:
+    folder = _frames_folder(tmp_path)
+    frames = FramesConfig(folder=str(folder))
+    models = [dataclasses.replace(model, name=model.name + "_x") for model in _models()]
+    with pytest.raises(InputError, match="is called 'bracket' there, and 'bracket_x' here"):
+        TrainingClouds(models, _MADE, frames, _CLOUD, 0)
+
+
+def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
+    far = dataclasses.replace(_MADE, distance_m=(19.0, 20.0))
+    clouds = TrainingClouds(_models(), far, None, CloudConfig(min_points=500), 0)
+    with pytest.raises(InputError, match="20 samples in a row have fewer than 500 points; bring"):
+        clouds[0]
+
+
+def test_held_out_views_are_not_those_that_are_trained_on() -> None:
+    models = _models()
+    held_out = HeldOut(models, _MADE, _CLOUD, HeldOutConfig(number=2))
+    trained = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    known = [trained[i].R for i in range(8)]
+    for cloud in held_out._of(0.3):
+        assert not any(torch.allclose(cloud.R, R) for R in known)
+    numbers = held_out.look(ResUNet(_SMALL).eval()).numbers
+    assert set(numbers) == {
+        f"held_out/occluded_{o}/{m}_{k}"
+        for o in (0, 30)
+        for m in ("lines", "ransac")
+        for k in ("add_10", "median")
+    }
+    assert HELD_OUT_SEED > 0
+
+
+def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:
+    path = train_pose(_training(), Run(folder=tmp_path / "run"))
+    weights = read_pose_weights(path)
+    assert isinstance(weights.network, ResUNet)
+    assert weights.network.config.norm == "none"
+    assert [model.name for model in weights.models] == ["bracket"]
+    assert weights.cloud == _CLOUD
+    assert "made views of bracket" in weights.facts["trained_on"]
+    card = path.with_suffix(".md").read_text()
+    assert "Objects: bracket (160 mm)." in card
+    rows = json.loads(path.with_suffix(".json").read_text())["held_out"]
+    assert set(rows) == {"0"}
+    shares = [rows["0"][name] for name in ("right", "wrong", "refused")]
+    assert sum(shares) == pytest.approx(1)
+    again = read_config(tmp_path / "run" / "config.yaml", PoseTraining)
+    assert again.network.classes == 1
+    with pytest.raises(InputError, match="holds a training"):
+        train_pose(_training(), Run(folder=tmp_path / "run"))
+
+
+def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:
+    whole = train_pose(_training(), Run(folder=tmp_path / "whole"))
+    loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
+
+    class _Stopped(Exception):  # noqa: N818
+        pass
+
+    def stop(progress: object) -> None:
+        if getattr(progress, "step", 0) == 2:
+            raise _Stopped
+
+    with pytest.raises(_Stopped):
+        train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop))
+    cut = train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
+    one, other = (read_pose_weights(path).network.state_dict() for path in (whole, cut))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_the_refusal_is_chosen_on_views_of_its_own(tmp_path: Path) -> None:
+    path = train_pose(_training(), Run(folder=tmp_path))
+    weights = read_pose_weights(path)
+    config = CalibrationConfig(number=20)
+    chosen = calibrated(weights, _MADE, config)
+    # Three steps teach nothing: nearly all answers are wrong, so nearly none may be given.
+    table = judged(chosen, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
+    assert (table["0"]["wrong"] or 0.0) <= 0.5
+    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
+    text = card_text(weights.models, {"licence": "MIT"}, table)
+    assert "| hidden % | right % | wrong % | refused %" in text
+    assert "Licence: MIT." in text
+
+
+def test_models_come_from_one_source(tmp_path: Path) -> None:
+    file = str(write_part("flange", tmp_path))
+    with pytest.raises(InputError, match="there is no object to learn; name its CAD file"):
+        read_models(ModelsConfig())
+    with pytest.raises(InputError, match="cad and parts are given; take the models from one"):
+        read_models(ModelsConfig(cad=(file,), parts=("mug",)))
+    with pytest.raises(InputError, match="two CAD files are called 'flange'"):
+        read_models(ModelsConfig(cad=(file, file)))
+    four = ModelsConfig(parts=("mug", "spool"), mesh=MeshConfig(keypoints=4))
+    assert [len(model.keypoints_m) for model in read_models(four)] == [4, 4]
+
+
+def test_symmetries_of_a_cad_file_are_told_and_taken_where_asked(tmp_path: Path) -> None:
+    file, told = str(write_part("flange", tmp_path)), []
+    (plain,) = read_models(ModelsConfig(cad=(file,)), told.append)
+    assert plain.symmetries.is_none
+    assert "flange: looks the same after 5 turns, about 0 axes" in told[0]
+    assert "--symmetries found" in told[0]
+    (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), told.append)
+    assert taken.symmetries.discrete is not None
+    assert len(taken.symmetries.discrete.R) == 5
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
+    text = path.read_text()
+    what = next((w for w in STAGES if f"--what {w} " in text), "pose")
+    read_config(path, STAGES[what][0])
+    head = " ".join(line for line in text.splitlines() if line.startswith("#"))
+    assert f"depthpose pose train --config configs/pose/{path.name}" in head
+    assert "Wall time" in head
+
+
+def test_the_thesis_config_is_the_published_network() -> None:
+    config = read_config(CONFIGS / "thesis.yaml", PoseTraining)
+    network = dataclasses.replace(config.network, with_bias=False)
+    assert sum(p.numel() for p in ResUNet(network).parameters()) == 8_774_168
+    rates = [config.adam.rate_at(epoch, 500) for epoch in (0, 99, 100, 250, 499)]
+    assert rates == [1e-4, 1e-4, 5e-5, 2.5e-5, 6.25e-6]
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (FramesConfig, "frames has no folder"),
+        (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
+        (lambda: HeldOutConfig(number=0), "nothing would be looked at; take 25"),
+        (lambda: CalibrationConfig(number=5), "number is 5; nothing can be chosen by fewer"),
+        (lambda: CalibrationConfig(max_wrong_share=1.0), "max_wrong_share is 1.0"),
+    ],
+)
+def test_knobs_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001
+    with pytest.raises(InputError) as error:
+        make()
+    assert said in str(error.value)

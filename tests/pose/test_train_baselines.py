@@ -1,0 +1,301 @@
+"""Baselines and segmentation in the loop: they train, resume, and leave files that estimate."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from tests.pose.made_object import bottle, bracket
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_image
+from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
+from depthpose.core.rigid import Rigid
+from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
+from depthpose.pose.bop import BopFrame, BopObject, write_bop_models, write_bop_scene
+from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.objects import Objects
+from depthpose.pose.resnet import ResNet18
+from depthpose.pose.segmentation import SegmentationConfig, Segmenter
+from depthpose.pose.train import (
+    STAGES,
+    DepthImageTraining,
+    HeldOutConfig,
+    ModelsConfig,
+    PointNetTraining,
+    Run,
+    SegmentationTraining,
+)
+from depthpose.pose.train.depth_image import TrainingCrops, surface_points, symmetric_copies
+from depthpose.pose.train.images import (
+    AnnotatedImages,
+    LabelledImage,
+    TrainingImages,
+    cut_window,
+    jitter_colors,
+)
+from depthpose.pose.train.segmentation_config import ImageAugmentConfig, ImagesConfig
+
+LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
+MADE = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))
+HELD_OUT = HeldOutConfig(number=1, occlusions=(0.0,), with_ransac=False)
+
+
+@pytest.fixture(scope="module")
+def models_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models")
+    write_bop_models(folder, [bracket()])
+    return folder
+
+
+def pointnet_config(folder: Path) -> PointNetTraining:
+    network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8), with_transforms=False)
+    return PointNetTraining(
+        models=ModelsConfig(bop=str(folder)), objects=MADE, network=network, held_out=HELD_OUT,
+        cloud=CloudConfig(max_points=50), loop=LOOP,
+    )  # fmt: skip
+
+
+def depth_image_config(folder: Path) -> DepthImageTraining:
+    return DepthImageTraining(
+        models=ModelsConfig(bop=str(folder)), objects=MADE, held_out=HELD_OUT, loop=LOOP,
+        network=DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8)), surface_points=50,
+    )  # fmt: skip
+
+
+def test_the_pointnet_trains_and_its_file_is_an_estimators(
+    models_folder: Path, tmp_path: Path
+) -> None:
+    config = pointnet_config(models_folder)
+    path = STAGES["pointnet"][1](config, Run(folder=tmp_path))
+    assert path == tmp_path / "pointnet.safetensors"
+    rows = read_metrics(tmp_path)
+    assert "held_out/occluded_0/lines_add_10" in rows[-1]
+    net = GeoPoseNet.load(path)
+    assert net.objects == ("bracket",)
+    (found,) = net.estimate_many([Objects([bracket()], MADE)[0].input])
+    assert found.is_ok or found.reason
+
+
+def test_the_depth_image_trains_and_its_file_is_a_regressors(
+    models_folder: Path, tmp_path: Path
+) -> None:
+    path = STAGES["depth-image"][1](depth_image_config(models_folder), Run(folder=tmp_path))
+    assert path == tmp_path / "depth-image.safetensors"
+    assert "held_out/occluded_0/regressed_median" in read_metrics(tmp_path)[-1]
+    regressor = DepthImageRegressor.load(path)
+    view = Objects([bracket()], MADE).view(0).input
+    found, refused = regressor.estimate_many(
+        [view, dataclasses.replace(view, mask=view.mask & False)]
+    )
+    assert found.is_ok
+    assert set(found.seconds) == {"network", "icp"}
+    assert (refused.status, refused.is_ok) == ("too few points", False)
+    with pytest.raises(InputError, match=r"'cup'.*they know bracket"):
+        regressor.estimate_many([dataclasses.replace(view, object="cup")])
+
+
+def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
+    models_folder: Path, tmp_path: Path
+) -> None:
+    votes = STAGES["pointnet"][1](pointnet_config(models_folder), Run(folder=tmp_path / "p"))
+    depth = STAGES["depth-image"][1](depth_image_config(models_folder), Run(folder=tmp_path / "d"))
+    with pytest.raises(InputError, match="load them as DepthImageRegressor"):
+        GeoPoseNet.load(depth)
+    with pytest.raises(InputError, match="load them as GeoPoseNet"):
+        DepthImageRegressor.load(votes)
+    other = dataclasses.replace(depth_image_config(models_folder), start=str(votes))
+    with pytest.raises(InputError, match="Give the config the weights' own"):
+        STAGES["depth-image"][1](other, Run(folder=tmp_path / "o"))
+
+
+def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) -> None:
+    config = dataclasses.replace(
+        depth_image_config(models_folder),
+        loop=LoopConfig(steps=40, batch_size=4, device="cpu", log_every_steps=10),
+        adam=AdamConfig(learning_rate=3e-3),
+    )
+    STAGES["depth-image"][1](config, Run(folder=tmp_path))
+    losses = [row["network/loss"] for row in read_metrics(tmp_path) if "network/loss" in row]
+    assert losses[-1] < 0.85 * losses[0]
+
+
+def test_crops_carry_the_truth_of_their_view() -> None:
+    config = DepthImageTraining(objects=MADE, network=DepthImageConfig(crop_px=32))
+    crops = TrainingCrops([bracket(), bottle()], config, 0)
+    sample, view = crops[3], Objects([bracket(), bottle()], MADE).view(3)
+    assert int(sample.class_of) == 1
+    torch.testing.assert_close(sample.R, view.truth.camera_from_model.R.float())
+    assert len(crops) == 8
+
+
+def test_points_and_copies_have_one_shape_for_all_objects() -> None:
+    models = [bracket(), bottle()]
+    assert surface_points(models, 40).shape == (2, 40, 3)
+    copies = symmetric_copies(models)
+    assert copies.R.shape[:2] == (2, 16)
+    assert bool((copies.R[0] == torch.eye(3)).all())
+    around = copies.apply(models[1].vertices_m.expand(2, 16, -1, -1))[1]
+    reach_m = around[..., :2].norm(dim=-1)
+    torch.testing.assert_close(reach_m, reach_m[:1].expand_as(reach_m))
+
+
+# images
+
+
+def colored_frame(number: int, size: tuple[int, int] = (48, 64)) -> BopFrame:
+    """A red box of object 7 and a green one of object 3 on noise."""
+    generator = torch.Generator().manual_seed(number)
+    rgb = 0.3 * torch.rand(3, *size, generator=generator)
+    masks = torch.zeros(2, *size, dtype=torch.bool)
+    for k in (0, 1):
+        top, left = (int(torch.randint(14, (), generator=generator)) for _ in range(2))
+        masks[k, top : top + 30, left + 30 * k : left + 30 * k + 18] = True
+        rgb[k][masks[k]] += 0.6
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))
+    objects = [
+        BopObject(number=n, camera_from_model=pose, visible=m, silhouette=m)
+        for n, m in zip((7, 3), masks, strict=True)
+    ]
+    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    depth_m = torch.ones(size)
+    return BopFrame(number=number, K=K, depth_m=depth_m, objects=objects, rgb=rgb)
+
+
+@pytest.fixture(scope="module")
+def colored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("colored")
+    other = dataclasses.replace(bottle(), number=3)
+    write_bop_models(folder, [bracket(), other])
+    write_bop_scene(folder, "train", 1, [colored_frame(k) for k in range(6)])
+    write_bop_scene(folder, "test", 1, [colored_frame(k) for k in range(6, 8)])
+    return folder
+
+
+def test_labels_are_the_classes_of_the_masks(colored: Path) -> None:
+    images = AnnotatedImages(ImagesConfig(folder=str(colored)))
+    assert (images.objects.names, images.objects.numbers) == (("bottle", "bracket"), (3, 7))
+    for _ in range(2):  # read, then out of memory
+        image, labels = images[2]
+        red, green = (o.visible for o in colored_frame(2).objects)
+        assert torch.equal(labels == 1, green)
+        assert torch.equal(labels == 2, red & ~green)
+        assert float(image[0][labels == 2].mean()) > 0.5
+    only = AnnotatedImages(ImagesConfig(folder=str(colored), objects=(7,), limit=3))
+    assert (len(only), only.objects.names, only[0].labels.unique().tolist()) == (
+        3, ("bracket",), [0, 1],
+    )  # fmt: skip
+
+
+def test_images_without_what_is_asked_are_refused(colored: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="name a folder in BOP's layout"):
+        AnnotatedImages(ImagesConfig())
+    with pytest.raises(InputError, match=r"none of the objects \[5\]; it has \[3, 7\]"):
+        AnnotatedImages(ImagesConfig(folder=str(colored), objects=(5,)))
+    write_bop_models(tmp_path, [bracket()])
+    write_bop_scene(tmp_path, "train", 1, [dataclasses.replace(colored_frame(0), rgb=None)])
+    with pytest.raises(InputError, match="'train' has no picture"):
+        AnnotatedImages(ImagesConfig(folder=str(tmp_path)))
+
+
+def test_a_picture_of_another_size_than_its_mask_is_refused(colored: Path, tmp_path: Path) -> None:
+    write_bop_models(tmp_path, [bracket(), dataclasses.replace(bottle(), number=3)])
+    scene = write_bop_scene(tmp_path, "train", 1, [colored_frame(0)])
+    write_image(scene / "rgb" / "000000.png", torch.zeros(3, 24, 32))
+    with pytest.raises(InputError, match="the mask is 64x48, but the picture 32x24"):
+        AnnotatedImages(ImagesConfig(folder=str(tmp_path)))[0]
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.7])
+def test_a_window_keeps_image_and_labels_together(scale: float) -> None:
+    """The image shows its own labels: after the cut it still does."""
+    labels = F.interpolate(
+        torch.randint(3, (1, 1, 6, 8), generator=torch.Generator().manual_seed(0)).float(),
+        (120, 160),
+    )[0, 0].long()
+    image = torch.stack([(labels == k).float() for k in range(3)])
+    for seed in range(5):
+        generator = torch.Generator().manual_seed(seed)
+        cut = cut_window(LabelledImage(image, labels), scale, (64, 96), generator)
+        assert cut.image.shape == (3, 64, 96)
+        rows, columns = round(120 * scale), round(160 * scale)  # a small image is filled up
+        right = (cut.image.argmax(0) == cut.labels)[:rows, :columns]
+        assert float(right.float().mean()) > 0.97
+
+
+def test_colors_change_within_their_bounds_and_by_the_generator_alone() -> None:
+    image = torch.rand(3, 8, 8)
+    draws = [jitter_colors(image, 0.3, torch.Generator().manual_seed(s)) for s in (0, 0, 1)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    torch.testing.assert_close(jitter_colors(image, 0.0, torch.Generator()), image)
+    assert 0 <= float(draws[0].min()) <= float(draws[0].max()) <= 1
+
+
+def segmentation_config(folder: Path, steps: int) -> SegmentationTraining:
+    return SegmentationTraining(
+        images=ImagesConfig(folder=str(folder)),
+        held_out=ImagesConfig(folder=str(folder), split="test"),
+        network=SegmentationConfig(widths=(8, 8, 16, 16), long_side_px=64),
+        augment=ImageAugmentConfig(crop_px=(64, 64), scale=(0.9, 1.1), jitter=0.1),
+        adam=AdamConfig(learning_rate=1e-2),
+        loop=LoopConfig(steps=steps, batch_size=4, device="cpu", log_every_steps=5),
+    )
+
+
+def test_segmentation_learns_colored_boxes_and_says_where(colored: Path, tmp_path: Path) -> None:
+    config = segmentation_config(colored, 60)
+    path = STAGES["segmentation"][1](config, Run(folder=tmp_path / "whole"))
+    last = read_metrics(tmp_path / "whole")[-1]
+    assert last["held_out/iou_objects"] > 0.5
+    image = colored_frame(7).rgb
+    assert image is not None
+    found = Segmenter.load(path).segment(image)
+    assert set(found.masks) <= {"bottle", "bracket"}
+    assert (tmp_path / "whole/pictures/0000060_found_truth.png").is_file()
+    settings = json.loads((tmp_path / "whole/run.json").read_text())
+    assert settings["settings"]["stage"] == "SegmentationTraining"
+
+
+def test_segmentation_starts_from_an_encoder(colored: Path, tmp_path: Path) -> None:
+    from depthpose.core.checkpoint import Checkpoint, save_checkpoint
+
+    torch.manual_seed(1)
+    encoder = ResNet18(widths=(8, 8, 16, 16))
+    path = tmp_path / "encoder.safetensors"
+    save_checkpoint(path, Checkpoint(kind="resnet18", config={}, state=encoder.state_dict()))
+    config = dataclasses.replace(
+        segmentation_config(colored, 1), start=str(path), adam=AdamConfig(learning_rate=1e-9)
+    )
+    trained = STAGES["segmentation"][1](config, Run(folder=tmp_path / "run"))
+    kept = Segmenter.load(trained).weights.network.encoder.state_dict()
+    name = "layer3.0.conv1.weight"
+    torch.testing.assert_close(kept[name], encoder.state_dict()[name])
+
+
+def test_training_images_are_the_same_for_the_same_ticket(colored: Path) -> None:
+    config = segmentation_config(colored, 1)
+    images = AnnotatedImages(config.images)
+    samples = TrainingImages(images, config.augment, config.network, 3)
+    again = TrainingImages(images, config.augment, config.network, 3)
+    assert torch.equal(samples[11].image, again[11].image)
+    assert torch.equal(samples[11].labels, again[11].labels)
+    assert not torch.equal(samples[11].image, samples[12].image)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: ImageAugmentConfig(crop_px=(100, 64)), "multiples of 32"),
+        (lambda: ImageAugmentConfig(scale=(0.0, 1.0)), "positive range"),
+        (lambda: ImageAugmentConfig(jitter=1.0), "both are shares"),
+        (lambda: SegmentationTraining(object_weight=0.0), "object_weight is 0.0"),
+        (lambda: DepthImageTraining(surface_points=2), "surface_points is 2"),
+    ],
+)
+def test_knobs_that_cannot_be_are_refused(make: object, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        make()  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,215 @@
+"""``pose predict`` from the words to the files, with an oracle in place of the network."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_frames import make_dataset
+from tests.pose.made_object import (
+    K,
+    Oracle,
+    bottle,
+    bracket,
+    cloud_of,
+    pose_at,
+    tiny_weights,
+    view_of,
+)
+
+from depthpose.cli import main, pose_methods
+from depthpose.core.camera import Camera, write_camera
+from depthpose.core.files import (
+    Cloud,
+    read_cloud,
+    read_image,
+    write_cloud,
+    write_depth_png,
+    write_image,
+)
+from depthpose.pose.bop import BopDataset
+from depthpose.pose.bop.results import read_results
+from depthpose.pose.metrics import add_m
+from depthpose.pose.predictions import read_predictions
+from depthpose.pose.weights import write_pose_weights
+
+TRUTH = pose_at(seed=1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+    return make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Weights of two objects whose directions are the true ones of ``TRUTH``."""
+    return oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(bracket(), bottle()), [TRUTH]))
+
+
+def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle) -> Path:
+    path = folder / "known.safetensors"
+    write_pose_weights(path, oracle.weights)
+    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
+    return path
+
+
+def poses_of(out: Path) -> dict[str, dict]:
+    return {row["name"]: row for row in json.loads((out / "poses.json").read_text())}
+
+
+def test_a_cloud_gives_its_pose_and_the_posed_model(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = cloud_of(bracket(), TRUTH)
+    write_cloud(tmp_path / "part.ply", Cloud(points=1000 * cloud))
+    words = ["--cloud", str(tmp_path / "part.ply"), "--unit", "mm", "--object", "bracket"]
+    out = tmp_path / "out"
+    assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
+    assert "1 inputs: 1 ok" in capsys.readouterr().out
+    found = read_predictions(out)[0].estimate
+    assert found.camera_from_model is not None
+    assert float(add_m(found.camera_from_model, TRUTH, bracket().vertices_m)) < 0.001
+    row = poses_of(out)["part"]
+    assert {"network", "voting", "icp"} <= row["seconds"].keys()
+    assert torch.tensor(row["covariance"]).shape == (6, 6)
+    beside = read_cloud(out / "part.ply")
+    assert len(beside.points) == len(cloud) + 5000
+    assert beside.color is not None
+
+
+def frames(folder: Path) -> list[str]:
+    """A folder of two depth images, one of them without the object, and their masks."""
+    depth_m, mask = view_of(bracket(), TRUTH)
+    for name, pixels in (("seen", mask), ("hidden", mask & False)):
+        (folder / "depth").mkdir(parents=True, exist_ok=True)
+        (folder / "mask").mkdir(exist_ok=True)
+        write_depth_png(folder / "depth" / f"{name}.png", depth_m, 0.001)
+        write_image(folder / "mask" / f"{name}.png", pixels.float().expand(3, -1, -1))
+    camera = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
+    write_camera(folder / "camera.json", camera)
+    words = ["--depth", str(folder / "depth"), "--mask", str(folder / "mask")]
+    return [*words, "--camera", str(folder / "camera.json"), "--object", "bracket"]
+
+
+def test_a_folder_of_depth_images_is_done_once(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--out", str(out)]
+    assert main(words) == 0
+    assert "2 inputs: 1 ok, 1 too few points" in capsys.readouterr().out
+    rows = poses_of(out)
+    assert rows["hidden"]["reason"] == "the mask is empty: no pixel of it is the object"
+    assert rows["hidden"]["camera_from_model"] is None
+    assert (out / "seen.ply").is_file()
+    assert not (out / "hidden.ply").exists()
+    blue = read_image(out / "seen.png")
+    assert blue.shape == (3, 240, 320)
+    assert int(((blue[2] > 0.9) & (blue[0] < 0.3)).sum()) > 100
+    before = (out / "poses.json").read_text()
+    assert main(words) == 0
+    assert (out / "poses.json").read_text() == before
+    assert main([*words, "--no-icp"]) == 2
+    assert "holds results made with" in capsys.readouterr().err
+
+
+def test_an_unreadable_image_stops_no_other(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = frames(tmp_path)
+    (tmp_path / "depth" / "hidden.png").write_bytes(b"no picture")
+    out = tmp_path / "out"
+    assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "failed: hidden: cannot be read: " in said.err
+    assert "2 inputs: 1 ok" in said.out
+
+
+def test_a_data_set_gives_the_csv_and_pictures(
+    made: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truths = [instance.camera_from_model for instance in made.instances]
+    models = [made.objects[number] for number in sorted(made.objects)]
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*models), truths))
+    out = tmp_path / "out"
+    words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(out)]
+    assert main(["pose", "predict", *words]) == 0
+    answered = [p for p in read_predictions(out) if p.estimate.is_ok]
+    assert len(read_predictions(out)) == len(made.instances)
+    results = read_results(out / f"depthpose_{made.folder.name}-test.csv")
+    assert len(results) == len(answered) > 0
+    images = {(p.place.scene_id, p.place.image_id) for p in answered if p.place is not None}
+    assert {f"{s:06d}_{i:06d}.png" for s, i in images} == {p.name for p in out.glob("*.png")}
+
+
+def test_two_processes_share_the_work(
+    made: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models = [made.objects[number] for number in sorted(made.objects)]
+    truths = [instance.camera_from_model for instance in made.instances]
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*models), truths))
+    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(path), "--out"]
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in ("1", "0"):
+        monkeypatch.setenv("RANK", rank)
+        assert main([*words, str(tmp_path / "two")]) == 0
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert main([*words, str(tmp_path / "one")]) == 0
+    one, two = (poses_of(tmp_path / name) for name in ("one", "two"))
+    assert list(one) == list(two)
+    for name, row in one.items():
+        assert row["camera_from_model"] == two[name]["camera_from_model"]
+    parts = [len(read_predictions(tmp_path / "two" / f"part-{k}")) for k in (0, 1)]
+    assert sum(parts) == len(made.instances)
+    assert min(parts) >= 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "0 of --cloud, --depth and --bop are given; give one"),
+        (["--cloud", "a.ply", "--bop", "b"], "2 of --cloud, --depth and --bop are given"),
+        (["--cloud", "a.ply"], "the weights know bracket, bottle; say which by --object"),
+        (["--cloud", "a.ply", "--object", "bracke"], "did you mean 'bracket'?"),
+        (["--depth", "d.png", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
+        (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz file there"),
+    ],
+)
+def test_what_cannot_be_predicted_is_refused(
+    weights: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    said: str,
+) -> None:
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    given = [*words, "--weights", str(weights), "--out", str(tmp_path / "out")]
+    assert main(["pose", "predict", *given]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_mask_of_another_name_is_refused(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = frames(tmp_path)
+    (tmp_path / "mask" / "seen.png").rename(tmp_path / "mask" / "scene.png")
+    out = str(tmp_path / "out")
+    assert main(["pose", "predict", *words, "--weights", str(weights), "--out", out]) == 2
+    assert "no mask called 'seen'" in capsys.readouterr().err
+
+
+def test_weights_of_other_objects_are_refused(
+    made: BopDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stranger = bracket("stranger")
+    stranger = type(stranger)(**{**vars(stranger), "number": 99})
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(stranger), [TRUTH]))
+    words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(tmp_path / "out")]
+    assert main(["pose", "predict", *words]) == 2
+    assert "but the weights know stranger; give weights of its objects" in capsys.readouterr().err
