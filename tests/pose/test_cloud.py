@@ -115,3 +115,10 @@ def test_the_real_cat(real: Path) -> None:
     assert 2000 < len(cloud) <= 2212
     assert float((cloud.amax(0) - cloud.amin(0)).norm()) < 0.25
     assert 50 < len(voxelise(cloud, 0.008).kept) < 500
+
+
+def test_a_point_that_is_none_does_not_move_all_others() -> None:
+    points_m = torch.rand(50, 3)
+    points_m[3, 0] = torch.nan
+    with pytest.raises(InputError, match="voxelise: 1 points are not finite; leave such"):
+        voxelise(points_m, 0.1)

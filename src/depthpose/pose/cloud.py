@@ -109,10 +109,15 @@ def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
     Votes are cast from the kept points' own coordinates, not from the centres of cells.
 
     Raises:
-        InputError: there is no point, or the cloud is over a million voxels wide.
+        InputError: there is no point, one is not finite, or the cloud is over a million voxels
+            wide.
     """
     if len(points_m) == 0:
         raise InputError("voxelise: the cloud has no point; see refusal_of first.")
+    if not bool(points_m.isfinite().all()):
+        # One NaN would move the mean, and with it every point, into one cell.
+        count = int((~points_m.isfinite().all(-1)).sum())
+        raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
     cells = torch.floor((points_m - points_m.mean(0)) / voxel_m).long()
     extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
     if extent > _LARGEST_CELL:
