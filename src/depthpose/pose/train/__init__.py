@@ -5,6 +5,7 @@ from depthpose.pose.train.baselines_config import PointNetTraining as PointNetTr
 from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch
 from depthpose.pose.train.clouds import TrainingClouds as TrainingClouds
+from depthpose.pose.train.config import CalibrationConfig as CalibrationConfig
 from depthpose.pose.train.config import FramesConfig as FramesConfig
 from depthpose.pose.train.config import HeldOutConfig as HeldOutConfig
 from depthpose.pose.train.config import ModelsConfig as ModelsConfig
