@@ -94,6 +94,8 @@ def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
         EstimateConfig(batch_voxels=0)
     with pytest.raises(InputError, match="icp_starts is 5; take 1, the voted pose, to 4"):
         EstimateConfig(icp_starts=5)
+    with pytest.raises(InputError, match=r"rough_rigidity_diameters is 0\.05, but the strict one"):
+        EstimateConfig(rough_rigidity_diameters=0.05)
 
 
 def test_a_wrong_pose_has_worse_signals_than_the_true_one() -> None:

@@ -57,8 +57,8 @@ def calibrate_refusal(
     is wrong.
 
     Args:
-        estimates: made with a :class:`RefusalConfig` without slopes, so that nothing was withheld
-            for its risk; on views that training has not seen, the hard ones too.
+        estimates: made with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for its
+            risk; on views that training has not seen, the hard ones too.
         is_right: whether each is right; what was refused anyhow does not count.
         max_wrong_share: of the answers that are given.
 
