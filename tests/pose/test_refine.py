@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from tests.pose.made_object import bracket
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
@@ -147,3 +148,14 @@ def test_the_real_cat_and_ape(real: Path) -> None:
         known = Rigid(true.R.expand(5, 3, 3), true.t_m.expand(5, 3))
         error_m = add_m(refined.camera_from_model, known, model.vertices_m[::7])
         assert float(error_m.max()) < 0.025 * model.diameter_m
+
+
+def test_nothing_and_no_numbers_are_refused() -> None:
+    surface = prepare_surface(bracket())
+    start = Rigid(torch.eye(3), torch.zeros(3))
+    for cloud, said in (
+        (torch.zeros(0, 3), "ICP of 0 points, 0 of them not finite"),
+        (torch.full((40, 3), torch.nan), "ICP of 40 points, 40 of them"),
+    ):
+        with pytest.raises(InputError, match=said):
+            refine_pose(cloud, start, surface)

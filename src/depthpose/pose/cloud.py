@@ -118,10 +118,15 @@ def voxelise(
     Votes are cast from the kept points' own coordinates, not from the centres of cells.
 
     Raises:
-        InputError: there is no point, or the cloud is over a million voxels wide.
+        InputError: there is no point, one is not finite, or the cloud is over a million voxels
+            wide.
     """
     if len(points_m) == 0:
         raise InputError("voxelise: the cloud has no point; see refusal_of first.")
+    if not bool(points_m.isfinite().all()):
+        # One NaN would move the mean, and with it every point, into one cell.
+        count = int((~points_m.isfinite().all(-1)).sum())
+        raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
     mean_m = points_m.mean(0)
     turn = torch.eye(3).to(points_m)
     if with_sight_axis and float(mean_m.norm()) > 0:

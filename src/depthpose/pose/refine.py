@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh import sample_surface
@@ -86,8 +87,16 @@ def refine_pose(
         initial: poses to begin from, ``camera_from_model``; one or a batch.
         surface: of :func:`prepare_surface`.
         config: limits and number of steps.
+
+    Raises:
+        InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
+    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
+        raise InputError(
+            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
+            "not finite: leave those out, and refuse a cloud of none."
+        )
     cloud = _thin(points_m.double(), config.cloud_points)
     pose = Rigid(initial.R.double(), initial.t_m.double())
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
