@@ -54,11 +54,11 @@ def calibrate_refusal(
 ) -> RefusalConfig:
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
-    The risk is a logistic regression on the signals but ``gap``; no slope is negative (more of
-    a bad sign is never better), a ridge holds them. The limit is chosen by risks that a fifth of the
-    data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is still
-    ``max_wrong_share`` at most; where the data are too few for that, the largest at which nothing
-    is wrong.
+    The risk is a logistic regression on the signals but ``gap``; no slope is negative (more of a
+    bad sign is never better), and a ridge holds them. The limit is chosen by risks that each fifth
+    of the data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is
+    still ``max_wrong_share`` at most; where the data are too few for that, the largest at which
+    nothing is wrong.
 
     Args:
         estimates: made with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for its
