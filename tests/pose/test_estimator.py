@@ -209,6 +209,24 @@ def test_the_keypoints_of_another_object_do_not_fit(part: ObjectModel) -> None:
     assert "another object, or too much of it hidden" in found.reason
 
 
+def test_rough_votes_are_mended_where_a_risk_judges_them(part: ObjectModel) -> None:
+    """Keypoints off by a seventh of the diameter break the strict test; ICP mends their pose."""
+    truth = pose_at()
+    cloud = cloud_of(part, truth)
+    off_m = 0.14 * part.diameter_m * torch.randn(8, 3, generator=torch.Generator().manual_seed(1))
+    rough = dataclasses.replace(part, keypoints_m=part.keypoints_m + off_m)
+    net = Oracle(tiny_weights(rough), [truth])
+
+    class Rough(Oracle):
+        def _true(self, points_m: torch.Tensor, number: int) -> torch.Tensor:
+            return net._true(points_m, number)
+
+    strict = Rough(tiny_weights(part), [truth]).estimate(cloud=cloud)
+    assert strict.status == "keypoints do not fit"
+    calibrated = tiny_weights(part, refusal=RefusalConfig(max_risk=1.0))
+    assert_close(Rough(calibrated, [truth]).estimate(cloud=cloud), truth)
+
+
 def test_an_untrained_network_is_refused_or_doubted(part: ObjectModel) -> None:
     """The real network, from the first to the last step."""
     slopes = {"disagree": 10.0, "far": 10.0}

@@ -24,11 +24,11 @@ def answer(**signals: float) -> PoseEstimate:
 
 
 def made(count: int, seed: int) -> tuple[list[PoseEstimate], list[bool]]:
-    """Wrong with the odds ``exp(20 far - 6)``, whatever ``gap`` says."""
+    """Wrong with the odds ``exp(20 far - 6)``, whatever ``bend`` says."""
     generator = torch.Generator().manual_seed(seed)
-    far, gap, luck = torch.rand(3, count, generator=generator)
+    far, bend, luck = torch.rand(3, count, generator=generator)
     is_right = luck > (20 * far - 6).sigmoid()
-    answers = [answer(far=float(f), gap=float(g)) for f, g in zip(far, gap, strict=True)]
+    answers = [answer(far=float(f), bend=float(b)) for f, b in zip(far, bend, strict=True)]
     return answers, is_right.tolist()
 
 
@@ -42,9 +42,10 @@ def test_the_risk_is_the_logistic_of_the_signals() -> None:
 
 def test_calibration_finds_what_makes_answers_wrong() -> None:
     config = calibrate_refusal(*made(4000, 0), max_wrong_share=0.02)
-    assert config.slopes["far"] == pytest.approx(20, rel=0.15)
-    assert config.bias == pytest.approx(-6, rel=0.15)
-    assert 0 <= config.slopes["gap"] < 0.5
+    assert config.slopes["far"] == pytest.approx(20, rel=0.2)
+    assert config.bias == pytest.approx(-6, rel=0.2)
+    assert 0 <= config.slopes["bend"] < 0.5
+    assert "gap" not in config.slopes
     assert all(slope >= 0 for slope in config.slopes.values())
 
 
@@ -94,6 +95,8 @@ def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
         EstimateConfig(batch_voxels=0)
     with pytest.raises(InputError, match="icp_starts is 5; take 1, the voted pose, to 4"):
         EstimateConfig(icp_starts=5)
+    with pytest.raises(InputError, match=r"rough_rigidity_diameters is 0\.05, but the strict one"):
+        EstimateConfig(rough_rigidity_diameters=0.05)
 
 
 def test_a_wrong_pose_has_worse_signals_than_the_true_one() -> None:

@@ -22,7 +22,6 @@ from depthpose.pose.resnet import ResNet18
 from depthpose.pose.segmentation import SegmentationConfig, Segmenter
 from depthpose.pose.train import (
     STAGES,
-    CalibrationConfig,
     DepthImageTraining,
     HeldOutConfig,
     ModelsConfig,
@@ -30,6 +29,7 @@ from depthpose.pose.train import (
     Run,
     SegmentationTraining,
 )
+from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.depth_image import TrainingCrops, surface_points, symmetric_copies
 from depthpose.pose.train.images import (
     AnnotatedImages,

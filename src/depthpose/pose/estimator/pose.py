@@ -88,7 +88,9 @@ def pose_from_directions(
     clock = _Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")
-    used = _agreeing(vote, model, config.voting)
+    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
+    limit_m = model.diameter_m * (rough if refusal.is_calibrated else strict)
+    used = _agreeing(vote, model, config.voting.max_condition, limit_m)
     if isinstance(used, Refusal):
         return _withheld(model, used, clock)
     fit = fit_pose(vote.keypoints_m, vote.covariance_m2, model.keypoints_m, used)
@@ -116,8 +118,10 @@ def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
     return meet_lines(points, directions, weight, config.refinements)
 
 
-def _agreeing(vote: Vote, model: ObjectModel, config: VotingConfig) -> Bool[Tensor, " k"] | Refusal:
-    found = (vote.condition <= config.max_condition) & (vote.inlier_share > 0)
+def _agreeing(
+    vote: Vote, model: ObjectModel, max_condition: float, limit_m: float
+) -> Bool[Tensor, " k"] | Refusal:
+    found = (vote.condition <= max_condition) & (vote.inlier_share > 0)
     total = len(found)
     if int(found.sum()) < _LEAST:
         return Refusal(
@@ -125,7 +129,6 @@ def _agreeing(vote: Vote, model: ObjectModel, config: VotingConfig) -> Bool[Tens
             reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
             "are needed: too few points, or not the object that the mask promises",
         )
-    limit_m = config.rigidity_diameters * model.diameter_m
     used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
     if int(used.sum()) < _LEAST:
         return Refusal(

@@ -12,8 +12,12 @@ from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.types import PoseEstimate
 
 _FOLDS = 5
-_RIDGE = 1.0
-"""Of the slopes in units of each signal's spread: as if one answer spoke against each."""
+_RIDGE = 3.0
+"""Of the slopes in units of each signal's spread: no signal decides alone."""
+_LEARNT = tuple(name for name in SIGNALS if name != "gap")
+"""How far points lie off the surface is the sensor's noise as much as the pose's error. On made
+views it tells right from wrong best of all; a real sensor that is noisier than the made one would
+have its right answers refused by it, as LineMOD's cat was."""
 
 
 def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None:
@@ -50,15 +54,15 @@ def calibrate_refusal(
 ) -> RefusalConfig:
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
-    The risk is a logistic regression on :data:`SIGNALS` with slopes that are not negative (more of
-    a bad sign is never better) and a ridge. The limit is chosen by risks that each fifth of the
-    data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is still
-    ``max_wrong_share`` at most; where the data are too few for that, the largest at which nothing
-    is wrong.
+    The risk is a logistic regression on the signals but ``gap``; no slope is negative (more of a
+    bad sign is never better), and a ridge holds them. The limit is chosen by risks that each fifth
+    of the data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is
+    still ``max_wrong_share`` at most; where the data are too few for that, the largest at which
+    nothing is wrong.
 
     Args:
-        estimates: made with a :class:`RefusalConfig` without slopes, so that nothing was withheld
-            for its risk; on views that training has not seen, the hard ones too.
+        estimates: made with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for its
+            risk; on views that training has not seen, the hard ones too.
         is_right: whether each is right; what was refused anyhow does not count.
         max_wrong_share: of the answers that are given.
 
@@ -76,7 +80,7 @@ def calibrate_refusal(
             "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
             "longer, or show easier views"
         )
-    x = np.array([[e.signals[name] for name in SIGNALS] for e, _ in answered])
+    x = np.array([[e.signals[name] for name in _LEARNT] for e, _ in answered])
     wrong = np.array([not ok for _, ok in answered], dtype=float)
     fold = np.arange(len(x)) % _FOLDS
     risks = np.empty(len(x))
@@ -87,14 +91,14 @@ def calibrate_refusal(
     return RefusalConfig(
         max_risk=_choose_limit(risks, wrong, max_wrong_share),
         bias=float(bias),
-        slopes=dict(zip(SIGNALS, slopes.tolist(), strict=True)),
+        slopes=dict(zip(_LEARNT, slopes.tolist(), strict=True)),
     )
 
 
 def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
     """Fit bias and slopes, the latter not negative, by penalised likelihood."""
     if len(x) == 0:
-        return 0.0, np.zeros(len(SIGNALS))
+        return 0.0, np.zeros(len(_LEARNT))
     middle, spread = x.mean(0), np.maximum(x.std(0), 1e-3)
     z = (x - middle) / spread
 

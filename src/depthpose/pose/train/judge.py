@@ -29,7 +29,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     """
     if config.number == 0:
         return weights
-    open_weights = dataclasses.replace(weights, refusal=RefusalConfig())
+    open_weights = dataclasses.replace(weights, refusal=RefusalConfig(max_risk=1.0))
     views = dataclasses.replace(
         made,
         number=config.number * len(weights.models),
@@ -45,7 +45,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
             estimates, [error < _RIGHT for error in errors], config.max_wrong_share
         )
     except InputError:
-        return open_weights
+        return weights
     return dataclasses.replace(weights, refusal=refusal)
 
 
