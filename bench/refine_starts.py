@@ -58,7 +58,9 @@ def best_of(points_m: Tensor, start: Rigid, middle_m: Tensor, surface: Surface) 
     starts = [start, *(turned(start, middle_m, axis, MORE_RAD) for axis in eye)]
     every = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
     refined = refine_pose(points_m, every, surface)
-    best = int((refined.inlier_share - refined.residual_m / surface.diameter_m).argmax())
+    value = refined.inlier_share - refined.residual_m / surface.diameter_m
+    value[0] += 0.02  # as the estimator has it
+    best = int(value.argmax())
     found = refined.camera_from_model
     return Rigid(found.R[best], found.t_m[best])
 

@@ -17,7 +17,7 @@ from tests.pose.made_object import (
     view_of,
 )
 
-from depthpose.cli import main
+from depthpose.cli import main, pose_methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,
@@ -29,7 +29,6 @@ from depthpose.core.files import (
 )
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.bop.results import read_results
-from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.weights import write_pose_weights
@@ -51,7 +50,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle) -> Path:
     path = folder / "known.safetensors"
     write_pose_weights(path, oracle.weights)
-    monkeypatch.setattr(GeoPoseNet, "load", lambda *_: oracle)
+    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
     return path
 
 

@@ -7,6 +7,7 @@ from depthpose.core.camera import project
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
+from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.cloud import (
     cloud_from_depth,
     is_flying,
@@ -122,3 +123,19 @@ def test_a_point_that_is_none_does_not_move_all_others() -> None:
     points_m[3, 0] = torch.nan
     with pytest.raises(InputError, match="voxelise: 1 points are not finite; leave such"):
         voxelise(points_m, 0.1)
+
+
+def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
+    generator = torch.Generator().manual_seed(2)
+    ahead = torch.rand(500, 3, generator=generator) * 0.1
+    ahead = ahead - ahead.mean(0) + torch.tensor([0.0, 0.0, 0.8])
+    away = turn_axis_to(torch.tensor([0.5, -0.3, 1.0])).float()
+    side = ahead @ away.mT
+    first = voxelise(ahead, 0.01, with_sight_axis=True)
+    second = voxelise(side, 0.01, with_sight_axis=True)
+    assert torch.allclose(first.grid_from_camera, torch.eye(3), atol=1e-6)
+    assert torch.allclose(second.grid_from_camera @ away, torch.eye(3), atol=1e-6)
+    # Rounding moves a point or two across a wall.
+    same = (first.coordinates[:, None] == second.coordinates[None]).all(-1).any(1)
+    assert float(same.float().mean()) > 0.98
+    assert torch.equal(voxelise(side, 0.01).grid_from_camera, torch.eye(3))

@@ -92,6 +92,8 @@ def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
         RefusalConfig(**knobs)
     with pytest.raises(InputError, match="batch_voxels 0; take 100 and 1 at least"):
         EstimateConfig(batch_voxels=0)
+    with pytest.raises(InputError, match="icp_starts is 5; take 1, the voted pose, to 4"):
+        EstimateConfig(icp_starts=5)
 
 
 def test_a_wrong_pose_has_worse_signals_than_the_true_one() -> None:

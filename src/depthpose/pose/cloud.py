@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.config import CloudConfig
 
 _LARGEST_CELL = 2**20
@@ -17,12 +18,15 @@ class Voxels:
     """Which cells of a grid a cloud fills, and the point that was kept in each.
 
     Attributes:
-        coordinates: cell of each kept point, ``floor((x - mean) / voxel)``; no two are equal.
+        coordinates: cell of each kept point, ``floor((x - mean) / voxel)`` of the turned cloud; no
+            two are equal.
         kept: index of that point in the cloud, ascending: the first of its cell.
+        grid_from_camera: how the cloud was turned before.
     """
 
     coordinates: Int64[Tensor, "m 3"]
     kept: Int64[Tensor, " m"]
+    grid_from_camera: Float[Tensor, "3 3"]
 
 
 def cloud_from_depth(
@@ -103,8 +107,13 @@ def sample_points(
     return points_m[index.to(points_m.device)]
 
 
-def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
+def voxelise(
+    points_m: Float[Tensor, "n 3"], voxel_m: float, *, with_sight_axis: bool = False
+) -> Voxels:
     """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
+
+    The grid's axes are the camera's, or with ``with_sight_axis`` turned so that the third points at
+    the cloud's mean, the shortest way.
 
     Votes are cast from the kept points' own coordinates, not from the centres of cells.
 
@@ -118,7 +127,11 @@ def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
         # One NaN would move the mean, and with it every point, into one cell.
         count = int((~points_m.isfinite().all(-1)).sum())
         raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
-    cells = torch.floor((points_m - points_m.mean(0)) / voxel_m).long()
+    mean_m = points_m.mean(0)
+    turn = torch.eye(3).to(points_m)
+    if with_sight_axis and float(mean_m.norm()) > 0:
+        turn = turn_axis_to(mean_m).mT.to(points_m)
+    cells = torch.floor((points_m - mean_m) @ turn.mT / voxel_m).long()
     extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
     if extent > _LARGEST_CELL:
         raise InputError(
@@ -131,4 +144,4 @@ def voxelise(points_m: Float[Tensor, "n 3"], voxel_m: float) -> Voxels:
     order = torch.arange(len(cells), device=cells.device)
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
     kept = first.scatter_reduce_(0, cell, order, "amin").sort().values
-    return Voxels(coordinates=cells[kept], kept=kept)
+    return Voxels(coordinates=cells[kept], kept=kept, grid_from_camera=turn)

@@ -38,6 +38,11 @@ class CloudConfig:
     voxel_m: float = 0.008
     """Side of a voxel; one point is kept in each. The published method takes 0.001."""
 
+    with_sight_axis: bool = True
+    """Turn the cloud so that it lies straight ahead before the grid is laid: what a camera sees of
+    an object at the side of its image is then what it sees in the middle. The published method
+    leaves the cloud as it is."""
+
     max_points: int | None = 1500
     """At most so many points, chosen at random before voxels are made; None: all."""
 

@@ -173,9 +173,17 @@ class GeoPoseNet:
         coordinates = torch.cat([cloud.coordinates for cloud in clouds])
         rows = torch.cat([cloud_of_point[:, None], coordinates], 1).to(self.config.device)
         class_of_point = torch.tensor(numbers)[cloud_of_point].to(self.config.device)
-        points_m = torch.cat([cloud.points_m for cloud in clouds]).to(self.config.device)
-        outputs = self._network.directions(points_m, rows, class_of_point)
-        return list(outputs.float().cpu().split(counts)), time.perf_counter() - start
+        points_m = torch.cat([cloud.points_m @ cloud.grid_from_camera.mT for cloud in clouds])
+        outputs = (
+            self._network.directions(points_m.to(self.config.device), rows, class_of_point)
+            .float()
+            .cpu()
+        )
+        turned = [
+            _in_camera(some, cloud.grid_from_camera)
+            for some, cloud in zip(outputs.split(counts), clouds, strict=True)
+        ]
+        return turned, time.perf_counter() - start
 
     def _pose(
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
@@ -204,6 +212,14 @@ class GeoPoseNet:
                 f"object {name!r}: the weights do not know it; {nearest_name(name, self.objects)}"
             )
         return self._numbers[name]
+
+
+def _in_camera(
+    outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k c"]:
+    """Turn directions back from the network's grid; what stands behind them stays."""
+    directions = outputs[..., :3] @ grid_from_camera
+    return torch.cat([directions, outputs[..., 3:]], -1)
 
 
 def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:

@@ -32,11 +32,13 @@ class Prepared:
         cloud_m: all usable points, what flies about left out.
         points_m: those that the network sees and that vote, one a voxel.
         coordinates: their voxels.
+        grid_from_camera: how the network's grid lies.
     """
 
     cloud_m: Float[Tensor, "n 3"]
     points_m: Float[Tensor, "m 3"]
     coordinates: Int64[Tensor, "m 3"]
+    grid_from_camera: Float[Tensor, "3 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +74,13 @@ def prepare_cloud(
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
-    voxels = voxelise(sampled_m, cloud.voxel_m)
-    return Prepared(cloud_m=kept_m, points_m=sampled_m[voxels.kept], coordinates=voxels.coordinates)
+    voxels = voxelise(sampled_m, cloud.voxel_m, with_sight_axis=cloud.with_sight_axis)
+    return Prepared(
+        cloud_m=kept_m,
+        points_m=sampled_m[voxels.kept],
+        coordinates=voxels.coordinates,
+        grid_from_camera=voxels.grid_from_camera,
+    )
 
 
 def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.raster import rasterize
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.objects.surface import drawn_triangles, hull_points
 from depthpose.pose.types import ObjectModel
 
@@ -66,17 +66,11 @@ def pose_of_middle(shape: Shape, R: Float[Tensor, "3 3"], middle_m: Float[Tensor
     return Rigid(R, middle_m - R @ shape.middle_m)
 
 
-def gaze(
-    direction: Float[Tensor, "3"], roll_rad: float
-) -> Float[Tensor, "3 3"]:  # fmt: skip
+def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
     """Rotation that carries the optical axis to a direction, the shortest way, after a roll."""
-    x, y, z = (direction / direction.norm()).tolist()
-    # Rodrigues, from (0, 0, 1) to (x, y, z); nothing is ever seen near z = -1.
-    k = 1 / (1 + z)
-    rows = [[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, z]]
     cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
-    return torch.tensor(rows, dtype=torch.float64) @ torch.tensor(roll, dtype=torch.float64)
+    return turn_axis_to(direction) @ torch.tensor(roll, dtype=torch.float64)
 
 
 def pixel_to_ray(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

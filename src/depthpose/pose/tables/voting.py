@@ -14,8 +14,8 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines.one_by_one import ransac_one_by_one
-from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points
-from depthpose.pose.config import VotingConfig
+from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
+from depthpose.pose.config import CloudConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network import ResUNet
@@ -84,7 +84,7 @@ def cases_of(
         is_symmetric = not model.symmetries.is_none if is_adds is None else is_adds
         yield VotingCase(
             points_m=points_m,
-            directions=_directions(network, points_m, number, net.weights.cloud.voxel_m),
+            directions=_directions(network, points_m, number, net.weights.cloud),
             model=model,
             truth=view.truth.camera_from_model,
             is_adds=is_symmetric,
@@ -162,10 +162,13 @@ def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
 
 @torch.inference_mode()
 def _directions(
-    network: ResUNet, points_m: Points, number: int, voxel_m: float
+    network: ResUNet, points_m: Points, number: int, cloud: CloudConfig
 ) -> Float[Tensor, "n k 3"]:
-    cells = torch.floor((points_m - points_m.mean(0)) / voxel_m).long()
+    """Ask for the direction of every point, not of one a voxel: those of a voxel share it."""
+    grid = voxelise(points_m, cloud.voxel_m, with_sight_axis=cloud.with_sight_axis)
+    turned_m = (points_m - points_m.mean(0)) @ grid.grid_from_camera.mT
+    cells = torch.floor(turned_m / cloud.voxel_m).long()
     rows = torch.cat([torch.zeros_like(cells[:, :1]), cells], 1)
     voxels = Voxels.from_points(rows, duplicates="mean")
-    outputs = network.forward_class(voxels, number)[..., :3]
+    outputs = network.forward_class(voxels, number)[..., :3] @ grid.grid_from_camera
     return torch.nn.functional.normalize(outputs, dim=-1)

@@ -22,7 +22,7 @@ _TRIES = 20
 
 
 class Cloud(NamedTuple):
-    """One training sample: the points that were kept, and the truth."""
+    """One training sample: the points that were kept, and the truth, in the axes of the grid."""
 
     points_m: Float[Tensor, "n 3"]
     coordinates: Int[Tensor, "n 3"]
@@ -35,7 +35,7 @@ class CloudBatch(NamedTuple):
     """Several clouds, one after the other.
 
     Attributes:
-        points_m: of all clouds, in their cameras' frames.
+        points_m: of all clouds, each in the axes of its grid about its camera.
         coordinates: (cloud, x, y, z) of each point's voxel.
         class_of: class of each cloud.
         R: rotation of each cloud's pose.
@@ -127,16 +127,19 @@ class TrainingClouds:
 def voxelised_cloud(
     sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
 ) -> Cloud:
-    """Take points of a sample and put them on the grid, as an estimate would."""
+    """Take points of a sample and put them on the grid, as an estimate would.
+
+    Cloud and truth are turned with the grid.
+    """
     points = sample_points(sample.input.points_m, config.max_points, generator)
-    voxels = voxelise(points, config.voxel_m)
-    pose = sample.truth.camera_from_model
+    voxels = voxelise(points, config.voxel_m, with_sight_axis=config.with_sight_axis)
+    turn, pose = voxels.grid_from_camera.float(), sample.truth.camera_from_model
     return Cloud(
-        points_m=points[voxels.kept].float(),
+        points_m=points[voxels.kept].float() @ turn.mT,
         coordinates=voxels.coordinates,
         class_number=class_number,
-        R=pose.R.float(),
-        t_m=pose.t_m.float(),
+        R=turn @ pose.R.float(),
+        t_m=turn @ pose.t_m.float(),
     )
 
 
