@@ -119,8 +119,8 @@ def reproduce_voting(weights: str, source: Source, points: Sequence[int], out: P
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "
         "milliseconds: processor time of one thread for all keypoints of a cloud, the median. "
-        "'points': at most so many; 'votes': how many the clouds had on average. Times faster: than the loop. All rows of a "
-        "block saw the same directions."
+        "'points': at most so many; 'votes': how many the clouds had on average. "
+        "Times faster: than the loop. All rows of a block saw the same directions."
     )
     sections = [Section(title="RANSAC against least squares", text=text, rows=rows)]
     return _write(f"{TITLES['3.3']}, {facts['frames']}", sections, out)
