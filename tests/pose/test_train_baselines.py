@@ -22,6 +22,7 @@ from depthpose.pose.resnet import ResNet18
 from depthpose.pose.segmentation import SegmentationConfig, Segmenter
 from depthpose.pose.train import (
     STAGES,
+    CalibrationConfig,
     DepthImageTraining,
     HeldOutConfig,
     ModelsConfig,
@@ -55,7 +56,7 @@ def pointnet_config(folder: Path) -> PointNetTraining:
     network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8), with_transforms=False)
     return PointNetTraining(
         models=ModelsConfig(bop=str(folder)), objects=MADE, network=network, held_out=HELD_OUT,
-        cloud=CloudConfig(max_points=50), loop=LOOP,
+        cloud=CloudConfig(max_points=50), loop=LOOP, calibration=CalibrationConfig(number=0),
     )  # fmt: skip
 
 

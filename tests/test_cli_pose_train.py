@@ -1,0 +1,85 @@
+"""``depthpose pose train`` and ``depthpose data make objects``."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from depthpose.cli import main
+from depthpose.pose.objects import write_part
+from depthpose.pose.weights import read_pose_weights
+
+_TINY = """
+network: {first_kernel: 3, encoder: [4, 4, 8, 8], decoder: [4, 4, 4, 8]}
+cloud: {max_points: 200}
+objects: {views: 2}
+held_out: {number: 2, occlusions: [0.0]}
+calibration: {number: 0}
+loop: {steps: 2, batch_size: 2, device: cpu}
+"""
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_part("connector", tmp_path_factory.mktemp("cad"))
+
+
+def test_a_cad_file_becomes_weights_with_a_card(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, out = tmp_path / "tiny.yaml", tmp_path / "my_part"
+    config.write_text(_TINY)
+    words = ["pose", "train", "--config", str(config), "--out", str(out)]
+    assert main([*words, "--cad", str(part), "--unit", "mm"]) == 0
+    said = capsys.readouterr().out
+    assert f"trained weights: {out / 'pose.safetensors'}" in said
+    assert "| 0 | " in said
+    (model,) = read_pose_weights(out / "pose.safetensors").models
+    assert model.name == "connector"
+    assert model.diameter_m == pytest.approx(0.133, abs=0.001)
+    # The folder is that of this config.
+    again = [*words, "--cad", str(part), "--unit", "mm", "--seed", "5", "--resume"]
+    assert main(again) == 2
+    assert "seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--cad", "part.stl"], "--cad without --unit: no file says its unit; give --unit mm"),
+        ([], "there is no object to learn; name its CAD file (--cad FILE --unit mm)"),
+        (["--data", "lm"], "--data lm: the config learns from no data set"),
+        (
+            ["--what", "segmentation", "--cad", "part.stl", "--unit", "mm"],
+            "--cad has no meaning for 'segmentation', which learns from pictures",
+        ),
+        (["--cad", "nowhere.stl", "--unit", "mm"], "nowhere.stl"),
+    ],
+)
+def test_words_that_do_not_go_together_are_refused(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["pose", "train", *words, "--out", str(tmp_path / "run")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_made_frames_are_a_data_set_that_the_check_accepts(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "made"
+    words = ["data", "make", "objects", "--cad", str(part), "--unit", "mm", "--out", str(out)]
+    assert main([*words, "--number", "2"]) == 0
+    assert main(["data", "check", str(out)]) == 0
+    assert "2 images, 2 instances" in capsys.readouterr().out
+    first = (out / "train" / "000000" / "rgb" / "000000.png").read_bytes()
+    assert main([*words, "--number", "2"]) == 0
+    assert "0 scenes made, 1 were there" in capsys.readouterr().out
+    assert main([*words, "--number", "3"]) == 0
+    assert (out / "train" / "000000" / "rgb" / "000000.png").read_bytes() == first
+    cameras = json.loads((out / "train" / "000000" / "scene_camera.json").read_text())
+    assert sorted(cameras) == ["0", "1", "2"]
+    assert main([*words, "--number", "3", "--sensor", "laser"]) == 2
+    assert "were made with other settings (sensor)" in capsys.readouterr().err
+    assert main([*words, "--number", "0"]) == 2
+    assert "--number 0: at least 1 frame" in capsys.readouterr().err
