@@ -118,6 +118,13 @@ def test_the_real_cat(real: Path) -> None:
     assert 50 < len(voxelise(cloud, 0.008).kept) < 500
 
 
+def test_a_point_that_is_none_does_not_move_all_others() -> None:
+    points_m = torch.rand(50, 3)
+    points_m[3, 0] = torch.nan
+    with pytest.raises(InputError, match="voxelise: 1 points are not finite; leave such"):
+        voxelise(points_m, 0.1)
+
+
 def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
     generator = torch.Generator().manual_seed(2)
     ahead = torch.rand(500, 3, generator=generator) * 0.1
@@ -132,10 +139,3 @@ def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
     same = (first.coordinates[:, None] == second.coordinates[None]).all(-1).any(1)
     assert float(same.float().mean()) > 0.98
     assert torch.equal(voxelise(side, 0.01).grid_from_camera, torch.eye(3))
-
-
-def test_a_point_that_is_none_does_not_move_all_others() -> None:
-    points_m = torch.rand(50, 3)
-    points_m[3, 0] = torch.nan
-    with pytest.raises(InputError, match="voxelise: 1 points are not finite; leave such"):
-        voxelise(points_m, 0.1)

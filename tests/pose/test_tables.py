@@ -9,7 +9,9 @@ from tests.pose.made_object import bracket, tiny_weights
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines.one_by_one import ransac_one_by_one
+from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
 from depthpose.pose.objects import Objects
 from depthpose.pose.tables import (
     LINEMOD,
@@ -122,3 +124,21 @@ def test_votes_stand_at_the_points_of_the_view() -> None:
     assert torch.equal(first.directions, again.directions)
     lengths = first.directions.norm(dim=-1)
     assert bool(((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all())
+
+
+def test_votes_are_those_of_the_estimator() -> None:
+    model = bracket()
+    weights = replace(tiny_weights(model), cloud=CloudConfig(max_points=None))
+    net = GeoPoseNet(weights)
+    view = Objects([model]).view(1)
+    prepared = prepare_cloud(view.input, model, weights.cloud, net.config)
+    assert isinstance(prepared, Prepared)
+    case = next(cases_of(net, [view], 100_000))
+    assert case is not None
+    (outputs,), _ = net._directions([prepared], [0])
+    expected = torch.nn.functional.normalize(outputs[..., :3], dim=-1)
+    # A kept point of each voxel; the estimator drops flying pixels by the same rule.
+    gaps = (case.points_m[None] - prepared.points_m[:, None]).norm(dim=-1)
+    place = gaps.argmin(1)
+    assert float(gaps.amin(1).max()) == 0.0
+    assert torch.allclose(case.directions[place], expected, atol=1e-4)

@@ -118,9 +118,9 @@ def reproduce_voting(weights: str, source: Source, points: Sequence[int], out: P
     write_table(out, rows)
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "
-        "milliseconds: median of the vote for all keypoints of a cloud. 'points': at most so many; "
-        "'votes': how many the clouds had on average. Times faster: than the loop. All rows of a "
-        "block saw the same directions."
+        "milliseconds: processor time of one thread for all keypoints of a cloud, the median. "
+        "'points': at most so many; 'votes': how many the clouds had on average. "
+        "Times faster: than the loop. All rows of a block saw the same directions."
     )
     sections = [Section(title="RANSAC against least squares", text=text, rows=rows)]
     return _write(f"{TITLES['3.3']}, {facts['frames']}", sections, out)
