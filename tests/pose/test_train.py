@@ -71,6 +71,15 @@ def test_a_ticket_gives_the_same_cloud_whenever_it_is_asked_for() -> None:
     assert not torch.equal(one[0].R, one[2].R)
 
 
+def test_the_first_object_may_begin_alone() -> None:
+    clouds = TrainingClouds(_models(), _MADE, None, _CLOUD, 0, first_alone=4)
+    assert [clouds[i].class_number for i in range(8)] == [0, 0, 0, 0, 0, 1, 0, 1]
+    plain = TrainingClouds(_models(), _MADE, None, _CLOUD, 0)
+    assert torch.equal(clouds[5].points_m, plain[5].points_m)
+    # They are different views.
+    assert not torch.equal(clouds[1].R, clouds[2].R)
+
+
 def test_a_batch_keeps_clouds_apart_and_points_in_their_voxels() -> None:
     clouds = TrainingClouds(_models(), _MADE, None, _CLOUD, 0)
     parts = [clouds[i] for i in range(3)]
@@ -312,6 +321,7 @@ def test_the_thesis_config_is_the_published_network() -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
+        (lambda: _training(first_alone=-1), "first_alone is -1; take 0 or more"),
         (FramesConfig, "frames has no folder"),
         (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
         (lambda: HeldOutConfig(number=0), "nothing would be looked at; take 25"),

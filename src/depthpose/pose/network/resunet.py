@@ -128,7 +128,7 @@ class ResUNet(nn.Module):
         answers = features.new_empty(len(features), self.config.keypoints, self.config.components)
         for number in class_of_point.unique().tolist():
             mine = class_of_point == number
-            answers[mine] = self._answer(features[mine], number)
+            answers[mine] = self._answer(features[mine], number).to(answers)
         return answers
 
     def directions(

@@ -63,6 +63,7 @@ class TrainingClouds:
         frames: real frames, and their share.
         cloud: points and voxels.
         seed: of the order of frames and of the choice of points.
+        first_alone: so many made views at the start show the first object.
 
     Raises:
         InputError: neither views nor frames, or frames of other objects.
@@ -75,8 +76,10 @@ class TrainingClouds:
         frames: FramesConfig | None,
         cloud: CloudConfig,
         seed: int,
+        first_alone: int = 0,
     ) -> None:
         self.cloud, self.seed, self.frames = cloud, seed, frames
+        self._first_alone = first_alone
         self.made = Objects(models, made, cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._real = None if frames is None else _open_frames(frames, models, cloud)
@@ -112,10 +115,12 @@ class TrainingClouds:
         return collate_clouds(clouds)
 
     def _sample(self, ticket: int, generator: torch.Generator) -> CloudSample:
+        # Sample i shows object i modulo their number.
+        index = ticket * len(self._class_of) if ticket < self._first_alone else ticket
         if self._real is None or self.frames is None:
-            return self.made.sample(ticket)
+            return self.made.sample(index)
         if float(torch.rand((), generator=generator)) >= self.frames.share:
-            return self.made.sample(ticket)
+            return self.made.sample(index)
         sample = self._real[shuffled_index(ticket, len(self._real), self.seed)]
         angle = 2 * math.pi * float(torch.rand((), generator=generator))
         return _rolled(sample, angle) if self.frames.with_roll else sample

@@ -119,6 +119,10 @@ class PoseTraining:
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
 
+    first_alone: int = 0
+    """Made views at the start that all show the first object. Several objects together take long to
+    get beyond votes for the middle of the cloud; one alone does not, and the others follow it."""
+
     cloud: CloudConfig = field(default_factory=lambda: CloudConfig(max_points=1000))
     """Voxel size, and points of a cloud."""
 
@@ -158,3 +162,8 @@ class PoseTraining:
 
     with_half: bool = False
     """Write the weights in 16 bits."""
+
+    def __post_init__(self) -> None:
+        """Refuse a negative number of views."""
+        if self.first_alone < 0:
+            raise InputError(f"first_alone is {self.first_alone}; take 0 or more made views")

@@ -33,7 +33,14 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.tell)
     config = dataclasses.replace(config, network=with_classes(config.network, models))
-    clouds = TrainingClouds(models, config.objects, config.frames, config.cloud, config.loop.seed)
+    clouds = TrainingClouds(
+        models,
+        config.objects,
+        config.frames,
+        config.cloud,
+        config.loop.seed,
+        first_alone=config.first_alone,
+    )
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
     network = _made(config.network)
     if config.start is not None:
