@@ -143,7 +143,7 @@ class PoseTraining:
     """Of the loss of the confidences, where the network has them."""
 
     adam: AdamConfig = field(
-        default_factory=lambda: AdamConfig(learning_rate=4e-3, schedule="cosine", warmup_steps=50)
+        default_factory=lambda: AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
     )
     """The optimiser."""
 
