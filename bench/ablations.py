@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
 import torch
+from curves import draw_curves
 from view_quality import measure
 
 from depthpose.cli import main as depthpose
@@ -191,30 +191,14 @@ def made_quality(weights: Path) -> dict[str, float]:
 
 def draw_growth(path: Path, rows: list[dict[str, Any]]) -> None:
     """Plot AbsRel on the real pairs over the number of training pairs."""
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    for axis, kind in zip(axes, ("made", "real"), strict=True):
-        for stage, colour in (("apart", "tab:grey"), ("fine-tuned", "tab:blue")):
-            of = [r for r in rows if r["stage"] == stage and r["discriminator"] == "patch"]
-            if kind == "made":
-                points = [(r["made"], r["abs_rel"]) for r in of if r["real"] is None]
-            else:  # none at all: made pairs alone
-                points = [(r["real"] or 0, r["abs_rel"]) for r in of if r["made"] == Arm.made]
-            counts = sorted({count for count, _ in points})
-            values = [[value for count, value in points if count == n] for n in counts]
-            means = [sum(v) / len(v) for v in values]
-            axis.plot(counts, means, "o-", color=colour, label=stage)
-            for count, value in zip(counts, values, strict=True):
-                axis.plot([count] * len(value), value, ".", color=colour)
-        axis.set_xscale("symlog", linthresh=10)
-        axis.set_xlabel(f"{kind} pairs")
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("AbsRel, 25 real pairs")
-    axes[1].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
+    of = [row for row in rows if row["discriminator"] == "patch" and "batch" not in row["stage"]]
+    made, real = [{row["stage"]: list[tuple[float, float]]() for row in of} for _ in range(2)]
+    for row in of:
+        if row["real"] is None:
+            made[row["stage"]].append((row["made"], row["abs_rel"]))
+        if row["made"] == Arm.made:  # without real pairs: the made ones alone
+            real[row["stage"]].append((row["real"] or 0, row["abs_rel"]))
+    draw_curves(path, {"made pairs": made, "real pairs": real}, "AbsRel, 25 real pairs", log=True)
 
 
 def main() -> None:

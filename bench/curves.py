@@ -1,46 +1,49 @@
-"""Curves as a PNG, without a plotting library."""
+"""Plots of the benchmarks, each a PNG."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from PIL import Image, ImageDraw
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-SIZE, LEFT, TOP, BOTTOM = (760, 460), 60, 40, 60
-COLORS = ("#1f5fbf", "#c0392b", "#2e8b57", "#8e44ad", "#d68910", "#555555", "#17a2b8")
+mpl.use("Agg")
 
 Curves = Mapping[str, Sequence[tuple[float, float]]]
 
 
-def draw_curves(path: Path, title: str, x_name: str, curves: Curves) -> None:
-    """Draw curves of shares (0 to 1) over a number, evenly spaced where values are listed.
+def draw_curves(
+    path: Path, axes_of: Mapping[str, Curves], y_name: str, *, log: bool = False
+) -> None:
+    """Draw curves side by side over one vertical axis.
 
     Args:
         path: the PNG.
-        title: above.
-        x_name: below.
-        curves: points (x, y) by name; the legend stands in their order.
+        axes_of: for each plot, by the name of its horizontal axis: points (x, y) by name. Several
+            points at one x stay visible; the line goes through their mean.
+        y_name: of the vertical axis.
+        log: horizontal axes in powers of ten, with a place for 0.
     """
-    picture = Image.new("RGB", SIZE, "white")
-    pen = ImageDraw.Draw(picture)
-    ticks = sorted({x for points in curves.values() for x, _ in points})
-    wide, tall = SIZE[0] - LEFT - 200, SIZE[1] - TOP - BOTTOM
-    place = {x: LEFT + wide * k / max(len(ticks) - 1, 1) for k, x in enumerate(ticks)}
-    for k in range(6):
-        y = TOP + tall * (1 - k / 5)
-        pen.line([(LEFT, y), (LEFT + wide, y)], fill="#dddddd")
-        pen.text((LEFT - 35, y - 6), f"{20 * k} %", fill="black")
-    for x, at in place.items():
-        pen.text((at - 8, TOP + tall + 8), f"{x:g}", fill="black")
-    pen.text((LEFT, 12), title, fill="black")
-    pen.text((LEFT + wide / 2 - 40, SIZE[1] - 28), x_name, fill="black")
-    for k, (name, points) in enumerate(curves.items()):
-        color = COLORS[k % len(COLORS)]
-        line = [(place[x], TOP + tall * (1 - y)) for x, y in sorted(points)]
-        pen.line(line, fill=color, width=3)
-        for x, y in line:
-            pen.ellipse([x - 4, y - 4, x + 4, y + 4], fill=color)
-        pen.rectangle([LEFT + wide + 15, TOP + 20 * k + 3, LEFT + wide + 27, TOP + 20 * k + 9],
-                      fill=color)  # fmt: skip
-        pen.text((LEFT + wide + 32, TOP + 20 * k), name, fill="black")
+    figure = Figure(figsize=(1.5 + 4 * len(axes_of), 3.8), layout="constrained")
+    plots = figure.subplots(1, len(axes_of), sharey=True, squeeze=False)[0]
+    for axes, (x_name, curves) in zip(plots, axes_of.items(), strict=True):
+        _draw(axes, curves)
+        axes.set_xlabel(x_name)
+        axes.grid(alpha=0.3)
+        if log:
+            axes.set_xscale("symlog", linthresh=10)
+    plots[0].set_ylabel(y_name)
+    plots[-1].legend()
     path.parent.mkdir(parents=True, exist_ok=True)
-    picture.save(path)
+    figure.savefig(path, dpi=120)
+
+
+def _draw(axes: Axes, curves: Curves) -> None:
+    for name, points in curves.items():
+        found: dict[float, list[float]] = {}
+        for x, y in sorted(points):
+            found.setdefault(x, []).append(y)
+        means = [sum(values) / len(values) for values in found.values()]
+        (line,) = axes.plot(list(found), means, "o-", label=name)
+        if len(points) > len(found):
+            axes.plot(*zip(*points, strict=True), ".", color=line.get_color())

@@ -171,7 +171,7 @@ def draw(rows: Sequence[Row], out: Path) -> None:
             if row["object"] == "all" and others_usual:
                 curves.setdefault(row["method"], []).append((row[knob], row["success"]))
         if any(len(points) > 1 for points in curves.values()):
-            draw_curves(out / f"{knob}.png", f"ADD(-S) < 10 % over {knob}", what, curves)
+            draw_curves(out / f"{knob}.png", {what: curves}, "share with ADD(-S) < 10 %")
 
 
 def main() -> None:

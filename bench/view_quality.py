@@ -63,11 +63,12 @@ def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
 
 def draw_views(path: Path, nets: dict[str, FakestereoNet], frames: list[StreetFrame]) -> None:
     """Write real right views, a column a street, and below them what each generator draws."""
+    height, width = (min(frame.right.shape[k] for frame in frames) for k in (1, 2))
     columns = []
     for frame in frames:
         drawn = [estimate_street(net, frame).right for net in nets.values()]
         views = [frame.right, *(view for view in drawn if view is not None)]
-        columns.append(torch.cat([view[:, :187, :611] for view in views], 1))
+        columns.append(torch.cat([view[:, :height, :width] for view in views], 1))
     write_image(path, torch.cat(columns, 2))
 
 
