@@ -49,7 +49,7 @@ def test_other_settings_are_refused(made: Path, capsys: pytest.CaptureFixture[st
     words = make(made, 3)
     words[words.index("0.25")] = "0.5"
     assert main(words) == 2
-    assert "other settings (scale)" in capsys.readouterr().err
+    assert "scale = 0.25, but now it is 0.5" in capsys.readouterr().err
     assert main(make(made, 0)) == 2
 
 

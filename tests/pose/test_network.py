@@ -20,6 +20,7 @@ from depthpose.pose.network import (
     read_network,
     resunet_from_published,
     select_class,
+    unfold_norms,
     write_network,
 )
 from depthpose.pose.sparse import Voxels
@@ -157,6 +158,25 @@ def test_folding_the_norms_changes_no_answer(with_bias: bool) -> None:
     voxels = double_voxels(surface())
     torch.testing.assert_close(folded(voxels), network(voxels), rtol=1e-11, atol=1e-11)
     assert fold_norms(folded) is folded
+
+
+def test_a_folded_network_learns_on_with_norms() -> None:
+    voxels = double_voxels(surface())
+    folded = fold_norms(trained(tiny(norm="batch")))
+    network = tiny(norm="batch").double()
+    unfold_norms(folded, network, voxels)
+    torch.testing.assert_close(network(voxels), folded(voxels), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(network.train()(voxels), folded(voxels), rtol=1e-9, atol=1e-9)
+
+
+def test_a_network_of_other_classes_gives_all_but_the_last_layer() -> None:
+    voxels = double_voxels(surface())
+    folded = fold_norms(trained(tiny(norm="batch")))
+    network = tiny(norm="batch", classes=1).double()
+    last = network.final.weight.clone()
+    unfold_norms(folded, network, voxels)
+    torch.testing.assert_close(network.point_features(voxels), folded.point_features(voxels))
+    assert torch.equal(network.final.weight, last)
 
 
 def test_answers_stand_by_point_in_the_order_given() -> None:

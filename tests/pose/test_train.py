@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from tests.pose.made_object import bottle, bracket
 
 from depthpose.core.config import read_config
@@ -17,6 +18,7 @@ from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Sensor
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.objects import Objects, make_frames, write_part
+from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -40,6 +42,7 @@ CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
 _CLOUD = CloudConfig(voxel_m=0.01, max_points=300)
 _MADE = ObjectsConfig(views=2, number=6)
+_FOUR_KEYPOINTS = ModelsConfig(parts=("bracket",), mesh=MeshConfig(keypoints=4))
 
 
 def _models() -> tuple[ObjectModel, ...]:
@@ -243,6 +246,26 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
     assert again.network.classes == 1
     with pytest.raises(InputError, match="holds a training"):
         train_pose(_training(), Run(folder=tmp_path / "run"))
+
+
+def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> None:
+    first = train_pose(_training(), Run(folder=tmp_path / "first"))
+    loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
+    still = AdamConfig(learning_rate=1e-9)
+    parts = ModelsConfig(parts=("bracket", "mug"))
+    config = _training(models=parts, start=str(first), adam=still, loop=loop)
+    then = train_pose(config, Run(folder=tmp_path / "then"))
+    networks = [read_pose_weights(path).network for path in (first, then)]
+    cloud = TrainingClouds(_models(), _MADE, None, _CLOUD, seed=1)[0]
+    voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
+    seen = [n.point_features(voxels).detach() for n in networks if isinstance(n, ResUNet)]
+    assert float((seen[1] - seen[0]).norm() / seen[0].norm()) < 0.1
+    other = dataclasses.replace(_SMALL, keypoints=4)
+    with pytest.raises(InputError, match="trained with keypoints = 8"):
+        train_pose(
+            dataclasses.replace(config, network=other, models=_FOUR_KEYPOINTS),
+            Run(folder=tmp_path / "other"),
+        )
 
 
 def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:

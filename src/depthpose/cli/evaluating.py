@@ -99,7 +99,7 @@ def measure_all(
     for folder in folders:
         result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
         who = _describe(folder)
-        name = {"method": who["method"], "weights": who["weights"]}
+        name = {column: who[column] for column in ("method", "sees", "weights")}
         rows += [who | row for row in result.rows]
         frames += [name | row for row in result.per_frame]
         deciles += [name | row for row in result.deciles]

@@ -91,7 +91,13 @@ def join_published(
 
 
 def _published(row: PublishedRow) -> Row:
-    facts = {"method": row.method, "cap_m": row.cap_m, "protocol": row.protocol, "note": row.note}
+    facts = {
+        "method": row.method,
+        "weights": "",
+        "cap_m": row.cap_m,
+        "protocol": row.protocol,
+        "note": row.note,
+    }
     return _ordered("published", facts | asdict(row.errors))
 
 
@@ -102,6 +108,7 @@ def _difference(ours: Mapping[str, Any], printed: PublishedRow) -> Row:
         protocol = f"{protocol} against {printed.protocol}"
     facts = {
         "method": f"{ours['method']} - {printed.method}",
+        "weights": ours.get("weights", ""),
         "cap_m": printed.cap_m,
         "protocol": protocol,
     }
@@ -109,8 +116,9 @@ def _difference(ours: Mapping[str, Any], printed: PublishedRow) -> Row:
 
 
 def _ordered(source: str, row: Mapping[str, Any]) -> Row:
-    """Columns in one order: what, the seven numbers, how they were measured, the rest."""
-    first = ("method", "cap_m", *_METRICS, "protocol")
+    """Columns in one order: whose, the seven numbers, how they were measured, the rest."""
+    first = ("method", "weights", "cap_m", *_METRICS, "protocol")
+    row = {"weights": ""} | dict(row)
     rest = [name for name in row if name not in first]
     return {"source": source} | {name: row[name] for name in (*first, *rest)}
 

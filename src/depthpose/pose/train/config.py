@@ -134,7 +134,7 @@ class PoseTraining:
     """The network; its classes and keypoints follow from the models."""
 
     start: str | None = None
-    """Weights to begin with."""
+    """Weights to begin with; those of other objects give all but the last layer."""
 
     loss: Literal["mse", "cosine", "l1"] = "mse"
     """How a direction is punished."""

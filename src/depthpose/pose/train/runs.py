@@ -12,7 +12,8 @@ from depthpose.core.files import atomic_write, write_json
 from depthpose.core.loop import train
 from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
-from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
+from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
+from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.baselines_config import DepthImageTraining, PointNetTraining
 from depthpose.pose.train.clouds import TrainingClouds
 from depthpose.pose.train.config import PoseTraining
@@ -26,6 +27,9 @@ from depthpose.pose.train.segmentation_config import SegmentationTraining
 from depthpose.pose.train.task import PoseTask
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import read_pose_weights, write_pose_weights
+
+_LIKE_THOSE_TO_COME = 64
+"""Clouds whose statistics stand in for those that folding took."""
 
 
 def train_pose(config: PoseTraining, run: Run) -> Path:
@@ -44,7 +48,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
     network = _made(config.network)
     if config.start is not None:
-        _start_from(network, config.start)
+        _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
     train(task, clouds, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
@@ -81,14 +85,30 @@ def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
     return PointNet(config) if isinstance(config, PointNetConfig) else ResUNet(config)
 
 
-def _start_from(network: ResUNet | PointNet, start: str) -> None:
-    """Copy weights; batch norm that was folded for use cannot be had back."""
+def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
+    """Copy weights; of other objects, all but the last layer.
+
+    Raises:
+        InputError: a network of another shape.
+    """
     found = read_pose_weights(find_weights(start)).network
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    free = ("classes", "norm", "with_bias") if isinstance(network, ResUNet) else ()
     for knob, value in wanted.items():
-        if given.get(knob) != value:
+        if knob not in free and given.get(knob) != value:
             raise InputError(
                 f"{start}: was trained with {knob} = {given.get(knob)!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
-    network.load_state_dict(found.state_dict())
+    if (
+        isinstance(network, ResUNet)
+        and isinstance(found, ResUNet)
+        and network.config.norm != "none"
+    ):
+        batch = clouds.collate([clouds[ticket] for ticket in range(_LIKE_THOSE_TO_COME)])
+        unfold_norms(found, network, Voxels.from_points(batch.coordinates))
+        return
+    state = found.state_dict()
+    if found.config.classes != network.config.classes:
+        state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
+    network.load_state_dict(state)
