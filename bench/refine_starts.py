@@ -7,7 +7,7 @@ chance, and shifted by a share of the diameter in a direction drawn by chance. R
 where the data are judged by it) below 5 % of the diameter: the truth of some instances was fitted
 to the same depth, and is no better than 1 % or 2 %. Beside it, the same with three starts more,
 each the given one turned by 15 degrees about an axis of the camera: of the four, the one that
-leaves the most points near the surface.
+leaves the most points near the surface (``pose.refine.refine_best``).
 """
 
 import argparse
@@ -25,11 +25,10 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import is_flying
 from depthpose.pose.metrics import add_m, adds_m
-from depthpose.pose.refine import Surface, prepare_surface, refine_pose
+from depthpose.pose.refine import prepare_surface, refine_best, refine_pose
 
 ANGLES_DEG = (0, 5, 10, 15, 20, 30, 45)
 SHIFTS = (0.0, 0.05, 0.1)
-MORE_RAD = math.radians(15)
 RIGHT = 0.05
 
 
@@ -50,19 +49,6 @@ def is_right(case: RealCase, found: Rigid, truth: Rigid) -> bool:
     measure = adds_m if case.is_symmetric else add_m
     points_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // 1000)]
     return float(measure(found, truth, points_m)) < RIGHT * case.model.diameter_m
-
-
-def best_of(points_m: Tensor, start: Rigid, middle_m: Tensor, surface: Surface) -> Rigid:
-    """Refine the start and three turned ones; keep what explains the most points."""
-    eye = torch.eye(3, dtype=torch.float64)
-    starts = [start, *(turned(start, middle_m, axis, MORE_RAD) for axis in eye)]
-    every = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
-    refined = refine_pose(points_m, every, surface)
-    value = refined.inlier_share - refined.residual_m / surface.diameter_m
-    value[0] += 0.02  # as the estimator has it
-    best = int(value.argmax())
-    found = refined.camera_from_model
-    return Rigid(found.R[best], found.t_m[best])
 
 
 def bench(case: RealCase, tries: int) -> list[dict]:
@@ -86,7 +72,7 @@ def bench(case: RealCase, tries: int) -> list[dict]:
                 begin = time.process_time()
                 one = refine_pose(points_m, start, surface).camera_from_model
                 between = time.process_time()
-                four = best_of(points_m, start, middle_m + away_m, surface)
+                four = refine_best(points_m, start, surface).camera_from_model
                 spent_s["one"] += between - begin
                 spent_s["four"] += time.process_time() - between
                 right["one"] += is_right(case, one, truth)

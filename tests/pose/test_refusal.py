@@ -8,7 +8,7 @@ from tests.pose.made_object import bracket, cloud_of, pose_at
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator import calibrate_refusal, risk_of
 from depthpose.pose.estimator.evidence import SIGNALS, hold_of, surface_signals
 from depthpose.pose.metrics import risk_coverage
@@ -93,8 +93,8 @@ def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
         RefusalConfig(**knobs)
     with pytest.raises(InputError, match="batch_voxels 0; take 100 and 1 at least"):
         EstimateConfig(batch_voxels=0)
-    with pytest.raises(InputError, match="icp_starts is 5; take 1, the voted pose, to 4"):
-        EstimateConfig(icp_starts=5)
+    with pytest.raises(InputError, match="starts is 5; take 1, the voted pose, to 4"):
+        IcpConfig(starts=5)
     with pytest.raises(InputError, match=r"rough_rigidity_diameters is 0\.05, but the strict one"):
         EstimateConfig(rough_rigidity_diameters=0.05)
 

@@ -24,7 +24,7 @@ def voting_method(word: Voting) -> VotingMethod:
 
 def predict(
     out: Path,
-    weights: str = "default",
+    weights: str = "parts",
     cloud: Path | None = None,
     unit: Unit = "m",
     depth: Path | None = None,

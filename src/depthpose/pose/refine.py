@@ -1,6 +1,7 @@
 """Point-to-plane ICP: a pose slides onto the cloud along the model's surface."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -10,11 +11,16 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.mesh import sample_surface
+from depthpose.pose.mesh import sample_surface, turn_about
 from depthpose.pose.types import ObjectModel
 
 _CONVERGED = 1e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
+_TURN_RAD = math.radians(15)
+"""By how much further starts are turned."""
+_TRUST = 0.02
+"""Another start must bring so large a share of the points nearer to the surface than the given one
+to be believed: a plane fits many places, and noise would choose among them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,6 +117,51 @@ def refine_pose(
     limit_m = config.end_distance_diameters * surface.diameter_m
     H, _, residual_m, weight = _normal_equations(cloud, pose, surface, limit_m)
     return _result(points_m, pose, (H, residual_m, weight), _middle(cloud))
+
+
+def refine_best(
+    points_m: Float[Tensor, "n 3"],
+    initial: Rigid,
+    surface: Surface,
+    config: IcpConfig | None = None,
+) -> Refined:
+    """Refine one pose, and beside it ones turned from it; give what explains the cloud best.
+
+    All begin with a quarter of the points; the best goes on with all of them.
+
+    Args:
+        points_m: of the object, in the camera frame.
+        initial: ``camera_from_model``.
+        surface: of :func:`prepare_surface`.
+        config: ``starts`` and what :func:`refine_pose` takes.
+
+    Raises:
+        InputError: there is no point, or one is not finite.
+    """
+    config = IcpConfig() if config is None else config
+    if config.starts == 1:
+        return refine_pose(points_m, initial, surface, config)
+    few = replace(config, cloud_points=max(100, config.cloud_points // 4))
+    tried = refine_pose(points_m, _starts(initial, surface, config.starts), surface, few)
+    # Points near the surface count; of equals, the nearer ones.
+    value = tried.inlier_share - tried.residual_m / surface.diameter_m
+    value[0] += _TRUST
+    best = int(value.argmax())
+    found = tried.camera_from_model
+    slow = replace(config, start_distance_diameters=config.end_distance_diameters)
+    return refine_pose(points_m, Rigid(found.R[best], found.t_m[best]), surface, slow)
+
+
+def _starts(pose: Rigid, surface: Surface, count: int) -> Rigid:
+    """Give the pose, and the same turned about axes through the middle of the object."""
+    middle_m = pose.apply(surface.points_m.mean(0)[None])[0]
+    axes = torch.eye(3, dtype=pose.R.dtype)[: count - 1]
+    angle = torch.tensor(_TURN_RAD, dtype=pose.R.dtype)
+    turns = [turn_about(axis, middle_m, angle) @ pose for axis in axes]
+    return Rigid(
+        torch.stack([pose.R, *(turn.R for turn in turns)]),
+        torch.stack([pose.t_m, *(turn.t_m for turn in turns)]),
+    )
 
 
 def _limits(config: IcpConfig, diameter_m: float) -> list[float]:

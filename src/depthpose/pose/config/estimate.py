@@ -57,12 +57,6 @@ class EstimateConfig:
     with_icp: bool = True
     """Whether it does; without, the voted pose is the answer."""
 
-    icp_starts: int = 4
-    """1: ICP begins at the voted pose alone; up to 4: also turned by 15 degrees about axes of the
-    camera, and what explains the cloud best is kept. On real instances turned by 30 degrees and
-    shifted by 5 % of the diameter one start is right for 88 %, four for all, in three times the
-    time (``bench/refine_starts.py``)."""
-
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk judges what comes out: ICP
     mends rough votes, and the risk finds those that it does not mend. A network that had trained
@@ -79,11 +73,6 @@ class EstimateConfig:
 
     def __post_init__(self) -> None:
         """Refuse counts of nothing."""
-        if not 1 <= self.icp_starts <= 4:
-            raise InputError(
-                f"icp_starts is {self.icp_starts}; take 1, the voted pose, to 4: it, and turned "
-                "about each axis of the camera"
-            )
         if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "

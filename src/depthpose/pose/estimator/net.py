@@ -35,8 +35,8 @@ class GeoPoseNet:
 
     Example::
 
-        net = GeoPoseNet.load("default")
-        found = net.estimate(cloud="part.ply", unit="mm", object="part")
+        net = GeoPoseNet.load("parts")
+        found = net.estimate(cloud="mug.ply", unit="mm", object="mug")
         print(found.camera_from_model if found.is_ok else found.reason)
 
     Args:

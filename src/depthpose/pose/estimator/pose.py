@@ -5,7 +5,6 @@ import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -19,8 +18,7 @@ from depthpose.pose.estimator.evidence import (
 )
 from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.refusal import reason_of, risk_of
-from depthpose.pose.mesh import turn_about
-from depthpose.pose.refine import Surface, refine_pose
+from depthpose.pose.refine import Surface, refine_best
 from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import (
     consistent_keypoints,
@@ -32,11 +30,6 @@ from depthpose.pose.voting import (
 
 _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
-_TURN_RAD = math.radians(15)
-"""By how much further starts of ICP are turned."""
-_TRUST = 0.02
-"""Another start must bring so large a share of the points nearer to the surface than the vote's own
-to be believed: a plane fits many places, and noise would choose among them."""
 
 
 class Voted(NamedTuple):
@@ -150,33 +143,15 @@ def _refine(
     signals = vote_signals(vote, fit, surface.diameter_m)
     moved = 0.0
     if config.with_icp:
-        starts = _starts(pose, surface, config.icp_starts)
-        refined = refine_pose(cloud_m.double(), starts, surface, config.icp)
-        # Points near the surface count; of equals, the nearer ones.
-        value = refined.inlier_share - refined.residual_m / surface.diameter_m
-        value[0] += _TRUST
-        best = int(value.argmax())
-        if float(refined.inlier_share[best]) > 0:
+        refined = refine_best(cloud_m.double(), pose, surface, config.icp)
+        if float(refined.inlier_share) > 0:
             found = refined.camera_from_model
-            found = Rigid(found.R[best], found.t_m[best])
             shift_m = found.apply(surface.points_m) - pose.apply(surface.points_m)
             moved = float(shift_m.norm(dim=-1).mean()) / surface.diameter_m
-            pose, covariance = found, refined.covariance[best]
-            residual_m = float(refined.residual_m[best])
+            pose, covariance = found, refined.covariance
+            residual_m = float(refined.residual_m)
     signals |= {"moved": moved, **surface_signals(cloud_m, pose, surface)}
     return _Found(pose, covariance, residual_m, signals)
-
-
-def _starts(pose: Rigid, surface: Surface, count: int) -> Rigid:
-    """Give the voted pose, and the same turned about axes through the middle of the object."""
-    middle_m = pose.apply(surface.points_m.mean(0)[None])[0]
-    axes = torch.eye(3, dtype=pose.R.dtype)[: count - 1]
-    angle = torch.tensor(_TURN_RAD, dtype=pose.R.dtype)
-    turns = [turn_about(axis, middle_m, angle) @ pose for axis in axes]
-    return Rigid(
-        torch.stack([pose.R, *(turn.R for turn in turns)]),
-        torch.stack([pose.t_m, *(turn.t_m for turn in turns)]),
-    )
 
 
 def _answer(
