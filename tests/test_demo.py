@@ -9,7 +9,11 @@ from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.files import read_image, read_map
 from depthpose.demo import make_demo
 from depthpose.demo.motorcycle import read_motorcycle
+from depthpose.demo.pose import show_poses
 from depthpose.depth.disparity import warp_right_to_left
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.objects import PARTS
+from depthpose.pose.predictions import read_predictions
 
 
 def test_the_disparity_carries_one_view_to_the_other() -> None:
@@ -40,9 +44,9 @@ def test_the_street_is_the_same_every_time() -> None:
 def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> None:
     result = make_demo(tmp_path, scale=0.5)
     html = result.page.read_text()
-    assert html.count("data:image/png;base64,") == 3 + 3 + 2 + 2 + 3 + 2 + 2
+    assert html.count("data:image/png;base64,") == 3 + 3 + 2 + 2 + 3 + 2 + 2 + 2
     assert "://" not in html, "the page loads nothing"
-    rows = json.loads((tmp_path / "rows.json").read_text())
+    rows = json.loads((tmp_path / "depths.json").read_text())
     assert [(row["scene"], row["sees"]) for row in rows] == [
         ("street", "one image"),
         ("street", "both images"),
@@ -57,6 +61,24 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert read_image(tmp_path / "street/left.png").shape == (3, camera.height, camera.width)
     depth_m = read_map(tmp_path / "fakestereo-net-compact/street.depth_m.npy")
     assert depth_m.shape == (camera.height, camera.width)
+
+
+def test_the_demo_poses_parts_and_answers_none_wrongly(tmp_path: Path) -> None:
+    rows, (section,) = show_poses(tmp_path, "parts")
+    assert {row["object"] for row in rows} == set(PARTS)
+    answered = [row for row in rows if row["status"] == "ok"]
+    assert len(answered) >= 3
+    assert all(row["of_diameter"] < 0.1 for row in answered)
+    assert all(row["reason"] for row in rows if row not in answered)
+    assert section.pictures
+    found = GeoPoseNet.load("parts").estimate(
+        depth=tmp_path / "part/depth.png",
+        mask=tmp_path / "part/mask.png",
+        camera=tmp_path / "part/camera.json",
+        object="flange",
+    )
+    assert found.is_ok, found.reason
+    assert len(read_predictions(tmp_path / "geo-posenet")) == len(PARTS)
 
 
 def test_the_motorcycle_is_consistent() -> None:

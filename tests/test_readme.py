@@ -50,6 +50,13 @@ def test_the_commands_that_need_no_data_run(demo_folder: Path) -> None:
     assert (demo_folder / "out/predict/left.ply").is_file()
 
 
+def test_the_commands_that_pose_run(demo_folder: Path) -> None:
+    lines = [line for line in commands() if " pose " in line and " out/demo" in line]
+    assert len(lines) == 3
+    assert [run(line) for line in lines] == [0] * len(lines)
+    assert (demo_folder / "out/measured/report.html").is_file()
+
+
 def test_the_python_lines_run_and_end_in_metres(demo_folder: Path) -> None:
     names: dict[str, object] = {}
     for block in blocks("python"):

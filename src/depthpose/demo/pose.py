@@ -4,19 +4,28 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.core.camera import Camera, write_camera
-from depthpose.core.files import read_image, write_cloud, write_image
+from depthpose.core.files import write_cloud, write_depth_png, write_image
 from depthpose.core.report import Picture, Section
-from depthpose.pose.bop import BopFrame, open_bop, write_bop_models, write_bop_scene
+from depthpose.pose.bop import open_bop, write_bop_models, write_bop_scene
+from depthpose.pose.bop.write import write_mask
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.objects import make_frames
 from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
 from depthpose.pose.predictions import Prediction, place_of, write_predictions
+from depthpose.pose.types import ViewInput
 
 FRAMES_SEED = 9
 """No weights were trained on frames of this seed."""
 
+_FRAME = 1
+"""The first that shows every part whole."""
+
+_SAMPLE = "flange"
+"""Whose depth image, mask and camera lie in a folder of their own, for a first command."""
+
+_UNIT_M = 0.0001
 _COLUMNS = ("object", "visible_fraction", "status", "metric", "error_mm", "of_diameter",
             "rotation_deg", "translation_mm", "ms_network", "ms_total", "reason")  # fmt: skip
 _TEXT = (
@@ -41,10 +50,12 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     config = ObjectsConfig(
         seed=FRAMES_SEED, distance_m=(0.6, 0.9), frame_objects=(count, count), frame_clutter=(2, 2)
     )
-    frame = next(make_frames(tuple(models.values()), config, 1))
-    _write_frame(out / "parts", net, frame)
+    frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
+    write_bop_models(out / "parts", net.weights.models)
+    write_bop_scene(out / "parts", "test", 0, [frame])
     dataset = open_bop(out / "parts", cloud=net.weights.cloud)
     views = [dataset.view(instance).input for instance in dataset.instances]
+    _write_sample(out / "part", next(view for view in views if view.object == _SAMPLE))
     found = net.estimate_many(views)
     predictions = [
         Prediction(estimate=estimate, place=place_of(instance))
@@ -53,7 +64,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
     rows = [_row(row) for row in evaluate(dataset, predictions).per_instance]
-    picture = read_image(out / "parts" / "test" / "000000" / "rgb" / "000000.png")
+    assert frame.rgb is not None
+    picture = frame.rgb
     for view, estimate, instance in zip(views, found, dataset.instances, strict=True):
         model, K = models[instance.object_id], instance.K.double()
         if (pose := estimate.camera_from_model) is not None:
@@ -76,15 +88,13 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     ]
 
 
-def _write_frame(folder: Path, net: GeoPoseNet, frame: BopFrame) -> None:
-    """Write the frame as a data set, and the camera as a file of its own."""
-    write_bop_models(folder, net.weights.models)
-    write_bop_scene(folder, "test", 0, [frame])
-    height, width = frame.depth_m.shape
-    write_camera(
-        folder / "camera.json",
-        Camera(width=width, height=height, K=frame.K.double(), depth_unit_m=0.0001),
-    )
+def _write_sample(folder: Path, view: ViewInput) -> None:
+    """Write one view as the files that a user of a sensor has."""
+    height, width = view.mask.shape
+    camera = Camera(width=width, height=height, K=view.K.double(), depth_unit_m=_UNIT_M)
+    write_camera(folder / "camera.json", camera)
+    write_depth_png(folder / "depth.png", view.depth_m, _UNIT_M)
+    write_mask(folder / "mask.png", view.mask)
 
 
 def _row(measured: dict[str, Any]) -> dict[str, Any]:
