@@ -6,8 +6,10 @@
 
 Every view is a rendering of its own, by a seed that no training has. A method is given one view at
 a time, on one thread; of several weights each answers for the objects that it knows. Success is ADD
-(ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. Writes rows.csv,
-rows.json, table.md and a picture of each curve.
+(ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
+is ours with every answer that votes can give, whatever its risk; of these risks.png says how many
+are wrong if only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
+view, and a picture of each curve.
 """
 
 import argparse
@@ -20,6 +22,7 @@ from typing import Any, NamedTuple
 import torch
 from curves import draw_curves
 
+from depthpose.core.checkpoint import find_weights
 from depthpose.core.report import markdown_table, write_table
 from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
@@ -27,15 +30,17 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.metrics import add_m, adds_m, risk_coverage
 from depthpose.pose.objects import Objects
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput, ViewSample
+from depthpose.pose.weights import read_pose_weights
 
 SEED = 0x7E57ED
 POINTS = 1000
 OCCLUSIONS = (0.0, 0.2, 0.4, 0.6)
 NOISES = (0.0, 1.0, 2.0, 4.0, 8.0)
 RESOLUTIONS = (1.0, 0.5, 0.25, 0.125)
+OPEN = "Geo-PoseNet + ICP, nothing refused"
 
 Row = dict[str, Any]
 
@@ -74,14 +79,27 @@ def loaded(
     """Give a method of trained weights, with and without ICP."""
     for with_icp in (False, True):
         nets = [kind.load(file, EstimateConfig(with_icp=with_icp)) for file in files]
-        by_object = {which: net for net in nets for which in net.objects}
+        yield from _of(f"{name} + ICP" if with_icp else name, nets, number)
 
-        def pose(given: ViewInput, known: dict[str, Any] = by_object) -> PoseEstimate:
-            return known[given.object].estimate_many([given])[0]
 
-        if by_object:
-            called = f"{name} + ICP" if with_icp else name
-            yield Method(called, pose, frozenset(by_object), number)
+def without_refusal(files: Sequence[str], number: int) -> Iterator[Method]:
+    """Give ours with every answer, however risky."""
+    found = [read_pose_weights(find_weights(file)) for file in files]
+    open_ = [
+        dataclasses.replace(w, refusal=dataclasses.replace(w.refusal, max_risk=1.0)) for w in found
+    ]
+    yield from _of(OPEN, [GeoPoseNet(weights) for weights in open_], number)
+
+
+def _of(name: str, nets: Sequence[Any], number: int) -> Iterator[Method]:
+    by_object = {which: net for net in nets for which in net.objects}
+    if by_object:
+        yield Method(
+            name,
+            lambda given: by_object[given.object].estimate_many([given])[0],
+            frozenset(by_object),
+            number,
+        )
 
 
 def registration(models: Sequence[ObjectModel], number: int) -> Iterator[Method]:
@@ -106,37 +124,47 @@ def measure(method: Method, view: ViewSample, model: ObjectModel, points_m: torc
     began = time.perf_counter()
     estimate = method.pose(view.input)
     seconds = time.perf_counter() - began
-    error = torch.inf
+    error = None  # where there is no answer
     if estimate.camera_from_model is not None:
         metric = add_m if model.symmetries.is_none else adds_m
         truth = view.truth.camera_from_model
         error = float(metric(estimate.camera_from_model, truth, points_m)) / model.diameter_m
-    return {"object": model.name, "error": error, "refused": not estimate.is_ok, "s": seconds}
+    risk = estimate.risk if estimate.is_ok else None
+    row = {"method": method.name, "object": model.name, "error": error, "risk": risk}
+    return row | {"refused": not estimate.is_ok, "s": seconds}
 
 
 def run_condition(
     methods: Sequence[Method], models: Sequence[ObjectModel], at: Condition, number: int
-) -> Iterator[Row]:
-    """Give a row for each method and object, and one for all objects together."""
+) -> tuple[list[Row], list[Row]]:
+    """Give a row for each method and object and one for all objects together, and all views."""
     objects = made_views(models, at, number)
     surfaces = [sample_surface(model, POINTS)[0] for model in models]
-    found: dict[str, list[Row]] = {method.name: [] for method in methods}
+    found: list[Row] = []
     for index in range(len(objects)):
         view, which = objects.view(index), index % len(models)
         for method in methods:
             if index // len(models) < method.limit and models[which].name in method.objects:
                 row = measure(method, view, models[which], surfaces[which])
-                found[method.name].append(row)
+                found.append({**at._asdict(), **row})
+    summed = []
     for method in methods:
         for name in (*(model.name for model in models), "all"):
-            rows = [r for r in found[method.name] if name in (r["object"], "all")]
-            if rows:
-                yield {**at._asdict(), "method": method.name, "object": name, **shares(rows)}
+            own = [r for r in found if r["method"] == method.name and name in (r["object"], "all")]
+            if own:
+                head = {**at._asdict(), "method": method.name, "object": name}
+                summed.append(head | shares(own))
+    return summed, found
+
+
+def finite(rows: Sequence[Row], name: str) -> torch.Tensor:
+    """Give a column, infinite where there is no answer."""
+    return torch.tensor([torch.inf if row[name] is None else row[name] for row in rows])
 
 
 def shares(rows: Sequence[Row]) -> Row:
     """Count successes, refusals and wrong answers, and take medians."""
-    errors = torch.tensor([row["error"] for row in rows])
+    errors = finite(rows, "error")
     refused = sum(row["refused"] for row in rows)
     right, middle = int((errors < 0.1).sum()), float(errors.median())
     return {
@@ -174,6 +202,19 @@ def draw(rows: Sequence[Row], out: Path) -> None:
             draw_curves(out / f"{knob}.png", {what: curves}, "share with ADD(-S) < 10 %")
 
 
+def draw_risks(views: Sequence[Row], out: Path) -> None:
+    """Draw the share of wrong answers over the share that is answered, for each occlusion."""
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for occlusion in OCCLUSIONS:
+        at = Condition(occlusion=occlusion)._asdict()
+        own = [v for v in views if v["method"] == OPEN and all(v[k] == at[k] for k in at)]
+        if own:
+            found = risk_coverage(finite(own, "risk"), finite(own, "error") < 0.1)
+            curves[f"{occlusion:.0%} hidden"] = list(zip(*(x.tolist() for x in found), strict=True))
+    if curves:
+        draw_curves(out / "risks.png", {"share of views answered": curves}, "wrong among answers")
+
+
 def main() -> None:
     """Run every method under every condition."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -192,17 +233,22 @@ def main() -> None:
     models = list(read_bop_models(words.bop, numbers).values())
     methods = [
         *loaded("Geo-PoseNet", words.ours, words.number, GeoPoseNet),
+        *without_refusal(words.ours, words.number),
         *loaded("PointNet", words.pointnet, words.number, GeoPoseNet),
         *loaded("depth image", words.depth_image, words.number, DepthImageRegressor),
         *registration(models, words.open3d),
     ]
     rows: list[Row] = []
+    views: list[Row] = []
     for at, number in conditions(words):
-        rows += run_condition(methods, models, at, number)
+        summed, every = run_condition(methods, models, at, number)
+        rows, views = rows + summed, views + every
         print(markdown_table([row for row in rows if row["object"] == "all"][-len(methods) :]),
               flush=True)  # fmt: skip
         write_table(words.out, rows)
+        write_table(words.out, views, name="views")
         draw(rows, words.out)
+        draw_risks(views, words.out)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from depthpose.core.report import markdown_table, write_table
 from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -37,7 +37,8 @@ def judge(case: RealCase, estimate: PoseEstimate) -> Row:
     """Errors of one estimate in diameters, and what they mean."""
     row: Row = {
         "metric": "ADD-S" if case.is_symmetric else "ADD",
-        "add": None, "adds": None, "success": False, "refused": not estimate.is_ok, "wrong": False,
+        "add": None, "adds": None, "error_m": None,
+        "success": False, "refused": not estimate.is_ok, "wrong": False,
     }  # fmt: skip
     if estimate.camera_from_model is None:
         return row
@@ -46,7 +47,8 @@ def judge(case: RealCase, estimate: PoseEstimate) -> Row:
     pair = (estimate.camera_from_model, case.sample.truth.camera_from_model, points_m)
     row["add"] = float(add_m(*pair)) / case.model.diameter_m
     row["adds"] = float(adds_m(*pair)) / case.model.diameter_m
-    row["success"] = row["adds" if case.is_symmetric else "add"] < 0.1
+    error = row["adds" if case.is_symmetric else "add"]
+    row["success"], row["error_m"] = error < 0.1, error * case.model.diameter_m
     return row | {"wrong": not row["success"]}
 
 
@@ -104,10 +106,12 @@ def summary(rows: list[Row]) -> list[Row]:
         }
         key = "adds" if group[0]["metric"] == "ADD-S" else "add"
         errors = sorted(float(r[key]) for r in group if r[key] is not None)
+        lost = [torch.inf if r["error_m"] is None else r["error_m"] for r in group]
         seconds = sorted(float(r["seconds"]) for r in group)
         table.append({
             "instance": instance, "method": method, "metric": group[0]["metric"],
             "of": len(group), **shares,
+            "AUC": round(auc(torch.tensor(lost)), 3),
             "median error [diameters]": round(errors[len(errors) // 2], 4) if errors else None,
             "median s": round(seconds[len(seconds) // 2], 3),
         })  # fmt: skip
