@@ -18,6 +18,7 @@ from depthpose.pose.evaluate import (
     of_targets,
     read_any,
 )
+from depthpose.pose.evaluate import errors
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, mspd_px
 from depthpose.pose.predictions import write_bop_results, write_predictions
@@ -96,6 +97,15 @@ def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDatas
     assert statuses == ["missing", "ok", "votes do not meet", "ok", "ok", "ok"]
     assert result.per_instance[0]["error_m"] is None
     assert result.per_instance[2]["reason"] == "the directions are parallel"
+
+
+def test_without_vsd_no_depth_is_decoded(
+    made: BopDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = predictions_of(made, lambda i: i.camera_from_model)
+    monkeypatch.setattr(errors, "read_depth_png", None)
+    result = evaluate(made, answers, EvaluationConfig(with_vsd=False))
+    assert result.rows[0]["ar_mspd"] == pytest.approx(1.0)
 
 
 def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
