@@ -12,13 +12,13 @@ from depthpose.pose.bop import BopDataset, Target
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.evaluate import (
     diameter_of,
+    errors,
     evaluate,
     frames_hash,
     is_adds,
     of_targets,
     read_any,
 )
-from depthpose.pose.evaluate import errors
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, mspd_px
 from depthpose.pose.predictions import write_bop_results, write_predictions
@@ -99,9 +99,7 @@ def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDatas
     assert result.per_instance[2]["reason"] == "the directions are parallel"
 
 
-def test_without_vsd_no_depth_is_decoded(
-    made: BopDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_vsd_no_depth_is_decoded(made: BopDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = predictions_of(made, lambda i: i.camera_from_model)
     monkeypatch.setattr(errors, "read_depth_png", None)
     result = evaluate(made, answers, EvaluationConfig(with_vsd=False))
