@@ -12,7 +12,8 @@ from typing import Any
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.pose_methods import Masks, PoseMethod, match_names
+from depthpose.cli.pose_masks import Masks
+from depthpose.cli.pose_methods import PoseMethod, match_names
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
     list_images,
