@@ -12,7 +12,7 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
 from depthpose.pose.bop import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
-from depthpose.pose.predictions import read_predictions, write_bop_results
+from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
 from depthpose.pose.weights import write_pose_weights
 
 
@@ -145,3 +145,21 @@ def test_weights_and_predictions_of_one_name_are_told_apart(
     twice = [*words, str(out), "--weights", str(files[0]), str(files[0])]
     assert main(twice) == 2
     assert "x/pose: 2 that are given bear this name" in capsys.readouterr().err
+
+
+def test_predictions_whose_record_names_another_data_set_are_refused(
+    made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = tmp_path / "theirs"
+    write_predictions(home, predictions_of(made, lambda i: i.camera_from_model))
+    words = ["pose", "evaluate", "--bop", str(made.folder), "--no-vsd", "--predictions", str(home)]
+    words += ["--out", str(tmp_path / "out")]
+    for settings, said in (
+        ({"dataset": "made", "split": "train"}, "the split 'train', but 'test' is measured"),
+        ({"dataset": "lm", "split": "test"}, "the dataset 'lm', but 'made' is measured; give"),
+    ):
+        (home / "run.json").write_text(json.dumps({"settings": settings}))
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+    (home / "run.json").write_text(json.dumps({"settings": {"dataset": "made", "split": "test"}}))
+    assert main(words) == 0

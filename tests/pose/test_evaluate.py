@@ -21,7 +21,7 @@ from depthpose.pose.evaluate import (
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, mspd_px
-from depthpose.pose.predictions import write_bop_results, write_predictions
+from depthpose.pose.predictions import Place, write_bop_results, write_predictions
 from depthpose.pose.types import Symmetries
 
 
@@ -183,6 +183,17 @@ def test_targets_keep_the_most_visible(made: BopDataset) -> None:
     assert frames_hash(some.instances) != frames_hash(made.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
         of_targets(some, [replace(target, count=3)])
+
+
+def test_an_estimate_that_belongs_elsewhere_answers_for_none(made: BopDataset) -> None:
+    every = predictions_of(made, lambda i: i.camera_from_model)
+    elsewhere = [replace(p, place=Place(9, 9, 99)) for p in every]
+    with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
+        evaluate(made, elsewhere)
+    result = evaluate(made, [*every[:1], *elsewhere[1:]])
+    assert [row["status"] for row in result.per_instance] == ["ok"] + ["missing"] * 5
+    nowhere = [replace(p, place=None) for p in every]
+    assert evaluate(made, nowhere).rows[-1]["success"] == 1.0
 
 
 def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.pose_masks import of_dataset
 from depthpose.cli.pose_names import distinct_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
@@ -46,6 +47,7 @@ def measure_all(
     instances: list[dict[str, Any]] = []
     risk: list[dict[str, Any]] = []
     for path, who in zip(predictions, describe(predictions), strict=True):
+        _refuse_others(path, dataset)
         result = evaluate(dataset, read_any(path), config, _show_progress)
         rows += [who | row for row in result.rows]
         short = {"method": who["method"], "masks": who["masks"]}
@@ -80,6 +82,18 @@ def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
         {**who, "method": names[home, who["method"]]}
         for home, who in zip(homes, found, strict=True)
     ]
+
+
+def _refuse_others(path: Path, dataset: BopDataset) -> None:
+    """Refuse predictions whose record says that they are of another data set or split."""
+    settings = (read_settings(path) if path.is_dir() else None) or {}
+    for what, own in of_dataset(dataset).items():
+        theirs = settings.get(what, own)
+        if theirs != own:
+            raise InputError(
+                f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
+                f"those of this very {what}, or measure that one"
+            )
 
 
 def _describe_one(path: Path) -> dict[str, Any]:
