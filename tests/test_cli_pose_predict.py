@@ -213,3 +213,12 @@ def test_weights_of_other_objects_are_refused(
     words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(tmp_path / "out")]
     assert main(["pose", "predict", *words]) == 2
     assert "but the weights know stranger; give weights of its objects" in capsys.readouterr().err
+
+
+def test_inputs_of_an_earlier_run_stay_in_the_file(weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["pose", "predict", "--object", "bracket", "--weights", str(weights), "--out", str(out)]
+    for name in ("a", "b"):
+        write_cloud(tmp_path / f"{name}.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+        assert main([*words, "--cloud", str(tmp_path / f"{name}.ply")]) == 0
+    assert list(poses_of(out)) == ["a", "b"]

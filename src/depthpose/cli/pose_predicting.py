@@ -245,8 +245,9 @@ def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
 
         wait_for([job.name for job in jobs], is_there)
     known = _known(out)
-    predictions = [known[job.name] for job in jobs]
-    write_predictions(out, predictions)
+    predictions = [known.pop(job.name) for job in jobs]
+    # Inputs of earlier runs stay in the file.
+    write_predictions(out, [*known.values(), *predictions])
     return predictions
 
 
