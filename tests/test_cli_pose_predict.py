@@ -114,8 +114,11 @@ def test_a_folder_of_depth_images_is_done_once(
     assert "holds results made with" in capsys.readouterr().err
 
 
-def test_an_unreadable_image_stops_no_other(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_unreadable_image_stops_no_other_and_is_read_when_mended(
+    weights: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = frames(tmp_path)
     (tmp_path / "depth" / "hidden.png").write_bytes(b"no picture")
@@ -124,6 +127,15 @@ def test_an_unreadable_image_stops_no_other(
     said = capsys.readouterr()
     assert "failed: hidden: cannot be read: " in said.err
     assert "2 inputs: 1 ok" in said.out
+    assert poses_of(out)["hidden"]["status"] == "unreadable"
+    depth_m, _ = view_of(bracket(), TRUTH)
+    write_depth_png(tmp_path / "depth" / "hidden.png", depth_m, 0.001)
+    given = ["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in ("1", "0"):
+        monkeypatch.setenv("RANK", rank)
+        assert main(given) == 0
+    assert poses_of(out)["hidden"]["reason"] == "the mask is empty: no pixel of it is the object"
 
 
 def test_a_data_set_gives_the_csv_and_pictures(

@@ -32,6 +32,7 @@ from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
 from depthpose.pose.predictions import (
     Job,
     Prediction,
+    is_finished,
     is_started,
     predict,
     read_predictions,
@@ -153,7 +154,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
 
     claim_folder(out, settings)
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
-    done = _known(out)
+    done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
         names = predict(estimate_many, left, home, settings, batch)
@@ -167,7 +168,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
 def say_result(predictions: list[Prediction], out: Path) -> int:
     """Print how many were posed and why others were not; give the exit code."""
     reasons: dict[str, int] = defaultdict(int)
-    failed = [p.estimate for p in predictions if p.estimate.reason.startswith(_FAILED)]
+    failed = [p.estimate for p in predictions if not is_finished(p)]
     for prediction in predictions:
         if prediction.estimate not in failed:
             reasons[prediction.estimate.status] += 1
@@ -230,7 +231,9 @@ def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Pose
 
 def _known(out: Path) -> dict[str, Prediction]:
     folders = [out, *sorted(out.glob("part-*"))]
-    return {p.estimate.name: p for f in folders if is_started(f) for p in read_predictions(f)}
+    every = [p for folder in folders if is_started(folder) for p in read_predictions(folder)]
+    # What was read at last counts, whatever another part said of an earlier try.
+    return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
 def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
@@ -255,15 +258,12 @@ def _model(method: PoseMethod, name: str) -> ObjectModel:
     return next(model for model in method.models if model.name == name)
 
 
-_FAILED = "cannot be read: "
-
-
 def _unread(given: Unreadable) -> PoseEstimate:
     return PoseEstimate(
         name=given.name,
         object=given.object,
-        status="unusable input",
-        reason=f"{_FAILED}{given.reason}",
+        status="unreadable",
+        reason=f"cannot be read: {given.reason}",
     )
 
 
