@@ -234,3 +234,21 @@ def test_inputs_of_an_earlier_run_stay_in_the_file(weights: Path, tmp_path: Path
         write_cloud(tmp_path / f"{name}.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
         assert main([*words, "--cloud", str(tmp_path / f"{name}.ply")]) == 0
     assert list(poses_of(out)) == ["a", "b"]
+
+
+def test_two_inputs_of_one_name_are_refused(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.ply", "a.pcd"):
+        write_cloud(tmp_path / "clouds" / name, Cloud(points=cloud_of(bracket(), TRUTH)))
+    words = ["pose", "predict", "--weights", str(weights), "--out", str(tmp_path / "out")]
+    cloud = ["--cloud", str(tmp_path / "clouds"), "--object", "bracket"]
+    assert main([*words, *cloud]) == 2
+    said = "a.pcd and a.ply would both be 'a' in the results; rename one, or move it"
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    views = frames(tmp_path)
+    mask = read_image(tmp_path / "mask" / "seen.png")
+    write_image(tmp_path / "mask" / "seen.jpg", mask)
+    assert main([*words, *views]) == 2
+    assert "seen.jpg and seen.png would both be 'seen'" in capsys.readouterr().err

@@ -74,7 +74,7 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or two of one name.
     """
     if word.is_dir():
         files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
@@ -82,6 +82,7 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
         files = [word]
     if not files:
         raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
+    _refuse_one_name(files)
     return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
 
 
@@ -89,10 +90,12 @@ def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[An
     """Take a depth image and its mask, or those of one name in two folders.
 
     Raises:
-        InputError: there is none, or a depth image has no mask.
+        InputError: there is none, two have one name, or a depth image has no mask.
     """
-    depths = list_images(depth)
-    masks = {path.stem: path for path in list_images(mask)}
+    depths, pictures = list_images(depth), list_images(mask)
+    _refuse_one_name(depths)
+    _refuse_one_name(pictures)
+    masks = {path.stem: path for path in pictures}
     if len(depths) == len(masks) == 1 and not depth.is_dir():
         masks = {depths[0].stem: next(iter(masks.values()))}
     lost = [path.stem for path in depths if path.stem not in masks]
@@ -227,6 +230,18 @@ def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Pose
         model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture
+
+
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )
 
 
 def _known(out: Path) -> dict[str, Prediction]:
