@@ -1,6 +1,7 @@
 """``pose predict`` from the words to the files, with an oracle in place of the network."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ from depthpose.core.files import (
     write_depth_png,
     write_image,
 )
+from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.bop.results import read_results
 from depthpose.pose.metrics import add_m
@@ -252,3 +254,18 @@ def test_two_inputs_of_one_name_are_refused(
     write_image(tmp_path / "mask" / "seen.jpg", mask)
     assert main([*words, *views]) == 2
     assert "seen.jpg and seen.png would both be 'seen'" in capsys.readouterr().err
+
+
+def test_a_cloud_for_weights_that_regress_a_depth_image_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = DepthImageNet(DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8))).eval()
+    path = tmp_path / "depth-image.safetensors"
+    write_pose_weights(path, replace(tiny_weights(bracket()), network=network))
+    write_cloud(tmp_path / "a.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    words = ["pose", "predict", "--weights", str(path), "--out", str(tmp_path / "out")]
+    assert main([*words, "--cloud", str(tmp_path / "a.ply")]) == 2
+    said = capsys.readouterr().err
+    assert "look at depth images; give --depth, --mask and --camera, or weights that vote" in said
+    assert main([*words, *frames(tmp_path)]) == 0
+    assert poses_of(tmp_path / "out")["seen"]["status"] == "ok"

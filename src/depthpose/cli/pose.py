@@ -85,6 +85,11 @@ def predict(
     (method,) = pose_methods([weights], config)
     if bop is not None:
         return _predict_bop(method, (bop, split, masks), out, batch)
+    if cloud is not None and not method.takes_clouds:
+        raise InputError(
+            f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
+            "and --camera, or weights that vote"
+        )
     name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:

@@ -32,10 +32,15 @@ EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethod:
-    """An estimator, what to call it, the objects it knows, and what decides its results."""
+    """An estimator, what to call it, the objects it knows, and what decides its results.
+
+    Attributes:
+        takes_clouds: whether it can do without a depth image.
+    """
 
     name: str
     estimate_many: EstimateMany
+    takes_clouds: bool
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
 
@@ -65,6 +70,7 @@ def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     return PoseMethod(
         name=name + suffix,
         estimate_many=net.estimate_many,
+        takes_clouds=not is_regressor,
         models=found.models,
         settings={**facts, "estimate": config_to_dict(config)},
     )
