@@ -135,7 +135,7 @@ def test_weights_and_predictions_of_one_name_are_told_apart(
     assert "x-pose" in page
     assert "y-pose" in page
     homes = [str(out / "predictions" / "x-pose_truth"), str(tmp_path / "z" / "x-pose_truth")]
-    shutil.copytree(*homes)
+    shutil.copytree(homes[0], homes[1])
     again = [*words, str(tmp_path / "again"), "--predictions", *homes]
     assert main(again) == 0
     methods = {str(row["method"]) for row in rows_of(tmp_path / "again")}
