@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
 from depthpose.pose.bop import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
-from depthpose.pose.predictions import read_predictions, write_bop_results
+from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
 from depthpose.pose.weights import write_pose_weights
 
 
@@ -117,3 +118,48 @@ def test_what_cannot_be_measured_is_refused(
     assert (
         main(["pose", "evaluate", *here, "--weights", str(few), "--objects", "7", "--no-vsd"]) == 0
     )
+
+
+def test_weights_and_predictions_of_one_name_are_told_apart(
+    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / folder / "pose.safetensors" for folder in ("x", "y")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_bytes(weights.read_bytes())
+    words = ["pose", "evaluate", "--bop", str(made.folder), "--no-vsd", "--out"]
+    out = tmp_path / "out"
+    assert main([*words, str(out), "--weights", *map(str, files)]) == 0
+    assert [row["method"] for row in rows_of(out)[::4]] == ["x-pose", "y-pose"]
+    page = (out / "report.html").read_text()
+    assert "x-pose" in page
+    assert "y-pose" in page
+    homes = [str(out / "predictions" / "x-pose_truth"), str(tmp_path / "z" / "x-pose_truth")]
+    shutil.copytree(homes[0], homes[1])
+    again = [*words, str(tmp_path / "again"), "--predictions", *homes]
+    assert main(again) == 0
+    methods = {str(row["method"]) for row in rows_of(tmp_path / "again")}
+    assert methods == {"predictions-x-pose", "z-x-pose"}
+    assert main([*again, homes[0]]) == 2
+    assert "two predictions by 'x-pose', masks 'truth', are given" in capsys.readouterr().err
+    twice = [*words, str(out), "--weights", str(files[0]), str(files[0])]
+    assert main(twice) == 2
+    assert "x/pose: 2 that are given bear this name" in capsys.readouterr().err
+
+
+def test_predictions_whose_record_names_another_data_set_are_refused(
+    made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = tmp_path / "theirs"
+    write_predictions(home, predictions_of(made, lambda i: i.camera_from_model))
+    words = ["pose", "evaluate", "--bop", str(made.folder), "--no-vsd", "--predictions", str(home)]
+    words += ["--out", str(tmp_path / "out")]
+    for settings, said in (
+        ({"dataset": "made", "split": "train"}, "the split 'train', but 'test' is measured"),
+        ({"dataset": "lm", "split": "test"}, "the dataset 'lm', but 'made' is measured; give"),
+    ):
+        (home / "run.json").write_text(json.dumps({"settings": settings}))
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+    (home / "run.json").write_text(json.dumps({"settings": {"dataset": "made", "split": "test"}}))
+    assert main(words) == 0

@@ -1,6 +1,7 @@
 """``pose predict`` from the words to the files, with an oracle in place of the network."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ from depthpose.core.files import (
     write_depth_png,
     write_image,
 )
+from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.bop.results import read_results
 from depthpose.pose.metrics import add_m
@@ -114,8 +116,11 @@ def test_a_folder_of_depth_images_is_done_once(
     assert "holds results made with" in capsys.readouterr().err
 
 
-def test_an_unreadable_image_stops_no_other(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_unreadable_image_stops_no_other_and_is_read_when_mended(
+    weights: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = frames(tmp_path)
     (tmp_path / "depth" / "hidden.png").write_bytes(b"no picture")
@@ -124,6 +129,15 @@ def test_an_unreadable_image_stops_no_other(
     said = capsys.readouterr()
     assert "failed: hidden: cannot be read: " in said.err
     assert "2 inputs: 1 ok" in said.out
+    assert poses_of(out)["hidden"]["status"] == "unreadable"
+    depth_m, _ = view_of(bracket(), TRUTH)
+    write_depth_png(tmp_path / "depth" / "hidden.png", depth_m, 0.001)
+    given = ["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in ("1", "0"):
+        monkeypatch.setenv("RANK", rank)
+        assert main(given) == 0
+    assert poses_of(out)["hidden"]["reason"] == "the mask is empty: no pixel of it is the object"
 
 
 def test_a_data_set_gives_the_csv_and_pictures(
@@ -213,3 +227,45 @@ def test_weights_of_other_objects_are_refused(
     words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(tmp_path / "out")]
     assert main(["pose", "predict", *words]) == 2
     assert "but the weights know stranger; give weights of its objects" in capsys.readouterr().err
+
+
+def test_inputs_of_an_earlier_run_stay_in_the_file(weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["pose", "predict", "--object", "bracket", "--weights", str(weights), "--out", str(out)]
+    for name in ("a", "b"):
+        write_cloud(tmp_path / f"{name}.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+        assert main([*words, "--cloud", str(tmp_path / f"{name}.ply")]) == 0
+    assert list(poses_of(out)) == ["a", "b"]
+
+
+def test_two_inputs_of_one_name_are_refused(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.ply", "a.pcd"):
+        write_cloud(tmp_path / "clouds" / name, Cloud(points=cloud_of(bracket(), TRUTH)))
+    words = ["pose", "predict", "--weights", str(weights), "--out", str(tmp_path / "out")]
+    cloud = ["--cloud", str(tmp_path / "clouds"), "--object", "bracket"]
+    assert main([*words, *cloud]) == 2
+    said = "a.pcd and a.ply would both be 'a' in the results; rename one, or move it"
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    views = frames(tmp_path)
+    mask = read_image(tmp_path / "mask" / "seen.png")
+    write_image(tmp_path / "mask" / "seen.jpg", mask)
+    assert main([*words, *views]) == 2
+    assert "seen.jpg and seen.png would both be 'seen'" in capsys.readouterr().err
+
+
+def test_a_cloud_for_weights_that_regress_a_depth_image_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = DepthImageNet(DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8))).eval()
+    path = tmp_path / "depth-image.safetensors"
+    write_pose_weights(path, replace(tiny_weights(bracket()), network=network))
+    write_cloud(tmp_path / "a.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    words = ["pose", "predict", "--weights", str(path), "--out", str(tmp_path / "out")]
+    assert main([*words, "--cloud", str(tmp_path / "a.ply")]) == 2
+    said = capsys.readouterr().err
+    assert "look at depth images; give --depth, --mask and --camera, or weights that vote" in said
+    assert main([*words, *frames(tmp_path)]) == 0
+    assert poses_of(tmp_path / "out")["seen"]["status"] == "ok"

@@ -9,6 +9,7 @@ from tests.pose.made_frames import draw_frame, made_models, moved, predictions_o
 from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
+from depthpose.cli.pose_views import spread_evenly
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.pose.bop import BopDataset, open_bop
 from depthpose.pose.bop.dataset import read_instance_mask
@@ -68,6 +69,12 @@ def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:
     return json.loads((out / f"{name}.json").read_text())
 
 
+def test_instances_are_chosen_from_all_over() -> None:
+    assert spread_evenly(10, 2) == [2, 7]
+    assert spread_evenly(3, 5) == [0, 1, 2]
+    assert spread_evenly(3, 0) == []
+
+
 def test_table_3_2_walks_over_the_layout_of_the_thesis(
     linemod: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,12 +115,14 @@ def test_table_3_2_walks_over_the_layout_of_the_thesis(
 def test_table_3_1_sets_methods_side_by_side(
     linemod: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = tmp_path / "other.safetensors"
+    # Trainings call their weights alike.
+    other = tmp_path / "other" / weights.name
+    other.parent.mkdir()
     other.write_bytes(weights.read_bytes())
     words = ["--bop", str(linemod.folder), "--out", str(tmp_path / "out"), "--pictures", "0"]
     assert main(["reproduce", "3.1", *words, "--weights", str(weights), str(other)]) == 0
     ours, theirs, difference = rows_of(tmp_path / "out")
-    assert (ours["method"], theirs["method"]) == ("tiny", "other")
+    assert (ours["method"], theirs["method"]) == (f"{weights.parent.name}-tiny", "other-tiny")
     assert difference["mean"] == 0.0
     assert main(["reproduce", "3.1", *words, "--weights", str(weights)]) == 2
     assert "give two weights or more" in capsys.readouterr().err

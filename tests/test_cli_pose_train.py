@@ -80,6 +80,20 @@ def test_made_frames_are_a_data_set_that_the_check_accepts(
     cameras = json.loads((out / "train" / "000000" / "scene_camera.json").read_text())
     assert sorted(cameras) == ["0", "1", "2"]
     assert main([*words, "--number", "3", "--sensor", "laser"]) == 2
-    assert "were made with other settings (sensor)" in capsys.readouterr().err
+    assert "sensor.kinds = ['structured light'], but now it is" in capsys.readouterr().err
     assert main([*words, "--number", "0"]) == 2
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
+
+
+def test_frames_of_an_edited_cad_file_go_to_another_folder(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = tmp_path / part.name, tmp_path / "made"
+    file.write_bytes(part.read_bytes())
+    words = ["data", "make", "objects", "--cad", str(file), "--unit", "mm", "--out", str(out)]
+    assert main([*words, "--number", "1"]) == 0
+    models = sorted((path.name, path.read_bytes()) for path in (out / "models").iterdir())
+    write_part("flange", tmp_path / "other").replace(file)
+    assert main([*words, "--number", "2"]) == 2
+    assert "holds results made with cad.object 1.sha256 = " in capsys.readouterr().err
+    assert models == sorted((path.name, path.read_bytes()) for path in (out / "models").iterdir())

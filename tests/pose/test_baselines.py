@@ -14,7 +14,7 @@ from torch import Tensor
 from depthpose.core.camera import project
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.raster import rasterize
-from depthpose.core.rigid import Rigid, perturb
+from depthpose.core.rigid import Rigid, perturb, turn_axis_to
 from depthpose.pose.baselines import (
     DepthImageConfig,
     DepthImageNet,
@@ -26,7 +26,7 @@ from depthpose.pose.baselines import (
     poses_of,
     rotation_from_6d,
 )
-from depthpose.pose.baselines.crop import EMPTY, DepthCrop, turn_onto
+from depthpose.pose.baselines.crop import EMPTY, DepthCrop
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ViewInput
@@ -72,7 +72,7 @@ def test_an_object_looks_alike_wherever_in_the_image_it_is() -> None:
     """The camera turns about its centre: the crop hardly changes, nor the pose in its frame."""
     pose = Rigid(turned(1), torch.tensor([0.0, 0.0, 0.9]))
     wide = replace(SMALL, crop_px=64, contrast=0.2)
-    turn = turn_onto(torch.tensor([0.2, 0.1, 1.0]))
+    turn = turn_axis_to(torch.tensor([0.2, 0.1, 1.0])).float()
     there = Rigid(turn @ pose.R, turn @ pose.t_m)
     one, two = (cut_depth(view_of(p), wide) for p in (pose, there))
     assert one is not None

@@ -27,6 +27,7 @@ def test_masks_of_every_kind_are_read(tmp_path: Path) -> None:
     mask[1:3, 2:] = 255
     rgba = np.stack([mask, mask, mask, np.full_like(mask, 255)], -1)
     kinds = {"grey": mask, "rgb": np.stack([mask] * 3, -1), "rgba": rgba, "bool": mask > 0}
+    kinds["grey and alpha"] = rgba[:, :, 2:]
     for name, values in kinds.items():
         Image.fromarray(values).save(tmp_path / f"{name}.png")
         assert torch.equal(read_mask(tmp_path / f"{name}.png"), torch.from_numpy(mask > 0)), name

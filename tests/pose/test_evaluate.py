@@ -12,6 +12,7 @@ from depthpose.pose.bop import BopDataset, Target
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.evaluate import (
     diameter_of,
+    errors,
     evaluate,
     frames_hash,
     is_adds,
@@ -20,7 +21,7 @@ from depthpose.pose.evaluate import (
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, mspd_px
-from depthpose.pose.predictions import write_bop_results, write_predictions
+from depthpose.pose.predictions import Place, write_bop_results, write_predictions
 from depthpose.pose.types import Symmetries
 
 
@@ -96,6 +97,13 @@ def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDatas
     assert statuses == ["missing", "ok", "votes do not meet", "ok", "ok", "ok"]
     assert result.per_instance[0]["error_m"] is None
     assert result.per_instance[2]["reason"] == "the directions are parallel"
+
+
+def test_without_vsd_no_depth_is_decoded(made: BopDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = predictions_of(made, lambda i: i.camera_from_model)
+    monkeypatch.setattr(errors, "read_depth_png", None)
+    result = evaluate(made, answers, EvaluationConfig(with_vsd=False))
+    assert result.rows[0]["ar_mspd"] == pytest.approx(1.0)
 
 
 def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
@@ -175,6 +183,17 @@ def test_targets_keep_the_most_visible(made: BopDataset) -> None:
     assert frames_hash(some.instances) != frames_hash(made.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
         of_targets(some, [replace(target, count=3)])
+
+
+def test_an_estimate_that_belongs_elsewhere_answers_for_none(made: BopDataset) -> None:
+    every = predictions_of(made, lambda i: i.camera_from_model)
+    elsewhere = [replace(p, place=Place(9, 9, 99)) for p in every]
+    with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
+        evaluate(made, elsewhere)
+    result = evaluate(made, [*every[:1], *elsewhere[1:]])
+    assert [row["status"] for row in result.per_instance] == ["ok"] + ["missing"] * 5
+    nowhere = [replace(p, place=None) for p in every]
+    assert evaluate(made, nowhere).rows[-1]["success"] == 1.0
 
 
 def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:

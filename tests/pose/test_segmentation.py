@@ -20,6 +20,7 @@ from depthpose.pose.segmentation import (
     Segmenter,
     class_probabilities,
     connected_parts,
+    label_parts,
     read_segmentation,
     write_segmentation,
 )
@@ -119,6 +120,15 @@ def test_the_largest_part_is_kept_or_every_large_one() -> None:
 def test_pixels_that_touch_at_a_corner_are_one_part() -> None:
     mask = painted((8, 8), (0, 0, 2, 2), (2, 2, 4, 4))
     assert len(connected_parts(mask, replace(TINY, with_one_instance=False, min_share=0.0))) == 1
+
+
+def test_parts_have_numbers_and_sizes() -> None:
+    mask = painted((8, 9), (0, 0, 2, 2), (5, 4, 8, 9))
+    label, pixels = label_parts(mask)
+    assert pixels.tolist() == [0, 4, 15]
+    assert torch.equal(label > 0, mask)
+    assert [int((label == k).sum()) for k in (1, 2)] == [4, 15]
+    assert label_parts(mask & False)[1].tolist() == [0]
 
 
 class Painter(FCN):

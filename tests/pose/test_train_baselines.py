@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from tests.pose.made_object import bottle, bracket
 
+from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
@@ -262,8 +263,6 @@ def test_segmentation_learns_colored_boxes_and_says_where(colored: Path, tmp_pat
 
 
 def test_segmentation_starts_from_an_encoder(colored: Path, tmp_path: Path) -> None:
-    from depthpose.core.checkpoint import Checkpoint, save_checkpoint
-
     torch.manual_seed(1)
     encoder = ResNet18(widths=(8, 8, 16, 16))
     path = tmp_path / "encoder.safetensors"
@@ -275,6 +274,34 @@ def test_segmentation_starts_from_an_encoder(colored: Path, tmp_path: Path) -> N
     kept = Segmenter.load(trained).weights.network.encoder.state_dict()
     name = "layer3.0.conv1.weight"
     torch.testing.assert_close(kept[name], encoder.state_dict()[name])
+
+
+@pytest.mark.parametrize("what", ["pointnet", "depth-image", "segmentation"])
+def test_a_resumed_training_ends_as_one_that_nothing_stopped(
+    what: str, models_folder: Path, colored: Path, tmp_path: Path
+) -> None:
+    config = {
+        "pointnet": lambda: pointnet_config(models_folder),
+        "depth-image": lambda: depth_image_config(models_folder),
+        "segmentation": lambda: segmentation_config(colored, 3),
+    }[what]()
+    loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
+    config, train = dataclasses.replace(config, loop=loop), STAGES[what][1]
+    whole = train(config, Run(folder=tmp_path / "whole"))
+
+    class _Stopped(Exception):  # noqa: N818
+        pass
+
+    def stop(progress: object) -> None:
+        if getattr(progress, "step", 0) == 2:
+            raise _Stopped
+
+    with pytest.raises(_Stopped):
+        train(config, Run(folder=tmp_path / "cut", on_step=stop))
+    cut = train(config, Run(folder=tmp_path / "cut", resume=True))
+    one, other = (read_checkpoint(path).state for path in (whole, cut))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_training_images_are_the_same_for_the_same_ticket(colored: Path) -> None:

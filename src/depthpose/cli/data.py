@@ -174,6 +174,7 @@ def make_objects(
     from tqdm import tqdm
 
     from depthpose.core.config import config_to_dict
+    from depthpose.core.run import claim_folder
     from depthpose.pose.bop import write_bop_models, write_bop_scene
     from depthpose.pose.config import ObjectsConfig, SensorConfig
     from depthpose.pose.mesh import read_model
@@ -186,7 +187,8 @@ def make_objects(
         seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number
     )
     said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
-    _keep_settings(out, said | {"cad": [path.name for path in cad], "unit": unit}, "objects.json")
+    files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
+    claim_folder(out, {**said, "cad": files, "unit": unit})
     write_bop_models(out, models)
     scenes = [
         range(first, min(first + _FRAMES_A_SCENE, number))
@@ -206,6 +208,12 @@ def make_objects(
     return 0
 
 
+def _fingerprint(path: Path) -> dict[str, str]:
+    from depthpose.core.checkpoint import file_sha256
+
+    return {"file": path.name, "sha256": file_sha256(path)}
+
+
 def _is_made(split: Path, scene: int, frames: range) -> bool:
     """Whether a scene is there with all of its frames; its last file says so."""
     from depthpose.core.files import read_json
@@ -215,25 +223,6 @@ def _is_made(split: Path, scene: int, frames: range) -> bool:
         return False
     there = read_json(path)
     return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
-
-
-def _keep_settings(out: Path, settings: dict, name: str = "streets.json") -> None:
-    """Refuse to mix frames of different settings in one folder."""
-    from depthpose.core.files import read_json, write_json
-
-    path = out / name
-    if not path.exists():
-        write_json(path, settings)
-        return
-    read = read_json(path)
-    there = read if isinstance(read, dict) else {}
-    # Seeds have drives of their own, so they may share a folder.
-    differing = [key for key in settings if key != "seed" and there.get(key) != settings[key]]
-    if differing:
-        raise InputError(
-            f"{path}: the frames here were made with other settings ({', '.join(differing)}); "
-            "write to another folder, or remove this one"
-        )
 
 
 def _drive(config: "StreetsConfig", day: int) -> str:

@@ -73,7 +73,7 @@ def predict(
         device: cpu, cuda, cuda:1, ...
     """
     from depthpose.cli import pose_predicting as posing
-    from depthpose.cli.pose_methods import pose_method
+    from depthpose.cli.pose_methods import pose_methods
     from depthpose.core.run import claim_names, own_device
 
     _refuse_mixture(cloud, depth, bop)
@@ -82,9 +82,14 @@ def predict(
         with_icp=icp,
         device=own_device(device),
     )
-    method = pose_method(weights, config)
+    (method,) = pose_methods([weights], config)
     if bop is not None:
         return _predict_bop(method, (bop, split, masks), out, batch)
+    if cloud is not None and not method.takes_clouds:
+        raise InputError(
+            f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
+            "and --camera, or weights that vote"
+        )
     name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
@@ -148,7 +153,7 @@ def evaluate(
         icp: refine each pose by ICP.
         device: cpu, cuda, cuda:1, ...
     """
-    from depthpose.cli import pose_evaluating, pose_methods
+    from depthpose.cli import pose_evaluating, pose_masks, pose_methods
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
@@ -156,8 +161,8 @@ def evaluate(
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
     )
-    methods = [pose_methods.pose_method(word, config) for word in weights]
-    shown = [pose_methods.find_masks(word, dataset, out) for word in masks] if methods else []
+    methods = pose_methods.pose_methods(weights, config)
+    shown = pose_masks.find_masks(masks, dataset, out) if methods else []
     paths = [
         pose_methods.predict_all(dataset, method, one, out) for method in methods for one in shown
     ]
@@ -173,13 +178,13 @@ def _predict_bop(
     batch: int,
 ) -> int:
     from depthpose.cli import pose_predicting as posing
-    from depthpose.cli.pose_methods import find_masks
+    from depthpose.cli.pose_masks import find_masks
     from depthpose.pose.bop import open_bop
 
     folder, split, word = given
     dataset = open_bop(folder, split)
     dataset = dataset.of_objects(*posing.known_objects(dataset, method))
-    masks = find_masks(word, dataset, out)
+    (masks,) = find_masks([word], dataset, out)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = posing.bop_jobs(dataset, masks, method)
     predictions = posing.predict_all(method, jobs, out, {**settings, **masks.settings}, batch)

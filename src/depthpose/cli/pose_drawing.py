@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.cli.pose_views import Views
+from depthpose.cli.pose_views import Views, spread_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image, write_image
 from depthpose.core.report import Picture, Section, write_page
@@ -155,8 +155,7 @@ def picture_sections(
     dataset: BopDataset, folders: Sequence[Path], number: int, out: Path
 ) -> list[Section]:
     """Draw some instances of each set of predictions, from the files that were measured."""
-    count = len(dataset)
-    places = sorted({(2 * k + 1) * count // (2 * number) for k in range(number)})
+    places = spread_evenly(len(dataset), number)
     sections: list[Section] = []
     for folder in folders:
         known = {p.estimate.name: p.estimate for p in read_predictions(folder)}

@@ -1,12 +1,16 @@
 """The work behind ``depthpose pose evaluate``."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.pose_masks import of_dataset
+from depthpose.cli.pose_names import distinct_names
 from depthpose.core.checkpoint import file_sha256
+from depthpose.core.errors import InputError
 from depthpose.core.report import Section, markdown_table, write_page, write_table
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.bop import BopDataset, Instance, open_bop, read_targets
@@ -42,8 +46,8 @@ def measure_all(
     rows: list[dict[str, Any]] = []
     instances: list[dict[str, Any]] = []
     risk: list[dict[str, Any]] = []
-    for path in predictions:
-        who = describe(path)
+    for path, who in zip(predictions, describe(predictions), strict=True):
+        _refuse_others(path, dataset)
         result = evaluate(dataset, read_any(path), config, _show_progress)
         rows += [who | row for row in result.rows]
         short = {"method": who["method"], "masks": who["masks"]}
@@ -52,8 +56,47 @@ def measure_all(
     return Evaluation(rows=rows, per_instance=instances, risk=risk)
 
 
-def describe(path: Path) -> dict[str, Any]:
-    """Columns that say whose predictions these are."""
+def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
+    """Give columns that say whose predictions each of these are.
+
+    Methods of one name that lie in two folders are two, and bear the folders' names too.
+
+    Raises:
+        InputError: predictions are given twice.
+    """
+    found = [_describe_one(path) for path in predictions]
+    homes = [path.resolve().parent for path in predictions]
+    rows = Counter(
+        (home, who["method"], who["masks"]) for home, who in zip(homes, found, strict=True)
+    )
+    twice = [key for key, count in rows.items() if count > 1]
+    if twice:
+        home, method, masks = twice[0]
+        raise InputError(
+            f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their rows "
+            "would be one; give one of them, or rename it"
+        )
+    own = list({(home, who["method"]): None for home, who in zip(homes, found, strict=True)})
+    names = dict(zip(own, distinct_names(own), strict=True))
+    return [
+        {**who, "method": names[home, who["method"]]}
+        for home, who in zip(homes, found, strict=True)
+    ]
+
+
+def _refuse_others(path: Path, dataset: BopDataset) -> None:
+    """Refuse predictions whose record says that they are of another data set or split."""
+    settings = (read_settings(path) if path.is_dir() else None) or {}
+    for what, own in of_dataset(dataset).items():
+        theirs = settings.get(what, own)
+        if theirs != own:
+            raise InputError(
+                f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
+                f"those of this very {what}, or measure that one"
+            )
+
+
+def _describe_one(path: Path) -> dict[str, Any]:
     settings = read_settings(path) if path.is_dir() else None
     if settings is None:
         # A file of others is its own fingerprint.

@@ -1,41 +1,27 @@
-"""Methods of the pose room by their words, and the masks that they are shown."""
+"""Methods of the pose room by their words, and what they predict of a data set."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.pose_masks import Masks, of_dataset
+from depthpose.cli.pose_names import distinct_names
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image
-from depthpose.core.run import claim_folder
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.bop import (
-    BopDataset,
-    Detection,
-    Instance,
-    encode_rle,
-    read_detections,
-    write_detections,
-)
-from depthpose.pose.bop.linemod import segnet_mask
+from depthpose.pose.bop import BopDataset
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.predictions import (
-    Job,
-    detection_jobs,
-    instance_jobs,
     predict,
     read_predictions,
     results_name,
     write_bop_results,
 )
-from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
 
@@ -46,30 +32,33 @@ EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethod:
-    """An estimator, what to call it, the objects it knows, and what decides its results."""
+    """An estimator, what to call it, the objects it knows, and what decides its results.
+
+    Attributes:
+        takes_clouds: whether it can do without a depth image.
+    """
 
     name: str
     estimate_many: EstimateMany
+    takes_clouds: bool
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Masks:
-    """Which pixels a method is shown: what to call them, and the jobs that they make."""
+def pose_methods(words: Sequence[str], config: EstimateConfig) -> list[PoseMethod]:
+    """Build the estimators of weights files of any kinds, given by their paths or by names.
 
-    name: str
-    jobs: Callable[[Mapping[int, str]], list[Job[ViewInput]]]
-    settings: Mapping[str, Any]
-
-
-def pose_method(word: str, config: EstimateConfig) -> PoseMethod:
-    """Build the estimator of a weights file of any kind, given by its path or by name.
+    Files of one name are told apart by the folders that they lie in.
 
     Raises:
-        InputError: there are no such weights, or they pose nothing.
+        InputError: there are no such weights, they pose nothing, or are given twice.
     """
-    path = find_weights(word)
+    paths = [find_weights(word) for word in words]
+    names = distinct_names([(path.parent, path.stem) for path in paths])
+    return [_method(path, name, config) for path, name in zip(paths, names, strict=True)]
+
+
+def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     found = read_pose_weights(path)
     say_terms(found.facts)
     is_regressor = isinstance(found.network, DepthImageNet)
@@ -79,31 +68,12 @@ def pose_method(word: str, config: EstimateConfig) -> PoseMethod:
     facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
     facts |= {"weights_sha256": file_sha256(path)}
     return PoseMethod(
-        name=path.stem + suffix,
+        name=name + suffix,
         estimate_many=net.estimate_many,
+        takes_clouds=not is_regressor,
         models=found.models,
         settings={**facts, "estimate": config_to_dict(config)},
     )
-
-
-def find_masks(word: str, dataset: BopDataset, out: Path) -> Masks:
-    """Understand ``truth``, ``predicted``, a file of BOP detections or segmentation weights.
-
-    Raises:
-        InputError: it is none of these, or the data set came without predicted masks.
-    """
-    if word == "truth":
-        return Masks(name="truth", jobs=lambda names: instance_jobs(dataset, names), settings={})
-    if word == "predicted":
-        return _shipped_masks(dataset)
-    if word.endswith(".json"):
-        return _detected_masks(dataset, Path(word), Path(word).stem)
-    path = find_weights(word)
-    found = out / "detections" / f"{path.stem}.json"
-    claim_folder(found.parent / path.stem, {"weights_sha256": file_sha256(path), **_of(dataset)})
-    if not found.is_file():
-        write_detections(found, list(_detect(Segmenter.load(path), dataset)))
-    return _detected_masks(dataset, found, path.stem)
 
 
 def predict_all(
@@ -116,7 +86,7 @@ def predict_all(
     """
     jobs = masks.jobs(match_names(dataset, method.models))
     home = out / "predictions" / f"{method.name}_{masks.name}"
-    settings = {**method.settings, "masks": masks.name, **masks.settings, **_of(dataset)}
+    settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
     written = predict(method.estimate_many, jobs, home, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
@@ -149,56 +119,3 @@ def match_names(dataset: BopDataset, models: Sequence[ObjectModel]) -> dict[int,
             )
         names[number] = model.name
     return names
-
-
-def _of(dataset: BopDataset) -> dict[str, Any]:
-    return {"dataset": dataset.folder.resolve().name, "split": dataset.split}
-
-
-def _shipped_masks(dataset: BopDataset) -> Masks:
-    def mask_of(instance: Instance) -> Path:
-        return segnet_mask(dataset.folder, instance)
-
-    if dataset.layout == "BOP":
-        raise InputError(
-            f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has them; "
-            "give --masks a file of BOP detections, or weights of a segmentation"
-        )
-    return Masks(
-        name="predicted",
-        jobs=lambda names: instance_jobs(dataset, names, mask_of),
-        settings={"masks_of": "segnet_results"},
-    )
-
-
-def _detected_masks(dataset: BopDataset, file: Path, name: str) -> Masks:
-    detections = read_detections(file)
-    return Masks(
-        name=name,
-        jobs=lambda names: detection_jobs(dataset, names, detections),
-        settings={"masks_sha256": file_sha256(file)},
-    )
-
-
-def _detect(segmenter: Segmenter, dataset: BopDataset) -> Iterable[Detection]:
-    """Segment each picture once; what it took is its time."""
-    numbers = {model.name: number for number, model in dataset.objects.items()}
-    ordered = sorted(dataset.instances, key=lambda i: (i.scene_id, i.image_id))
-    images = [next(some) for _, some in groupby(ordered, key=lambda i: (i.scene_id, i.image_id))]
-    for shown in tqdm(images, "segmentation", disable=None, unit=" images"):
-        if shown.rgb is None:
-            raise InputError(f"{shown.name}: has no picture, and a segmentation looks at pictures")
-        start = perf_counter()
-        found = segmenter.segment(read_image(shown.rgb))
-        spent_s = perf_counter() - start
-        for name, masks in found.masks.items():
-            for mask, score in zip(masks, found.scores[name].tolist(), strict=True):
-                if name in numbers:
-                    yield Detection(
-                        scene_id=shown.scene_id,
-                        image_id=shown.image_id,
-                        object_id=numbers[name],
-                        score=score,
-                        segmentation=encode_rle(mask),
-                        seconds=spent_s,
-                    )

@@ -12,7 +12,8 @@ from typing import Any
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.pose_methods import Masks, PoseMethod, match_names
+from depthpose.cli.pose_masks import Masks
+from depthpose.cli.pose_methods import PoseMethod, match_names
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
     list_images,
@@ -31,6 +32,7 @@ from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
 from depthpose.pose.predictions import (
     Job,
     Prediction,
+    is_finished,
     is_started,
     predict,
     read_predictions,
@@ -72,7 +74,7 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or two of one name.
     """
     if word.is_dir():
         files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
@@ -80,6 +82,7 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
         files = [word]
     if not files:
         raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
+    _refuse_one_name(files)
     return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
 
 
@@ -87,10 +90,12 @@ def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[An
     """Take a depth image and its mask, or those of one name in two folders.
 
     Raises:
-        InputError: there is none, or a depth image has no mask.
+        InputError: there is none, two have one name, or a depth image has no mask.
     """
-    depths = list_images(depth)
-    masks = {path.stem: path for path in list_images(mask)}
+    depths, pictures = list_images(depth), list_images(mask)
+    _refuse_one_name(depths)
+    _refuse_one_name(pictures)
+    masks = {path.stem: path for path in pictures}
     if len(depths) == len(masks) == 1 and not depth.is_dir():
         masks = {depths[0].stem: next(iter(masks.values()))}
     lost = [path.stem for path in depths if path.stem not in masks]
@@ -152,7 +157,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
 
     claim_folder(out, settings)
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
-    done = _known(out)
+    done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
         names = predict(estimate_many, left, home, settings, batch)
@@ -166,7 +171,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
 def say_result(predictions: list[Prediction], out: Path) -> int:
     """Print how many were posed and why others were not; give the exit code."""
     reasons: dict[str, int] = defaultdict(int)
-    failed = [p.estimate for p in predictions if p.estimate.reason.startswith(_FAILED)]
+    failed = [p.estimate for p in predictions if not is_finished(p)]
     for prediction in predictions:
         if prediction.estimate not in failed:
             reasons[prediction.estimate.status] += 1
@@ -227,9 +232,23 @@ def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Pose
     return picture
 
 
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )
+
+
 def _known(out: Path) -> dict[str, Prediction]:
     folders = [out, *sorted(out.glob("part-*"))]
-    return {p.estimate.name: p for f in folders if is_started(f) for p in read_predictions(f)}
+    every = [p for folder in folders if is_started(folder) for p in read_predictions(folder)]
+    # What was read at last counts, whatever another part said of an earlier try.
+    return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
 def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
@@ -244,8 +263,9 @@ def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
 
         wait_for([job.name for job in jobs], is_there)
     known = _known(out)
-    predictions = [known[job.name] for job in jobs]
-    write_predictions(out, predictions)
+    predictions = [known.pop(job.name) for job in jobs]
+    # Inputs of earlier runs stay in the file.
+    write_predictions(out, [*known.values(), *predictions])
     return predictions
 
 
@@ -253,15 +273,12 @@ def _model(method: PoseMethod, name: str) -> ObjectModel:
     return next(model for model in method.models if model.name == name)
 
 
-_FAILED = "cannot be read: "
-
-
 def _unread(given: Unreadable) -> PoseEstimate:
     return PoseEstimate(
         name=given.name,
         object=given.object,
-        status="unusable input",
-        reason=f"{_FAILED}{given.reason}",
+        status="unreadable",
+        reason=f"cannot be read: {given.reason}",
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import pose_evaluating, pose_methods
+from depthpose.cli import pose_evaluating, pose_masks, pose_methods
 from depthpose.cli.pose_drawing import picture_sections
 from depthpose.cli.pose_views import Source, open_views
 from depthpose.core.checkpoint import file_sha256, find_weights
@@ -86,9 +86,9 @@ def reproduce_by_object(
 ) -> int:
     """Predict what is missing, measure, set beside the print, and write everything."""
     dataset = order.dataset
-    methods = [pose_methods.pose_method(word, rule.estimate) for word in weights]
+    methods = pose_methods.pose_methods(weights, rule.estimate)
     claim_folder(out, _settings(order, methods, rule))
-    shown = [pose_methods.find_masks(word, dataset, out) for word in masks] if methods else []
+    shown = pose_masks.find_masks(masks, dataset, out) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], rule.evaluation)
     numbers = {model.name: number for number, model in dataset.objects.items()}

@@ -98,12 +98,19 @@ def open_views(net: GeoPoseNet, source: Source, number: int | None = None) -> Vi
         "frames_sha256": frames_hash(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
-        count = len(dataset)
-        kept = [(2 * k + 1) * count // (2 * number) for k in range(number)]
-        dataset = replace(dataset, instances=[dataset.instances[i] for i in kept])
+        kept = [dataset.instances[i] for i in spread_evenly(len(dataset), number)]
+        dataset = replace(dataset, instances=kept)
     return Views(
         samples=list(_views_of(dataset, net)), instances=list(dataset.instances), facts=facts
     )
+
+
+def spread_evenly(total: int, number: int) -> list[int]:
+    """Choose so many of 0 .. total - 1, the middle of each equal part; all where there are fewer.
+
+    None where ``number`` is 0.
+    """
+    return sorted({(2 * k + 1) * total // (2 * number) for k in range(number)})
 
 
 def _views_of(dataset: BopDataset, net: GeoPoseNet) -> Iterator[ViewSample]:

@@ -154,6 +154,7 @@ def refine_best(
 
 def _starts(pose: Rigid, surface: Surface, count: int) -> Rigid:
     """Give the pose, and the same turned about axes through the middle of the object."""
+    pose = Rigid(pose.R.double(), pose.t_m.double())
     middle_m = pose.apply(surface.points_m.mean(0)[None])[0]
     axes = torch.eye(3, dtype=pose.R.dtype)[: count - 1]
     angle = torch.tensor(_TURN_RAD, dtype=pose.R.dtype)

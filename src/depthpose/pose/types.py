@@ -11,6 +11,7 @@ from depthpose.core.rigid import Rigid
 
 Status = Literal[
     "ok",
+    "unreadable",
     "unusable input",
     "too few points",
     "votes do not meet",
@@ -18,7 +19,8 @@ Status = Literal[
     "not observable",
     "doubtful",
 ]
-"""An answer, or why there is none. Doubtful: nothing plainly wrong, but the risk is too great."""
+"""An answer, or why there is none. Unreadable: no input came; it is tried again by the next run.
+Doubtful: nothing plainly wrong, but the risk is too great."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

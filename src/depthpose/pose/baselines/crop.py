@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.baselines.config import DepthImageConfig
 from depthpose.pose.types import ViewInput
 
@@ -60,7 +60,7 @@ def cut_depth(
     ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
     return DepthCrop(
         image=_window(relief, middle_px, side_px, config.crop_px)[None],
-        R=turn_onto(ray),
+        R=turn_axis_to(ray).to(ray),
         middle_m=ray * mean_m,
         side_m=side_px * mean_m / K[0, 0],
     )
@@ -70,14 +70,6 @@ def camera_from_crop(crop: DepthCrop, R: Float[Tensor, "b 3 3"], offset: Tensor)
     """Carry a pose from the crop's frame, offsets in its widths, to that of the camera."""
     shift = crop.side_m[:, None] * offset
     return Rigid(crop.R @ R, crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1))
-
-
-def turn_onto(ray: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Turn the optical axis onto a ray in front of the camera, the shortest way (Rodrigues)."""
-    x, y, z = (ray / ray.norm()).tolist()
-    k = 1 / (1 + z)
-    rows = [[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, z]]
-    return torch.tensor(rows).to(ray)
 
 
 def _window(

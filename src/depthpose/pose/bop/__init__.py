@@ -11,6 +11,7 @@ from depthpose.pose.bop.detections import encode_rle as encode_rle
 from depthpose.pose.bop.detections import read_detections as read_detections
 from depthpose.pose.bop.detections import write_detections as write_detections
 from depthpose.pose.bop.frames import Instance as Instance
+from depthpose.pose.bop.models import object_names as object_names
 from depthpose.pose.bop.results import BopResult as BopResult
 from depthpose.pose.bop.results import read_results as read_results
 from depthpose.pose.bop.results import write_results as write_results

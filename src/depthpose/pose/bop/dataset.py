@@ -203,7 +203,7 @@ def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
     """
     with opened_image(path) as image:
         values = np.asarray(image.convert("RGB") if image.mode == "P" else image)
-        if values.ndim == 3 and values.shape[2] == 4:
-            values = values[:, :, :3]  # opaque black is not the object
+        if values.ndim == 3 and values.shape[2] in (2, 4):
+            values = values[:, :, :-1]  # opaque black is not the object
     is_object = values != 0
     return torch.from_numpy(is_object if is_object.ndim == 2 else is_object.any(-1))

@@ -83,6 +83,16 @@ def read_bop_models(
     return models
 
 
+def object_names(folder: Path) -> dict[int, str]:
+    """Say what samples call each object that ``models_info`` lists.
+
+    Raises:
+        InputError: there is no folder of models, or the file is damaged.
+    """
+    infos = read_models_info(models_folder(folder))
+    return {number: object_name(number, info) for number, info in infos.items()}
+
+
 def object_name(number: int, info: dict[str, Any]) -> str:
     """Say what samples call an object."""
     return str(info.get("name", f"obj_{number:06d}"))

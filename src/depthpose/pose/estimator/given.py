@@ -1,12 +1,12 @@
 """What a caller hands over, files, arrays or tensors, to the room's own inputs."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped
-from scipy import ndimage
 from torch import Tensor
 
 from depthpose.core.camera import Camera, check_image_matches_camera, read_camera
@@ -15,6 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
 from depthpose.pose.bop import read_mask
 from depthpose.pose.config import METRES, Unit
+from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput
 
 AnyArray = str | Path | np.ndarray | Tensor
@@ -67,12 +68,10 @@ def split_instances(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
 
     Pixels that touch at a corner are connected. A piece below a fifth of the largest is a crumb.
     """
-    found: Any = ndimage.label(mask.cpu().numpy(), structure=np.ones((3, 3)))
-    labels, count = torch.from_numpy(found[0]), int(found[1])
-    sizes = torch.bincount(labels.flatten(), minlength=count + 1)[1:]
-    order = sizes.argsort(descending=True, stable=True)
-    least = _SMALLEST_INSTANCE * int(sizes.max()) if count else 0
-    return [labels == int(k) + 1 for k in order if int(sizes[k]) >= least]
+    label, pixels = label_parts(mask)
+    order = pixels.argsort(descending=True, stable=True)
+    least = max(1, math.ceil(_SMALLEST_INSTANCE * int(pixels.max())))
+    return [label == k for k in order if int(pixels[k]) >= least]
 
 
 def _depth(depth: AnyArray, unit_m: float | None, name: str) -> Float[Tensor, "h w"]:

@@ -11,15 +11,15 @@ from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.refine import Surface, prepare_surface, refine_pose
+from depthpose.pose.refine import Surface, prepare_surface, refine_best
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 
 class DepthImageRegressor:
-    """The baseline as an estimator. It refuses nothing but views without the object.
+    """The baseline as an estimator. It refuses nothing but views with too little of the object.
 
     Args:
         weights: of kind ``depth-image``.
@@ -107,14 +107,18 @@ class DepthImageRegressor:
         points_m = cloud_from_depth(
             given.depth_m, given.mask, given.K, model.diameter_m, self.weights.cloud
         ).float()
+        if (few := refusal_of(points_m, self.weights.cloud)) is not None:
+            return replace(found, status="too few points", reason=few, camera_from_model=None)
         assert found.camera_from_model is not None
-        refined = refine_pose(
+        refined = refine_best(
             points_m, found.camera_from_model, self._surfaces[number], self.config.icp
         )
+        found = replace(found, seconds={**found.seconds, "icp": time.perf_counter() - start})
+        if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
+            return found
         return replace(
             found,
             camera_from_model=refined.camera_from_model,
             covariance=refined.covariance,
             residual_m=float(refined.residual_m),
-            seconds={**found.seconds, "icp": time.perf_counter() - start},
         )

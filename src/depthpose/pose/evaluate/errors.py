@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import project
-from depthpose.core.files import read_depth_png
+from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.raster import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import Instance
@@ -90,8 +90,7 @@ def measure(
         return dict.fromkeys(names, math.inf), None if ruler.vsd_delta_m is None else nothing
     true, points = instance.camera_from_model, ruler.model.vertices_m
     adds = float(adds_m(estimated, true, points))
-    depth_m = _read_depth(instance.depth, instance.depth_unit_m)
-    scale = BOP_WIDTH_PX / depth_m.shape[1]
+    scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
     rotation_deg, translation = _nearest_copy(estimated, true, ruler.symmetries)
     row = {
         "error_m": adds if ruler.is_adds else float(add_m(estimated, true, points)),
@@ -103,7 +102,7 @@ def measure(
     }
     if ruler.vsd_delta_m is None:
         return row, None
-    return row, _vsd(estimated, instance, ruler, depth_m)
+    return row, _vsd(estimated, instance, ruler)
 
 
 def _nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> tuple[float, float]:
@@ -116,10 +115,9 @@ def _nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> tuple[flo
     return math.degrees(float(turned[nearest])), float(moved)
 
 
-def _vsd(
-    estimated: Rigid, instance: Instance, ruler: Ruler, depth_m: Float[Tensor, "h w"]
-) -> Float[Tensor, "10"]:
+def _vsd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Float[Tensor, "10"]:
     assert ruler.vsd_delta_m is not None
+    depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)
     left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
     # What neither pose covers has no say: only the window about both is drawn.

@@ -22,25 +22,32 @@ def match(
 ) -> dict[str, PoseEstimate]:
     """Give each instance the estimate that answers for it, by the instance's name.
 
-    An estimate that bears an instance's name was made from its very mask, and is its own. Of the
+    An estimate that bears an instance's name was made from its very mask, and is its own, unless
+    it says that it belongs elsewhere: in another data set names may be the same. Of the
     others an image with n instances of an object takes the n of the highest scores, as BOP does,
     and sets them against the instances so that the sum of ADD-S, at most a diameter each, is least.
     BOP does so anew for each error and threshold. Refusals go to instances that are left over.
     """
-    names = {instance.name for instance in instances}
-    found = {p.estimate.name: p.estimate for p in predictions if p.estimate.name in names}
+    places = {instance.name: place_of(instance) for instance in instances}
+    own = [p for p in predictions if _is_own(p, places)]
+    found = {p.estimate.name: p.estimate for p in own}
     waiting: dict[Place, list[Instance]] = defaultdict(list)
     for instance in instances:
         if instance.name not in found:
             waiting[place_of(instance)].append(instance)
     offered: dict[Place, list[PoseEstimate]] = defaultdict(list)
     for prediction in predictions:
-        if prediction.estimate.name not in names and prediction.place in waiting:
+        if not _is_own(prediction, places) and prediction.place in waiting:
             assert prediction.place is not None
             offered[prediction.place].append(prediction.estimate)
     for place, estimates in offered.items():
         found |= _assign(waiting[place], estimates, models[place.object_id])
     return found
+
+
+def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
+    place = places.get(prediction.estimate.name)
+    return place is not None and prediction.place in (None, place)
 
 
 def _assign(

@@ -8,6 +8,7 @@ from depthpose.pose.predictions.records import POSES as POSES
 from depthpose.pose.predictions.records import STAGES as STAGES
 from depthpose.pose.predictions.records import Place as Place
 from depthpose.pose.predictions.records import Prediction as Prediction
+from depthpose.pose.predictions.records import is_finished as is_finished
 from depthpose.pose.predictions.records import is_started as is_started
 from depthpose.pose.predictions.records import place_of as place_of
 from depthpose.pose.predictions.records import read_predictions as read_predictions

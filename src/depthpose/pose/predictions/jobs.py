@@ -13,6 +13,7 @@ from depthpose.pose.bop import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.predictions.records import (
     Place,
     Prediction,
+    is_finished,
     is_started,
     place_of,
     read_predictions,
@@ -51,6 +52,8 @@ def predict(
 ) -> Generator[str, None, None]:
     """Estimate what is not finished yet, and yield each name; ``poses.json`` grows as it goes.
 
+    What was unreadable is tried again.
+
     What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
 
     Args:
@@ -63,9 +66,10 @@ def predict(
     claim_folder(folder, settings)
     wanted = list(jobs)
     done = {p.estimate.name: p for p in read_predictions(folder)} if is_started(folder) else {}
-    yield from (job.name for job in wanted if job.name in done)
-    left = [job for job in wanted if job.name not in done]
-    saved = len(done)
+    finished = {name for name, prediction in done.items() if is_finished(prediction)}
+    yield from (job.name for job in wanted if job.name in finished)
+    left = [job for job in wanted if job.name not in finished]
+    unsaved = 0
     try:
         for start in range(0, len(left), batch):
             some = left[start : start + batch]
@@ -76,12 +80,13 @@ def predict(
                 done[job.name] = Prediction(
                     estimate=replace(estimate, seconds=spent), place=job.place
                 )
+                unsaved += 1
                 yield job.name
-            if len(done) >= saved + _SAVE_EVERY:
+            if unsaved >= _SAVE_EVERY:
                 write_predictions(folder, done.values())
-                saved = len(done)
+                unsaved = 0
     finally:
-        if len(done) > saved or not is_started(folder):
+        if unsaved or not is_started(folder):
             write_predictions(folder, done.values())
 
 

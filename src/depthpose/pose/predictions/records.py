@@ -55,6 +55,11 @@ def is_started(folder: Path) -> bool:
     return (folder / POSES).is_file()
 
 
+def is_finished(prediction: Prediction) -> bool:
+    """Whether a rerun need not estimate it: an input that was unreadable may be mended."""
+    return prediction.estimate.status != "unreadable"
+
+
 def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
     """Write ``poses.json``: a list of estimates and refusals, in metres, radians and seconds.
 

@@ -7,6 +7,7 @@ from depthpose.pose.segmentation.segmenter import Segmentation as Segmentation
 from depthpose.pose.segmentation.segmenter import Segmenter as Segmenter
 from depthpose.pose.segmentation.segmenter import class_probabilities as class_probabilities
 from depthpose.pose.segmentation.segmenter import connected_parts as connected_parts
+from depthpose.pose.segmentation.segmenter import label_parts as label_parts
 from depthpose.pose.segmentation.segmenter import resize_image as resize_image
 from depthpose.pose.segmentation.weights import KIND as KIND
 from depthpose.pose.segmentation.weights import SegmentationWeights as SegmentationWeights

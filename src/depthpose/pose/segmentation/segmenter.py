@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from scipy import ndimage
 from torch import Tensor
 
@@ -111,17 +111,28 @@ def resize_image(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 rows c
 
 
 def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:
-    """Split a mask into parts whose pixels touch, at corners too; those that are large enough.
+    """Split a mask into parts whose pixels touch; those that are large enough.
 
     With one instance an image, the largest alone.
     """
-    numbered = np.empty(mask.shape, np.int32)
-    ndimage.label(mask.numpy(), structure=[[1] * 3] * 3, output=numbered)
-    label = torch.from_numpy(numbered).long()
-    pixels = torch.bincount(label.flatten())
-    pixels[0] = 0
+    label, pixels = label_parts(mask)
     least = max(1, math.ceil(config.min_share * mask.numel()))
     large = (pixels >= least).nonzero()[:, 0]
     if config.with_one_instance and len(large):
         large = pixels.argmax()[None]
     return label == large[:, None, None]
+
+
+def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[Tensor, " n"]]:
+    """Number the parts of a mask whose pixels touch, at corners too.
+
+    Returns:
+        The number of each pixel's part, 0 beside the mask; and by number how many pixels a part
+        has, 0 for number 0.
+    """
+    numbered = np.empty(mask.shape, np.int32)
+    ndimage.label(mask.cpu().numpy(), structure=[[1] * 3] * 3, output=numbered)
+    label = torch.from_numpy(numbered).long()
+    pixels = torch.bincount(label.flatten(), minlength=1)
+    pixels[0] = 0
+    return label, pixels

@@ -1,0 +1,61 @@
+"""The regressed depth image as an estimator: its refinement, and what it refuses."""
+
+import math
+
+import pytest
+import torch
+from tests.pose.made_object import FACTS, K, bracket, pose_at, view_of
+
+from depthpose.core.rigid import Rigid, perturb
+from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
+from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.estimator import DepthImageRegressor, regression
+from depthpose.pose.metrics import add_m
+from depthpose.pose.types import ViewInput
+from depthpose.pose.weights import PoseWeights
+
+
+@pytest.fixture(scope="module")
+def weights() -> PoseWeights:
+    torch.manual_seed(0)
+    config = DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8))
+    network = DepthImageNet(config).eval()
+    return PoseWeights(
+        network=network, models=(bracket(),), cloud=CloudConfig(), refusal=RefusalConfig(),
+        facts=FACTS,
+    )  # fmt: skip
+
+
+def seen() -> ViewInput:
+    depth_m, mask = view_of(bracket(), pose_at())
+    return ViewInput(name="seen", depth_m=depth_m, mask=mask, K=K, object="bracket")
+
+
+def test_the_refinement_is_ours_from_several_starts(
+    weights: PoseWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So far turned that ICP from this start alone ends elsewhere.
+    start = perturb(pose_at(), torch.tensor([math.radians(60), 0.0, 0.0, 0.0, 0.0, 0.0]))
+    wrong = Rigid(start.R[None], pose_at().t_m[None])
+    monkeypatch.setattr(regression, "poses_of", lambda *_: wrong)
+    errors_m: list[float] = []
+    for starts in (4, 1):
+        config = EstimateConfig(icp=IcpConfig(starts=starts))
+        (found,) = DepthImageRegressor(weights, config).estimate_many([seen()])
+        assert found.camera_from_model is not None
+        error_m = add_m(found.camera_from_model, pose_at(), bracket().vertices_m)
+        errors_m.append(float(error_m))
+    assert errors_m[0] < 0.0005
+    assert errors_m[1] > 0.01
+
+
+def test_blobs_far_from_their_middle_are_refused_and_stop_no_other(weights: PoseWeights) -> None:
+    view = seen()
+    mask = torch.zeros_like(view.mask)
+    mask[:20, :20] = mask[:20, -20:] = mask[-20:, 150:170] = True
+    depth_m = torch.where(mask, 1.5, torch.nan)
+    blobs = ViewInput(name="blobs", depth_m=depth_m, mask=mask, K=K, object="bracket")
+    refused, found = DepthImageRegressor(weights).estimate_many([blobs, view])
+    assert (refused.name, refused.status) == ("blobs", "too few points")
+    assert refused.reason.startswith("the cloud has 0 points, fewer than the ")
+    assert found.is_ok

@@ -1,0 +1,185 @@
+"""Masks by their words: files of detections, and weights of a segmentation."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_frames import HEIGHT, WIDTH, made_models, make_dataset
+from tests.pose.made_object import tiny_weights
+
+from depthpose.cli import main
+from depthpose.core.files import write_image
+from depthpose.pose.bop import (
+    BopDataset,
+    Detection,
+    encode_rle,
+    read_detections,
+    read_mask,
+    write_detections,
+)
+from depthpose.pose.predictions import read_predictions
+from depthpose.pose.resnet import normalise_colors
+from depthpose.pose.segmentation import (
+    FCN,
+    SegmentationConfig,
+    SegmentationWeights,
+    write_segmentation,
+)
+from depthpose.pose.weights import write_pose_weights
+
+LEFT = torch.arange(WIDTH).expand(HEIGHT, WIDTH) < WIDTH // 2
+PICTURE = torch.stack([LEFT, ~LEFT, LEFT & False]).float()
+"""Red on the left, where object 7 is, green on the right, where object 10 is."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+    data = make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
+    for instance in data.instances:
+        assert instance.rgb is not None
+        write_image(instance.rgb, PICTURE)
+    return data
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    write_pose_weights(path, tiny_weights(*made_models()))
+    return path
+
+
+def halves(
+    path: Path, names: Sequence[str] = ("bracket", "bottle"), numbers: Sequence[int] = (7, 10)
+) -> Path:
+    """Weights that take the red half for their first object, the green one for the second."""
+    torch.manual_seed(0)
+    config = SegmentationConfig(stride=32, widths=(4, 4, 8, 8), long_side_px=WIDTH)
+    network = FCN(2, config).eval()
+    with torch.no_grad():
+        features = network.encoder(normalise_colors(PICTURE)[None])[-1][0]
+        red, green = features[:, :, 0].mean(1), features[:, :, -1].mean(1)
+        score = network.scores[0]
+        score.get_parameter("weight").copy_(
+            torch.stack([red * 0, red - green, green - red])[..., None, None]
+        )
+        bias = (red - green) @ (red + green) / 2
+        score.get_parameter("bias").copy_(torch.stack([bias * 0 - 100, -bias, bias]))
+    weights = SegmentationWeights(network=network, objects=tuple(names), numbers=tuple(numbers))
+    write_segmentation(path, weights)
+    return path
+
+
+def found_by_truth(made: BopDataset, path: Path) -> Path:
+    masks = [read_mask(i.mask) for i in made.instances if i.mask is not None]
+    write_detections(
+        path,
+        [
+            Detection(scene_id=i.scene_id, image_id=i.image_id, object_id=i.object_id, score=0.9,
+                      segmentation=encode_rle(mask), seconds=0.5)
+            for i, mask in zip(made.instances, masks, strict=True)
+        ],
+    )  # fmt: skip
+    return path
+
+
+def statuses(out: Path) -> dict[str, str]:
+    rows = json.loads((out / "instances.json").read_text())
+    return {row["instance"]: row["status"] for row in rows}
+
+
+def test_predict_takes_a_file_of_detections(
+    made: BopDataset, weights: Path, tmp_path: Path
+) -> None:
+    found = found_by_truth(made, tmp_path / "found.json")
+    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights)]
+    assert main([*words, "--out", str(tmp_path / "truth")]) == 0
+    assert main([*words, "--out", str(tmp_path / "out"), "--masks", str(found)]) == 0
+    by_truth, by_file = (read_predictions(tmp_path / name) for name in ("truth", "out"))
+    assert len(by_file) == len(made.instances)
+    for one, other in zip(by_truth, by_file, strict=True):
+        # The same pixels, the same pose or refusal; the time of the segmentation is counted.
+        assert (one.place, one.estimate.status) == (other.place, other.estimate.status)
+        assert one.estimate.inlier_share == other.estimate.inlier_share
+        assert other.estimate.seconds["segmentation"] == 0.25
+
+
+def test_predict_segments_by_weights_once(made: BopDataset, weights: Path, tmp_path: Path) -> None:
+    masks, out = halves(tmp_path / "halves.safetensors"), tmp_path / "out"
+    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights)]
+    words += ["--masks", str(masks), "--out", str(out)]
+    assert main(words) == 0
+    found = read_detections(out / "detections" / "halves.json")
+    assert sorted((d.image_id, d.object_id) for d in found) == [(0, 7), (0, 10), (1, 7), (1, 10)]
+    for one in found:
+        half = LEFT if one.object_id == 7 else ~LEFT
+        assert float((one.mask == half).float().mean()) > 0.75
+    places = {p.place for p in read_predictions(out)}
+    assert len(places) == 4
+    assert all(p.estimate.seconds["segmentation"] > 0 for p in read_predictions(out))
+    before = (out / "detections" / "halves.json").stat().st_mtime_ns
+    assert main(words) == 0
+    assert before == (out / "detections" / "halves.json").stat().st_mtime_ns
+
+
+def test_objects_asked_for_later_are_found_too(
+    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masks, out = halves(tmp_path / "halves.safetensors"), tmp_path / "out"
+    words = ["pose", "evaluate", "--bop", str(made.folder), "--weights", str(weights), "--no-vsd"]
+    words += ["--masks", str(masks), "--out", str(out)]
+    assert main([*words, "--objects", "7"]) == 0
+    assert len(statuses(out)) == 2
+    assert main([*words, "--objects", "7", "10"]) == 0
+    assert len(statuses(out)) == 4
+    assert "missing" not in statuses(out).values()
+    targets = tmp_path / "targets.json"
+    row = {"scene_id": 1, "im_id": 1, "obj_id": 10, "inst_count": 1}
+    targets.write_text(json.dumps([row]))
+    other = [*words[:-1], str(tmp_path / "other")]
+    assert main([*other, "--targets", str(targets)]) == 0
+    assert main(other) == 0
+    assert "missing" not in statuses(tmp_path / "other").values()
+    record = out / "detections" / "halves" / "images.json"
+    record.write_text('[{"scene_id": 1}]')
+    assert main(words) == 2
+    assert "images.json: im_id is None" in capsys.readouterr().err
+
+
+def test_objects_are_matched_by_name_else_by_number(
+    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights), "--masks"]
+    for names, numbers, objects in (
+        (("obj_000007", "obj_000010"), (7, 10), {7, 10}),
+        (("bracket", "bottle"), (1, 2), {7, 10}),
+        # The name tells more than the number.
+        (("obj_000010", "bottle"), (10, 7), {10}),
+    ):
+        masks = halves(tmp_path / f"{names[0]}.safetensors", names, numbers)
+        out = tmp_path / "-".join((*names, *map(str, numbers)))
+        assert main([*words, str(masks), "--out", str(out)]) == 0
+        assert {p.place.object_id for p in read_predictions(out) if p.place} == objects
+    assert "segments no objects [7]; each is missing" in capsys.readouterr().err
+    masks = halves(tmp_path / "strange.safetensors", ("cup", "pan"), (1, 2))
+    assert main([*words, str(masks), "--out", str(tmp_path / "strange")]) == 2
+    said = capsys.readouterr().err
+    assert "segments cup (1), pan (2), but" in said
+    assert "shows objects [7, 10]; give weights of its objects" in said
+
+
+def test_masks_of_one_name_are_told_apart_by_their_folders(
+    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in ("x", "y"):
+        (tmp_path / folder).mkdir()
+        found_by_truth(made, tmp_path / folder / "found.json")
+    files = [str(tmp_path / folder / "found.json") for folder in ("x", "y")]
+    words = ["pose", "evaluate", "--bop", str(made.folder), "--weights", str(weights), "--no-vsd"]
+    words += ["--out", str(tmp_path / "out"), "--masks"]
+    assert main([*words, *files]) == 0
+    rows = json.loads((tmp_path / "out" / "rows.json").read_text())
+    assert {row["masks"] for row in rows} == {"x-found", "y-found"}
+    assert main([*words, files[0], files[0]]) == 2
+    assert "x/found: 2 that are given bear this name" in capsys.readouterr().err
