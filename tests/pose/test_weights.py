@@ -10,6 +10,7 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import write_bop_models
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
@@ -47,6 +48,29 @@ def test_network_and_objects_come_back_exactly(tmp_path: Path) -> None:
     discrete = again.models[2].symmetries.discrete
     assert discrete is not None
     assert discrete.t_m.tolist() == [pytest.approx([0.01, 0, 0])]
+
+
+def test_meshes_that_were_kept_back_are_put_in_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tiny_weights(dataclasses.replace(bracket(), number=3))
+    bare, whole = tmp_path / "bare.safetensors", tmp_path / "whole.safetensors"
+    write_pose_weights(bare, weights, with_meshes=False)
+    kept = [name for name in read_checkpoint(bare).state if name.startswith("models.")]
+    assert kept == ["models.0.keypoints_m"]
+    with pytest.raises(InputError, match="depthpose weights complete bare --models FOLDER"):
+        read_pose_weights(bare)
+    write_bop_models(tmp_path / "data", weights.models)
+    words = ["weights", "complete", str(bare), "--models", str(tmp_path / "data")]
+    assert main([*words, "--out", str(whole)]) == 0
+    mine, theirs = read_pose_weights(whole).models[0], weights.models[0]
+    torch.testing.assert_close(mine.vertices_m, theirs.vertices_m, rtol=0, atol=1e-6)
+    assert torch.equal(mine.keypoints_m, theirs.keypoints_m)
+    write_bop_models(tmp_path / "other", [dataclasses.replace(bottle(), number=3)])
+    assert main([*words[:-1], str(tmp_path / "other"), "--out", str(whole)]) == 2
+    assert "another object, frame or unit" in capsys.readouterr().err
+    write_bop_models(tmp_path / "few", [bottle()])
+    assert main([*words[:-1], str(tmp_path / "few"), "--out", str(whole)]) == 2
 
 
 def test_half_precision_halves_the_network_and_keeps_models_exact(tmp_path: Path) -> None:

@@ -30,6 +30,10 @@ COMMANDS = {
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
+    "weights complete": (
+        "weights:complete_weights",
+        "put meshes into pose weights that came without",
+    ),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),

@@ -134,3 +134,23 @@ def pack_weights(
         with_half=half,
     )
     return show_weights(str(out))
+
+
+def complete_weights(weights: tyro.conf.Positional[str], models: Path, out: Path) -> int:
+    """Put meshes into pose weights that came without, as their licence keeps the meshes back.
+
+        depthpose weights complete linemod-nc --models lm --out linemod.safetensors
+
+    Args:
+        weights: a file, or the name of weights that came with the package.
+        models: folder of the data set in BOP's layout, whose models the weights were trained on.
+        out: the .safetensors file to write; every other command takes it.
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.pose.bop.models import read_bop_models
+    from depthpose.pose.weights import complete_weights as complete
+    from depthpose.pose.weights import known_numbers
+
+    path = find_weights(weights)
+    complete(path, read_bop_models(models, known_numbers(path)), out)
+    return show_weights(str(out))

@@ -28,7 +28,10 @@ _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     "depth-image": (DepthImageNet, DepthImageConfig),
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
-_TENSORS = ("vertices_m", "faces", "normals", "keypoints_m")
+_OFF = 0.02
+"""Keypoints were vertices; so many diameters off the mesh, it is another one."""
+_SURFACE = ("vertices_m", "faces", "normals")
+_TENSORS = (*_SURFACE, "keypoints_m")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,18 +74,23 @@ class PoseWeights:
             )
 
 
-def write_pose_weights(path: Path, weights: PoseWeights, *, with_half: bool = False) -> None:
+def write_pose_weights(
+    path: Path, weights: PoseWeights, *, with_half: bool = False, with_meshes: bool = True
+) -> None:
     """Write a network and its objects to one ``.safetensors`` file.
 
     Args:
         path: the file.
         weights: what to write.
         with_half: store the network's numbers with 16 bits: half the size. Models stay exact.
+        with_meshes: keep the models' surfaces. Without, where a licence does not let them pass on,
+            the file cannot be used until :func:`complete_weights` has put them in again.
     """
     network = weights.network
     state = {f"network.{name}": _half(t, with_half) for name, t in network.state_dict().items()}
     for k, model in enumerate(weights.models):
-        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _TENSORS}
+        kept = _TENSORS if with_meshes else ("keypoints_m",)
+        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in kept}
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -94,6 +102,43 @@ def write_pose_weights(path: Path, weights: PoseWeights, *, with_half: bool = Fa
         facts["norm_mode"] = network.config.norm
     kind = next(kind for kind, (made, _) in _NETWORKS.items() if type(network) is made)
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
+
+
+def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -> None:
+    """Put surfaces into weights that were written without.
+
+    Args:
+        path: the weights.
+        meshes: their objects by number; names, keypoints and symmetries stay those of the weights.
+        out: the whole file.
+
+    Raises:
+        InputError: an object is missing, or is not the one that the weights were trained on.
+    """
+    checkpoint = read_checkpoint(path)
+    state = dict(checkpoint.state)
+    for k, record in enumerate(checkpoint.config.get("models", ())):
+        number, keypoints_m = record["number"], state[f"models.{k}.keypoints_m"]
+        if number not in meshes:
+            raise InputError(
+                f"{path}: knows object {number} ({record['name']}), but there is no such model "
+                f"among {sorted(meshes)}. Give the data set that it was trained on."
+            )
+        model = meshes[number]
+        off_m = float(torch.cdist(keypoints_m, model.vertices_m).amin(1).max())
+        if off_m > _OFF * record["diameter_m"]:
+            raise InputError(
+                f"{path}: a keypoint of object {number} ({record['name']}) lies {off_m:.3g} m off "
+                f"the model {model.name}: another object, frame or unit. Give the models that it "
+                "was trained on."
+            )
+        state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _SURFACE}
+    save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
+
+
+def known_numbers(path: Path) -> tuple[int, ...]:
+    """Give the numbers of the objects that weights know, with or without their surfaces."""
+    return tuple(int(record["number"]) for record in read_checkpoint(path).config["models"])
 
 
 def read_pose_weights(path: Path) -> PoseWeights:
@@ -108,6 +153,12 @@ def read_pose_weights(path: Path) -> PoseWeights:
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
             f"{', '.join(map(repr, _NETWORKS))}."
+        )
+    if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
+        raise InputError(
+            f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
+            f"in once: depthpose weights complete {path.stem} --models FOLDER --out "
+            f"{path.stem}-complete.safetensors, with the data set's folder."
         )
     source = str(path)
     parts = {name: _part(checkpoint, name, source) for name in ("network", "cloud", "refusal")}

@@ -34,6 +34,12 @@ class ModelsConfig:
     with_found_symmetries: bool = False
     """Look for symmetries of CAD files, and count the copies as right."""
 
+    licence: str = "not stated; that of the models binds"
+    """Under which the weights may be used."""
+
+    terms: str = ""
+    """Said whenever the weights are loaded; for licences that bind the user."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:

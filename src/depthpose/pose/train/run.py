@@ -69,16 +69,17 @@ def packed(
     cloud: CloudConfig = config.cloud
     names = ", ".join(model.name for model in models)
     source = "made views" if frames is None else f"{Path(frames.folder).name} and made views"
+    facts = {
+        "trained_on": f"{source} of {names}",
+        "stage": type(config).__name__,
+        "licence": config.models.licence,
+    }
     return PoseWeights(
         network=network.cpu().eval(),
         models=models,
         cloud=cloud,
         refusal=RefusalConfig(),
-        facts={
-            "trained_on": f"{source} of {names}",
-            "stage": type(config).__name__,
-            "licence": "not stated; that of the models binds",
-        },
+        facts=facts | ({"terms": config.models.terms} if config.models.terms else {}),
     )
 
 
