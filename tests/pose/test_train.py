@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut
 from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.task import keypoint_copies
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import read_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
@@ -318,9 +319,27 @@ def test_symmetries_of_a_cad_file_are_told_and_taken_where_asked(tmp_path: Path)
     assert plain.symmetries.is_none
     assert "flange: looks the same after 5 turns, about 0 axes" in told[0]
     assert "--symmetries found" in told[0]
+    (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", told[0])
+    assert float(certainty) > 0.5
     (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), told.append)
     assert taken.symmetries.discrete is not None
     assert len(taken.symmetries.discrete.R) == 5
+
+
+def test_symmetries_that_a_data_set_does_not_declare_are_found_too(tmp_path: Path) -> None:
+    declared = dataclasses.replace(bottle(), number=1)
+    silent = dataclasses.replace(bottle(), number=2, symmetries=Symmetries())
+    write_bop_models(tmp_path, [declared, silent])
+    told: list[str] = []
+    config = ModelsConfig(bop=str(tmp_path), with_found_symmetries=True)
+    models = read_models(config, told.append)
+    assert [len(model.symmetries.continuous) for model in models] == [1, 1]
+    axis = models[1].symmetries.continuous[0].direction
+    assert float(axis[2].abs()) == pytest.approx(1, abs=1e-3)
+    # What is declared stands, and nobody looks for more.
+    assert len(told) == 1
+    assert "about 1 axes" in told[0]
+    assert read_models(ModelsConfig(bop=str(tmp_path)))[1].symmetries.is_none
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)

@@ -22,6 +22,8 @@ _COARSE = 0.04
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SHADOW_RAD = 0.25
+SURE = 0.5
+"""Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
 _MOST_AXES = 40
 """A cube has 13 axes, an icosahedron 31."""
 
@@ -126,7 +128,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 
 
 def symmetries_from_proposals(
-    proposals: list[SymmetryProposal], min_certainty: float = 0.5
+    proposals: list[SymmetryProposal], min_certainty: float = SURE
 ) -> Symmetries:
     """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
 
