@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from depthpose.pose.train import (
     train_pose,
 )
 from depthpose.pose.train.config import CalibrationConfig
-from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut
+from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objects
 from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
@@ -227,6 +228,24 @@ def test_held_out_views_are_not_those_that_are_trained_on() -> None:
         for k in ("add_10", "median")
     }
     assert HELD_OUT_SEED > 0
+
+
+def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
+    config = HeldOutConfig(number=3, occlusions=(0.0,), with_ransac=False)
+    network = ResUNet(_SMALL).eval()
+    none = HeldOut(
+        _models(), _MADE, dataclasses.replace(_CLOUD, max_points=None, min_points=10**6), config
+    )
+    numbers = none.look(network).numbers
+    assert numbers["held_out/occluded_0/lines_add_10"] == 0
+    assert numbers["held_out/occluded_0/lines_median"] == math.inf
+    made = held_out_objects(_models(), _MADE, _CLOUD, config, 0.0)
+    seen = sorted(len(made[i].input.points_m) for i in range(6))
+    some = dataclasses.replace(_CLOUD, max_points=None, min_points=seen[4])
+    with torch.no_grad():
+        errors = HeldOut(_models(), _MADE, some, config)._errors(network, 0.0)["lines"]
+    assert len(errors) == 6
+    assert int(errors.isfinite().sum()) == sum(count >= seen[4] for count in seen) < 6
 
 
 def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class HeldOut:
     """Clouds that are made once, and looked at again and again.
 
     Each is a rendering of its own at the full resolution; so many of each object stand at each
-    occlusion.
+    occlusion. One that shows too few points to be posed counts as a failure.
 
     Args:
         models: the objects; class k is ``models[k]``.
@@ -71,7 +71,12 @@ class HeldOut:
             found["lines"].append(self._error(meet_lines(points, directions), cloud))
             if self.config.with_ransac:
                 found["ransac"].append(self._error(vote_ransac(points, directions), cloud))
-        return {method: torch.tensor(errors) for method, errors in found.items()}
+        missing = [math.inf] * (self._wanted - len(self._of(occlusion)))
+        return {method: torch.tensor(errors + missing) for method, errors in found.items()}
+
+    @property
+    def _wanted(self) -> int:
+        return self.config.number * len(self.models)
 
     def _error(self, vote: Vote, cloud: Cloud) -> float:
         """ADD, or ADD-S of a symmetric object, in diameters."""
