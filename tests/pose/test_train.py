@@ -18,7 +18,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import write_bop_models, write_bop_scene
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.losses import unit_directions
-from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.objects import Objects, make_frames, write_part
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import (
@@ -36,9 +36,10 @@ from depthpose.pose.train import (
 from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objects
 from depthpose.pose.train.judge import calibrated, card_text, judged
+from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
-from depthpose.pose.weights import read_pose_weights
+from depthpose.pose.weights import read_pose_weights, write_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
@@ -286,6 +287,25 @@ def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> Non
             dataclasses.replace(config, network=other, models=_FOUR_KEYPOINTS),
             Run(folder=tmp_path / "other"),
         )
+
+
+def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_path: Path) -> None:
+    path = tmp_path / "folded.safetensors"
+    config = _training()
+    network = fold_norms(ResUNet(dataclasses.replace(_SMALL, classes=1)))
+    write_pose_weights(path, packed(network, read_models(config.models), config))
+    plain = dataclasses.replace(_SMALL, norm="none")
+    with pytest.raises(InputError) as error:
+        train_pose(_training(start=str(path), network=plain), Run(folder=tmp_path / "plain"))
+    assert str(error.value) == (
+        f"{path}: was trained with with_bias = True, but the config says False. Give the config "
+        "the weights' own."
+    )
+    biased = dataclasses.replace(plain, with_bias=True)
+    still = _training(start=str(path), network=biased, adam=AdamConfig(learning_rate=1e-12))
+    then = read_pose_weights(train_pose(still, Run(folder=tmp_path / "biased"))).network
+    for name, tensor in network.state_dict().items():
+        assert torch.allclose(then.state_dict()[name], tensor, atol=1e-6), name
 
 
 def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:

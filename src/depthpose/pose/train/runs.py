@@ -88,12 +88,15 @@ def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
 def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
     """Copy weights; of other objects, all but the last layer.
 
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up.
+
     Raises:
         InputError: a network of another shape.
     """
     found = read_pose_weights(find_weights(start)).network
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
-    free = ("classes", "norm", "with_bias") if isinstance(network, ResUNet) else ()
+    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
+    free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
     for knob, value in wanted.items():
         if knob not in free and given.get(knob) != value:
             raise InputError(
