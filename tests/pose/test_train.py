@@ -16,7 +16,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import write_bop_models, write_bop_scene
-from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.config import (
+    CloudConfig,
+    MeshConfig,
+    ObjectsConfig,
+    RefusalConfig,
+    SensorConfig,
+)
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.objects import Objects, make_frames, write_part
@@ -39,7 +45,7 @@ from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
-from depthpose.pose.weights import read_pose_weights, write_pose_weights
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
@@ -324,6 +330,31 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> 
     cut = train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
     one, other = (read_pose_weights(path).network.state_dict() for path in (whole, cut))
     assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_weights_are_calibrated_and_judged_as_the_file_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[PoseWeights] = []
+
+    def chosen(weights: PoseWeights, *_: object) -> PoseWeights:
+        seen.append(weights)
+        return dataclasses.replace(weights, refusal=RefusalConfig(bias=-1.0, slopes={"far": 2.0}))
+
+    def counted(weights: PoseWeights, *_: object) -> dict[str, dict[str, float | None]]:
+        seen.append(weights)
+        return {}
+
+    monkeypatch.setattr("depthpose.pose.train.runs.calibrated", chosen)
+    monkeypatch.setattr("depthpose.pose.train.runs.judged", counted)
+    path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
+    written = read_pose_weights(path)
+    assert len(seen) == 2
+    for weights in seen:
+        for name, tensor in written.network.state_dict().items():
+            assert torch.equal(weights.network.state_dict()[name], tensor), name
+    assert written.refusal == seen[1].refusal
+    assert written.refusal.slopes == {"far": 2.0}
 
 
 def test_the_refusal_is_chosen_on_views_of_its_own(tmp_path: Path) -> None:
