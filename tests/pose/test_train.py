@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.pose.made_object import bottle, bracket
+from tests.pose.made_object import bottle, bracket, tiny_weights
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
@@ -23,6 +23,8 @@ from depthpose.pose.config import (
     RefusalConfig,
     SensorConfig,
 )
+from depthpose.pose.estimator import risk_of
+from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.objects import Objects, make_frames, write_part
@@ -44,7 +46,7 @@ from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objec
 from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
-from depthpose.pose.types import ObjectModel, Symmetries
+from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
@@ -357,18 +359,54 @@ def test_weights_are_calibrated_and_judged_as_the_file_has_them(
     assert written.refusal.slopes == {"far": 2.0}
 
 
-def test_the_refusal_is_chosen_on_views_of_its_own(tmp_path: Path) -> None:
-    path = train_pose(_training(), Run(folder=tmp_path))
-    weights = read_pose_weights(path)
-    config = CalibrationConfig(number=20)
-    chosen = calibrated(weights, _MADE, config)
-    # Three steps teach nothing: nearly all answers are wrong, so nearly none may be given.
-    table = judged(chosen, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
-    assert (table["0"]["wrong"] or 0.0) <= 0.5
-    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
+def _as_known(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+    """Answers of which 2 in 5 are wrong: those of a large signal. The refusal alone decides."""
+    estimates, errors = [], []
+    for index in range(len(objects)):
+        far = (37 * index % 100) / 100
+        signals = dict.fromkeys(SIGNALS, 0.0) | {"far": far}
+        risk = risk_of(signals, weights.refusal)
+        is_ok = risk is None or risk <= weights.refusal.max_risk
+        pose = Rigid(torch.eye(3), torch.ones(3)) if is_ok else None
+        status, reason = ("ok", "") if is_ok else ("doubtful", "so")
+        estimates.append(PoseEstimate(name="", object="", status=status, reason=reason,
+                                      camera_from_model=pose, signals=signals))  # fmt: skip
+        errors.append((0.02 if far < 0.6 else 0.4) if is_ok else math.inf)
+    return estimates, errors
+
+
+def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("depthpose.pose.train.judge._posed", _as_known)
+    weights = tiny_weights(*_models())
+    held_out = HeldOutConfig(number=100, occlusions=(0.0,))
+    uncalibrated = judged(weights, _MADE, held_out)["0"]
+    assert uncalibrated["wrong"] == pytest.approx(0.4)
+    chosen = calibrated(weights, _MADE, CalibrationConfig(number=200, max_wrong_share=0.02))
+    table = judged(chosen, _MADE, held_out)
+    assert (table["0"]["wrong"] or 0.0) <= 0.02
+    assert (table["0"]["right"] or 0.0) > 0.55
+    opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
+    without = judged(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
+    assert without["wrong"] == pytest.approx(0.4)
     text = card_text(weights.models, {"licence": "MIT"}, table)
     assert "| hidden % | right % | wrong % | refused %" in text
     assert "Licence: MIT." in text
+
+
+def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Objects] = []
+
+    def posed(_: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+        seen.append(objects)
+        return _as_known(weights, objects)
+
+    monkeypatch.setattr("depthpose.pose.train.judge._posed", posed)
+    weights = tiny_weights(*_models())
+    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
+    _ = calibrated(weights, _MADE, CalibrationConfig(number=20))
+    _ = judged(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
+    calibration, held_out = (objects[0].input.points_m for objects in seen)
+    assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
 
 def test_models_come_from_one_source(tmp_path: Path) -> None:
