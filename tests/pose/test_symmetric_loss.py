@@ -22,7 +22,12 @@ class _Stubborn(ResUNet):
 
     answer: torch.Tensor
 
-    def directions(self, *_: torch.Tensor) -> torch.Tensor:
+    def directions(
+        self,
+        points_m: torch.Tensor,  # noqa: ARG002
+        coordinates: torch.Tensor,  # noqa: ARG002
+        class_of_point: torch.Tensor,  # noqa: ARG002
+    ) -> torch.Tensor:
         return self.answer
 
 
@@ -37,7 +42,7 @@ def _batch(pose: Rigid, points_m: torch.Tensor) -> CloudBatch:
     )
 
 
-@pytest.mark.parametrize(("part", "copies"), [("flange", 6), ("spool", 2 * 63)])
+@pytest.mark.parametrize(("part", "copies"), [("flange", 6), ("spool", 63)])
 @pytest.mark.parametrize("mode", ["mse", "cosine", "l1"])
 def test_each_declared_symmetry_leaves_the_loss_as_it_is(part: str, copies: int, mode: str) -> None:
     model = make_part(part, 1)
