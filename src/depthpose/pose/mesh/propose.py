@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
 from depthpose.pose.mesh.sampling import fibonacci_directions, sample_surface
 from depthpose.pose.mesh.symmetry import turn_about
@@ -61,8 +62,7 @@ class _Surface:
         self._rough_tree = KDTree(self._every(2500).numpy())
 
     def _every(self, count: int) -> Float[Tensor, "m 3"]:
-        index = torch.arange(count) * len(self.points) // count
-        return self.points[index.unique()]
+        return take_evenly(self.points, count)
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Give distance and index of the nearest sample."""
