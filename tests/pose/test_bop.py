@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -25,7 +26,9 @@ from depthpose.pose.bop import (
     write_bop_scene,
 )
 from depthpose.pose.bop.linemod import segnet_mask
+from depthpose.pose.bop.models import read_bop_models
 from depthpose.pose.mesh import make_model, turn_about
+from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries
 
 K = torch.tensor([[500.0, 0, 40], [0, 500, 30], [0, 0, 1]]).double()
@@ -263,6 +266,25 @@ def test_linemod_preprocessed(tmp_path: Path) -> None:
     (folder / "data/02/test.txt").write_text("0009\n")
     with pytest.raises(InputError, match="image 9 has no annotation"):
         open_bop(folder)
+
+
+def test_eggbox_and_glue_of_linemod_get_the_half_turn_that_is_not_declared(tmp_path: Path) -> None:
+    plain = [dataclasses.replace(block(n), symmetries=Symmetries()) for n in (9, 10, 11)]
+    write_bop_models(tmp_path, plain)
+    assert all(
+        model.symmetries.is_none for model in read_bop_models(tmp_path, (9, 10, 11)).values()
+    )
+    models = read_bop_models(linemod(tmp_path), (9, 10, 11))
+    assert models[9].symmetries.is_none
+    point = torch.tensor([[0.01, 0.02, 0.03]]).double()
+    for number in (10, 11):
+        turn = models[number].symmetries.discrete
+        assert turn is not None
+        assert len(turn.R) == 1
+        turned = Rigid(turn.R[0], turn.t_m[0]).apply(point)
+        assert torch.allclose(turned, torch.tensor([[-0.01, -0.02, 0.03]]).double())
+    # Training gets the copy, as evaluation does.
+    assert keypoint_copies([models[10]]).shape[1] == 2
 
 
 def test_the_real_frames(real: Path) -> None:

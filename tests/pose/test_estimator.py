@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from tests.pose.made_object import (
     FACTS,
     K,
@@ -26,6 +27,7 @@ from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_imag
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.mesh import make_model, propose_symmetries, symmetries_from_proposals
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
@@ -162,6 +164,22 @@ def test_a_declared_axis_is_no_reason_to_refuse() -> None:
     assert found.free_motions.shape == (1, 6)
     along = found.free_motions[0].double() @ found.covariance.double()
     assert float(along.norm()) < 1e-9
+
+
+def test_a_ball_whose_symmetries_were_found_is_posed() -> None:
+    ball = trimesh.creation.icosphere(3, 0.06)
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (ball.vertices, ball.faces))
+    plain = make_model(vertices, faces, name="ball")
+    found = symmetries_from_proposals(propose_symmetries(plain))
+    assert len(found.continuous) == 2
+    model, truth = dataclasses.replace(plain, symmetries=found), pose_at(seed=5)
+    net = Oracle(tiny_weights(model), [truth], noise=0.02)
+    answer = net.estimate(cloud=cloud_of(model, truth))
+    assert answer.status == "ok", answer.reason
+    assert answer.camera_from_model is not None
+    assert answer.free_motions is not None
+    assert answer.free_motions.shape == (3, 6)
+    assert float((answer.camera_from_model.t_m - truth.t_m).norm()) < 0.002
 
 
 def test_an_axis_that_nobody_declared_is_not_observable() -> None:

@@ -135,6 +135,22 @@ def test_free_motions_leave_points_of_the_axis_where_they_are() -> None:
     assert free_motions((), pose).shape == (0, 6)
 
 
+def test_two_axes_free_every_turn_about_their_meeting() -> None:
+    pose, centre = random_pose(9), torch.tensor([0.1, 0.2, 0.3]).double()
+    up = torch.tensor([0, 0, 1.0]).double()
+    slant = torch.tensor([0.6, 0, 0.8]).double()
+    # Each is given by a point of its own.
+    axes = tuple(Axis(direction=d, point_m=centre + s * d) for d, s in ((up, 0.5), (slant, -0.2)))
+    motions = free_motions(axes, pose)
+    assert motions.shape == (3, 6)
+    assert int(torch.linalg.matrix_rank(motions)) == 3
+    at = pose.apply(centre[None])[0]
+    speed = torch.linalg.cross(motions[:, :3], at.expand(3, 3)) + motions[:, 3:]
+    assert float(speed.norm()) < 1e-6
+    # The same axis twice is one axis.
+    assert free_motions((axes[0], axes[0]), pose).shape == (1, 6)
+
+
 def test_the_whole_way_on_the_real_cat(real: Path) -> None:
     """Depth, voxels, votes of a network that errs by 3 degrees and is wrong a tenth of the time."""
     data = open_bop(real / "pose/lm")

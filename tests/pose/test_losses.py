@@ -3,8 +3,6 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from depthpose.pose.losses import (
@@ -54,20 +52,15 @@ def test_the_loss_by_hand() -> None:
     assert choose_copies(found, points, copies, torch.tensor([0, 0, 1])).tolist() == [0, 1]
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 10**6), st.permutations(range(4)), st.sampled_from(["mse", "cosine", "l1"]))
-def test_the_loss_is_the_same_for_each_symmetric_truth(
-    seed: int, order: list[int], mode: DirectionMode
-) -> None:
-    points, found = random(20, 3, seed=seed), random(20, 5, 3, seed=seed + 1)
-    copies, instance = random(3, 4, 5, 3, seed=seed + 2), torch.arange(20) % 3
-    loss = direction_loss(found, points, copies, instance, mode)
-    torch.testing.assert_close(
-        direction_loss(found, points, copies[:, order], instance, mode), loss
-    )
-    # Repeating copies, as padding does, changes nothing either.
+@pytest.mark.parametrize("mode", ["mse", "cosine", "l1"])
+def test_repeated_copies_change_no_loss(mode: DirectionMode) -> None:
+    points, found = random(20, 3, seed=0), random(20, 5, 3, seed=1)
+    copies, instance = random(3, 4, 5, 3, seed=2), torch.arange(20) % 3
     padded = torch.cat([copies, copies[:, :2]], 1)
-    torch.testing.assert_close(direction_loss(found, points, padded, instance, mode), loss)
+    torch.testing.assert_close(
+        direction_loss(found, points, padded, instance, mode),
+        direction_loss(found, points, copies, instance, mode),
+    )
 
 
 def test_one_copy_serves_a_whole_instance() -> None:

@@ -89,6 +89,69 @@ def test_a_damaged_file_is_refused_with_a_remedy(tmp_path: Path) -> None:
         read_model(tmp_path / "none.ply", "mm")
 
 
+def _saved(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl"])
+def test_a_mesh_with_holes_is_a_model(tmp_path: Path, suffix: str) -> None:
+    whole = stone(1000)
+    faces = np.array(whole.faces)[2:]
+    model = read_model(_saved(tmp_path / f"open.{suffix}", whole.vertices, faces), "mm")
+    assert len(model.faces) == len(whole.faces) - 2
+    points, normals = sample_surface(model, 500)
+    assert torch.allclose(normals.norm(dim=-1), torch.ones(500))
+    assert len(torch.unique(points, dim=0)) == 500
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl"])
+def test_faces_twice_and_faces_without_area_are_dropped(tmp_path: Path, suffix: str) -> None:
+    whole = stone(1000)
+    faces = np.array(whole.faces)
+    # Again, from another corner; from behind; three points of which two are one, or on one line.
+    middle = whole.vertices[faces[0, :2]].mean(0)
+    vertices = np.concatenate([whole.vertices, middle[None]])
+    extra = [np.roll(faces[3], 1), faces[4][::-1], [*faces[5, :2], faces[5, 0]],
+             [*faces[0, :2], len(whole.vertices)]]  # fmt: skip
+    damaged = np.concatenate([faces, np.array(extra)])
+    path = _saved(tmp_path / f"twice.{suffix}", vertices, damaged)
+    model, expected = read_model(path, "mm"), model_of(stone())
+    # In 32 bits a point on a line is off by a little: that face may stay, of no weight.
+    assert len(faces) <= len(model.faces) <= len(faces) + 1
+    for mine, theirs in zip(sample_surface(model, 300), sample_surface(expected, 300), strict=True):
+        assert torch.allclose(mine, theirs, atol=1e-5)
+
+
+def test_faces_that_are_no_surface_are_refused(tmp_path: Path) -> None:
+    whole = stone(1000)
+    beyond = tmp_path / "beyond.ply"
+    faces = np.array(whole.faces)
+    faces[7, 2] = len(whole.vertices)
+    last = len(whole.vertices) - 1
+    beyond.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {last + 1}\n"
+        + "".join(f"property float {axis}\n" for axis in "xyz")
+        + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        + "".join(f"{x} {y} {z}\n" for x, y, z in whole.vertices)
+        + "".join(f"3 {a} {b} {c}\n" for a, b, c in faces)
+    )
+    with pytest.raises(InputError) as error:
+        read_model(beyond, "mm")
+    assert str(error.value) == (
+        f"{beyond}: face 7 names point {last + 1}, but the {last + 1} points are numbered 0 .. "
+        f"{last}; the file is damaged. Export it again."
+    )
+    lines = faces[:, [0, 1, 0]]
+    path = _saved(tmp_path / "lines.ply", whole.vertices, lines)
+    with pytest.raises(InputError) as error:
+        read_model(path, "mm")
+    assert str(error.value) == (
+        f"{path}: its {len(faces)} faces have no area, so there is no surface to see; all are "
+        "lines or points. Export it again as triangles, or as points without faces."
+    )
+
+
 def test_the_wrong_unit_is_told(tmp_path: Path) -> None:
     trimesh.creation.box((100, 200, 300)).export(tmp_path / "mm.ply")
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "m.ply")

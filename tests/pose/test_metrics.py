@@ -1,18 +1,20 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from depthpose.core.camera import project
-from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
+from depthpose.pose.bop import open_bop
+from depthpose.pose.evaluate.errors import make_ruler, measure
 from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
+    VSD_DELTA_M,
     View,
     add_m,
     adds_m,
@@ -43,31 +45,6 @@ def random_pose(seed: int) -> Rigid:
     return Rigid(q * torch.linalg.det(q), torch.tensor([0.1, -0.1, 0.9]).double())
 
 
-def draw_depth(triangles_m: Tensor, size: tuple[int, int]) -> Tensor:
-    """Depth of a mesh by brute force: every small triangle against the pixels of its box."""
-    height, width = size
-    pixels = project(triangles_m, K)
-    low = pixels.amin(1).ceil().long()
-    span = int((pixels.amax(1) - pixels.amin(1)).max()) + 2
-    steps = torch.cartesian_prod(torch.arange(span), torch.arange(span))
-    at = low[:, None] + steps
-    a, b, c = ((pixels[:, i] - pixels[:, (i + 1) % 3])[:, None] for i in range(3))
-    from_a, from_b, from_c = (at - pixels[:, (i + 1) % 3][:, None] for i in range(3))
-    cross = [e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0] for e, f in
-             ((a, from_a), (b, from_b), (c, from_c))]  # fmt: skip
-    weights = torch.stack([cross[1], cross[2], cross[0]], -1)
-    total = weights.sum(-1, keepdim=True)
-    share = weights / total
-    inside = (share >= 0).all(-1) & (total[..., 0].abs() > 1e-12)
-    # 1 / z is linear in the image.
-    z = 1 / (share / triangles_m[:, None, :, 2]).sum(-1)
-    u, v = at.unbind(-1)
-    inside &= (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
-    depth.scatter_reduce_(0, (v * width + u)[inside], z[inside], "amin")
-    return depth.reshape(height, width)
-
-
 def test_errors_are_those_of_the_bop_toolkit(real: Path) -> None:
     reference = json.loads((real / "reference/bop_errors/errors.json").read_text())
     folder = real / "pose/lm/models"
@@ -95,21 +72,16 @@ def test_errors_are_those_of_the_bop_toolkit(real: Path) -> None:
 
 def test_vsd_is_that_of_the_bop_toolkit(real: Path) -> None:
     reference = json.loads((real / "reference/bop_errors/errors.json").read_text())["vsd"]
-    folder = real / "pose/lm"
-    model = read_model(folder / "models/obj_000006.ply", "mm")
-    depth_m = read_depth_png(folder / "test/000006/depth/000000.png", 0.001)
-    size = (depth_m.shape[0], depth_m.shape[1])
-
-    def render(pose: Rigid) -> Tensor:
-        corners = model.triangles_m.double().flatten(0, 1)
-        return draw_depth(pose.apply(corners).unflatten(0, (-1, 3)), size)
-
-    view = View(depth_m=depth_m, K=K, render=render)
-    true = pose_of(reference["rows"][0]["R_est"], reference["rows"][0]["t_est"])
-    taus_m = [tau * model.diameter_m for tau in reference["taus"]]
+    data = open_bop(real / "pose/lm").of_objects("cat")
+    assert len(data) == 1
+    cat = data.objects[6]
+    ruler = make_ruler(cat, cat.diameter_m, is_adds=False, vsd_delta_m=VSD_DELTA_M)
+    first = reference["rows"][0]
+    true = replace(data.instances[0], camera_from_model=pose_of(first["R_est"], first["t_est"]))
     assert tuple(reference["taus"]) == BOP_SHARES
     for row in reference["rows"]:
-        ours = vsd(pose_of(row["R_est"], row["t_est"]), true, view, taus_m)
+        _, ours = measure(pose_of(row["R_est"], row["t_est"]), true, ruler)
+        assert ours is not None
         assert ours.tolist() == pytest.approx(row["vsd"], abs=0.01)
 
 
@@ -152,6 +124,7 @@ def test_missing_estimates_stay_in_the_denominator() -> None:
     errors = torch.tensor([0.0, 0.05, math.inf, math.nan])
     assert auc(errors) == pytest.approx((1 + 0.5) / 4)
     assert is_within_diameter(errors, 0.6).tolist() == [True, True, False, False]
+    assert is_within_diameter(errors / 0.6).tolist() == [True, True, False, False]
     assert average_recall(errors[:, None], BOP_SHARES) == pytest.approx((10 + 9) / 40)
     assert len(BOP_PIXELS) == 10
 

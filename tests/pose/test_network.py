@@ -19,7 +19,6 @@ from depthpose.pose.network import (
     import_fcgf,
     read_network,
     resunet_from_published,
-    select_class,
     unfold_norms,
     write_network,
 )
@@ -201,9 +200,9 @@ def test_one_class_alone_answers_as_among_all() -> None:
     assert outputs.shape[1:] == (3, 4, 4)
     for number in range(3):
         torch.testing.assert_close(network.forward_class(voxels, number), outputs[:, number])
-    each = torch.arange(len(outputs)) % 3
-    chosen = select_class(outputs, each)
-    assert torch.equal(chosen[4], outputs[4, 1])
+    rows = torch.arange(len(outputs))
+    chosen = network.forward_classes(voxels, rows % 3)
+    torch.testing.assert_close(chosen, outputs[rows, rows % 3])
     assert network.point_features(voxels).shape[1] == TINY.decoder[0]
 
 

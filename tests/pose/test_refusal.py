@@ -6,11 +6,13 @@ import pytest
 import torch
 from tests.pose.made_object import bracket, cloud_of, pose_at
 
+from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator import calibrate_refusal, risk_of
 from depthpose.pose.estimator.evidence import SIGNALS, hold_of, surface_signals
+from depthpose.pose.estimator.refusal import reason_of
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.refine import prepare_surface
 from depthpose.pose.types import PoseEstimate
@@ -38,6 +40,25 @@ def test_the_risk_is_the_logistic_of_the_signals() -> None:
     assert risk_of(signals, config) == pytest.approx(1 / (1 + math.exp(-1)))
     assert risk_of(signals, RefusalConfig()) is None
     assert risk_of(signals, RefusalConfig(bias=1e9, slopes={"far": 1.0})) == 1.0
+
+
+def test_a_refusal_names_the_signal_that_is_unusual() -> None:
+    """What is always large, and weighs much, makes no answer more doubtful than others."""
+    slopes, signals = {"unseen": 4.0, "far": 4.0}, answer(unseen=0.7, far=0.4).signals
+    config = RefusalConfig(slopes=slopes, means={"unseen": 0.65, "far": 0.01})
+    assert reason_of(signals, 0.9, config).startswith("40% of the points are nowhere near")
+    # Weights that were written before means were: those of 0.
+    assert reason_of(signals, 0.9, RefusalConfig(slopes=slopes)).startswith("70% of the posed")
+    old = {"max_risk": 0.3, "bias": -1.0, "slopes": slopes}
+    assert config_from_dict(old, RefusalConfig, source="old").means == {}
+
+
+def test_the_means_are_those_of_right_answers() -> None:
+    answers = [answer(far=0.1), answer(far=0.3), answer(far=0.9)]
+    config = calibrate_refusal(answers, [True, True, False])
+    assert config.means["far"] == pytest.approx(0.2)
+    assert config.means.keys() == config.slopes.keys()
+    assert calibrate_refusal(answers, [False] * 3).means == {}
 
 
 def test_calibration_finds_what_makes_answers_wrong() -> None:

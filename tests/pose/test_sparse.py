@@ -88,6 +88,7 @@ CASES = [
     for kernel, stride, is_transposed in [
         (3, 1, False), (5, 1, False), (7, 1, False), (3, 2, False), (5, 2, False), (3, 1, True),
         (7, 2, False), (2, 2, False), (3, 2, True), (5, 2, True), (1, 2, False),
+        (7, 2, True), (7, 1, True), (3, 4, False), (3, 4, True),
     ]
     for inputs in (1, 6)
 ]  # fmt: skip
@@ -156,6 +157,27 @@ def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPat
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(7, 1), (7, 2), (3, 4), (4, 4), (2, 4), (1, 4)])
+@pytest.mark.parametrize("shift", range(4))
+def test_no_look_leaves_the_table(
+    kernel: int, stride: int, shift: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full block, whichever of its planes the coarser voxels lie on or before."""
+    xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
+    keys = pack(F.pad(xyz, (1, 0)))
+    found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
+    monkeypatch.setattr("depthpose.pose.sparse.search.MAX_CELLS", 0)
+    wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(11, 1), (9, 2), (5, 4), (7, 4), (3, 8)])
+def test_a_kernel_that_looks_beyond_the_table_is_refused(kernel: int, stride: int) -> None:
+    cache = Voxels.from_points(cloud()).cache
+    with pytest.raises(AssertionError, match=f"kernel {kernel} with stride {stride} looks"):
+        cache.kernel_map(0, kernel, stride)
 
 
 def test_voxels_far_apart_need_no_table_of_the_air_between() -> None:

@@ -2,21 +2,31 @@
 
 import dataclasses
 import json
+import math
+import re
 from pathlib import Path
 
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.pose.made_object import bottle, bracket
+from tests.pose.made_object import bottle, bracket, tiny_weights
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import write_bop_models, write_bop_scene
-from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.config import (
+    CloudConfig,
+    MeshConfig,
+    ObjectsConfig,
+    RefusalConfig,
+    SensorConfig,
+)
+from depthpose.pose.estimator import risk_of
+from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import unit_directions
-from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.objects import Objects, make_frames, write_part
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import (
@@ -32,11 +42,12 @@ from depthpose.pose.train import (
     train_pose,
 )
 from depthpose.pose.train.config import CalibrationConfig
-from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut
+from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objects
 from depthpose.pose.train.judge import calibrated, card_text, judged
+from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
-from depthpose.pose.types import ObjectModel
-from depthpose.pose.weights import read_pose_weights
+from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
@@ -228,6 +239,24 @@ def test_held_out_views_are_not_those_that_are_trained_on() -> None:
     assert HELD_OUT_SEED > 0
 
 
+def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
+    config = HeldOutConfig(number=3, occlusions=(0.0,), with_ransac=False)
+    network = ResUNet(_SMALL).eval()
+    none = HeldOut(
+        _models(), _MADE, dataclasses.replace(_CLOUD, max_points=None, min_points=10**6), config
+    )
+    numbers = none.look(network).numbers
+    assert numbers["held_out/occluded_0/lines_add_10"] == 0
+    assert numbers["held_out/occluded_0/lines_median"] == math.inf
+    made = held_out_objects(_models(), _MADE, _CLOUD, config, 0.0)
+    seen = sorted(len(made[i].input.points_m) for i in range(6))
+    some = dataclasses.replace(_CLOUD, max_points=None, min_points=seen[4])
+    with torch.no_grad():
+        errors = HeldOut(_models(), _MADE, some, config)._errors(network, 0.0)["lines"]
+    assert len(errors) == 6
+    assert int(errors.isfinite().sum()) == sum(count >= seen[4] for count in seen) < 6
+
+
 def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:
     path = train_pose(_training(), Run(folder=tmp_path / "run"))
     weights = read_pose_weights(path)
@@ -268,6 +297,25 @@ def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> Non
         )
 
 
+def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_path: Path) -> None:
+    path = tmp_path / "folded.safetensors"
+    config = _training()
+    network = fold_norms(ResUNet(dataclasses.replace(_SMALL, classes=1)))
+    write_pose_weights(path, packed(network, read_models(config.models), config))
+    plain = dataclasses.replace(_SMALL, norm="none")
+    with pytest.raises(InputError) as error:
+        train_pose(_training(start=str(path), network=plain), Run(folder=tmp_path / "plain"))
+    assert str(error.value) == (
+        f"{path}: was trained with with_bias = True, but the config says False. Give the config "
+        "the weights' own."
+    )
+    biased = dataclasses.replace(plain, with_bias=True)
+    still = _training(start=str(path), network=biased, adam=AdamConfig(learning_rate=1e-12))
+    then = read_pose_weights(train_pose(still, Run(folder=tmp_path / "biased"))).network
+    for name, tensor in network.state_dict().items():
+        assert torch.allclose(then.state_dict()[name], tensor, atol=1e-6), name
+
+
 def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:
     whole = train_pose(_training(), Run(folder=tmp_path / "whole"))
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
@@ -286,18 +334,79 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> 
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_the_refusal_is_chosen_on_views_of_its_own(tmp_path: Path) -> None:
-    path = train_pose(_training(), Run(folder=tmp_path))
-    weights = read_pose_weights(path)
-    config = CalibrationConfig(number=20)
-    chosen = calibrated(weights, _MADE, config)
-    # Three steps teach nothing: nearly all answers are wrong, so nearly none may be given.
-    table = judged(chosen, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
-    assert (table["0"]["wrong"] or 0.0) <= 0.5
-    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
+def test_weights_are_calibrated_and_judged_as_the_file_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[PoseWeights] = []
+
+    def chosen(weights: PoseWeights, *_: object) -> PoseWeights:
+        seen.append(weights)
+        return dataclasses.replace(weights, refusal=RefusalConfig(bias=-1.0, slopes={"far": 2.0}))
+
+    def counted(weights: PoseWeights, *_: object) -> dict[str, dict[str, float | None]]:
+        seen.append(weights)
+        return {}
+
+    monkeypatch.setattr("depthpose.pose.train.runs.calibrated", chosen)
+    monkeypatch.setattr("depthpose.pose.train.runs.judged", counted)
+    path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
+    written = read_pose_weights(path)
+    assert len(seen) == 2
+    for weights in seen:
+        for name, tensor in written.network.state_dict().items():
+            assert torch.equal(weights.network.state_dict()[name], tensor), name
+    assert written.refusal == seen[1].refusal
+    assert written.refusal.slopes == {"far": 2.0}
+
+
+def _as_known(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+    """Answers of which 2 in 5 are wrong: those of a large signal. The refusal alone decides."""
+    estimates, errors = [], []
+    for index in range(len(objects)):
+        far = (37 * index % 100) / 100
+        signals = dict.fromkeys(SIGNALS, 0.0) | {"far": far}
+        risk = risk_of(signals, weights.refusal)
+        is_ok = risk is None or risk <= weights.refusal.max_risk
+        pose = Rigid(torch.eye(3), torch.ones(3)) if is_ok else None
+        status, reason = ("ok", "") if is_ok else ("doubtful", "so")
+        estimates.append(PoseEstimate(name="", object="", status=status, reason=reason,
+                                      camera_from_model=pose, signals=signals))  # fmt: skip
+        errors.append((0.02 if far < 0.6 else 0.4) if is_ok else math.inf)
+    return estimates, errors
+
+
+def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("depthpose.pose.train.judge._posed", _as_known)
+    weights = tiny_weights(*_models())
+    held_out = HeldOutConfig(number=100, occlusions=(0.0,))
+    uncalibrated = judged(weights, _MADE, held_out)["0"]
+    assert uncalibrated["wrong"] == pytest.approx(0.4)
+    chosen = calibrated(weights, _MADE, CalibrationConfig(number=200, max_wrong_share=0.02))
+    table = judged(chosen, _MADE, held_out)
+    assert (table["0"]["wrong"] or 0.0) <= 0.02
+    assert (table["0"]["right"] or 0.0) > 0.55
+    opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
+    without = judged(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
+    assert without["wrong"] == pytest.approx(0.4)
     text = card_text(weights.models, {"licence": "MIT"}, table)
     assert "| hidden % | right % | wrong % | refused %" in text
     assert "Licence: MIT." in text
+
+
+def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Objects] = []
+
+    def posed(_: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+        seen.append(objects)
+        return _as_known(weights, objects)
+
+    monkeypatch.setattr("depthpose.pose.train.judge._posed", posed)
+    weights = tiny_weights(*_models())
+    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
+    _ = calibrated(weights, _MADE, CalibrationConfig(number=20))
+    _ = judged(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
+    calibration, held_out = (objects[0].input.points_m for objects in seen)
+    assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
 
 def test_models_come_from_one_source(tmp_path: Path) -> None:
@@ -318,9 +427,27 @@ def test_symmetries_of_a_cad_file_are_told_and_taken_where_asked(tmp_path: Path)
     assert plain.symmetries.is_none
     assert "flange: looks the same after 5 turns, about 0 axes" in told[0]
     assert "--symmetries found" in told[0]
+    (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", told[0])
+    assert float(certainty) > 0.5
     (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), told.append)
     assert taken.symmetries.discrete is not None
     assert len(taken.symmetries.discrete.R) == 5
+
+
+def test_symmetries_that_a_data_set_does_not_declare_are_found_too(tmp_path: Path) -> None:
+    declared = dataclasses.replace(bottle(), number=1)
+    silent = dataclasses.replace(bottle(), number=2, symmetries=Symmetries())
+    write_bop_models(tmp_path, [declared, silent])
+    told: list[str] = []
+    config = ModelsConfig(bop=str(tmp_path), with_found_symmetries=True)
+    models = read_models(config, told.append)
+    assert [len(model.symmetries.continuous) for model in models] == [1, 1]
+    axis = models[1].symmetries.continuous[0].direction
+    assert float(axis[2].abs()) == pytest.approx(1, abs=1e-3)
+    # What is declared stands, and nobody looks for more.
+    assert len(told) == 1
+    assert "about 1 axes" in told[0]
+    assert read_models(ModelsConfig(bop=str(tmp_path)))[1].symmetries.is_none
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)

@@ -1,10 +1,11 @@
-"""Shape names, and the units and conventions they carry.
+"""Shape names, and the units and conventions they carry; rows taken at even steps.
 
 Everything that flows is a ``torch.Tensor``; only files know bytes. Batched forms put ``*batch`` in
 front. Invalid values of a map are NaN in memory and in NPY files, and 0 in 16-bit PNG files.
 """
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 Image = Float[Tensor, "3 h w"]
@@ -21,3 +22,10 @@ Points = Float[Tensor, "n 3"]
 
 Matrix3 = Float[Tensor, "3 3"]
 """A 3x3 matrix: intrinsics ``K``, fundamental ``F``, essential ``E`` or a rotation ``R``."""
+
+
+def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:
+    """Take ``count`` rows at even steps, the first among them; all where there are no more."""
+    if len(rows) <= count:
+        return rows
+    return rows[torch.arange(count, device=rows.device) * len(rows) // count]

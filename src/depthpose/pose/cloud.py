@@ -18,12 +18,13 @@ class Voxels:
     """Which cells of a grid a cloud fills, and the point that was kept in each.
 
     Attributes:
-        coordinates: cell of each kept point, ``floor((x - mean) / voxel)`` of the turned cloud; no
-            two are equal.
+        cells: cell of every point, ``floor((x - mean) / voxel)`` of the turned cloud.
+        coordinates: those of the kept points; no two are equal.
         kept: index of that point in the cloud, ascending: the first of its cell.
         grid_from_camera: how the cloud was turned before.
     """
 
+    cells: Int64[Tensor, "n 3"]
     coordinates: Int64[Tensor, "m 3"]
     kept: Int64[Tensor, " m"]
     grid_from_camera: Float[Tensor, "3 3"]
@@ -144,4 +145,4 @@ def voxelise(
     order = torch.arange(len(cells), device=cells.device)
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
     kept = first.scatter_reduce_(0, cell, order, "amin").sort().values
-    return Voxels(coordinates=cells[kept], kept=kept, grid_from_camera=turn)
+    return Voxels(cells=cells, coordinates=cells[kept], kept=kept, grid_from_camera=turn)

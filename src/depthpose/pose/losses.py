@@ -82,7 +82,7 @@ def direction_loss(
     It is the same whichever of the symmetric truths stands first.
 
     Args:
-        found: raw outputs of each point's own class (``select_class``).
+        found: raw outputs of each point's own class.
         points_m: where each point lies, in the frame of the keypoints.
         copies_m: keypoints of each instance under each of its object's symmetries; objects with
             fewer than others repeat a copy.

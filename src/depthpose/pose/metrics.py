@@ -84,6 +84,19 @@ def adds_m(
     return torch.tensor(means, dtype=torch.float64).reshape(first.shape[:-2])
 
 
+def add_share(
+    estimated: Rigid,
+    true: Rigid,
+    points_m: Float[Tensor, "n 3"],
+    diameter_m: float,
+    *,
+    is_adds: bool,
+) -> float:
+    """ADD, or ADD-S where that decides (a symmetric object), in diameters."""
+    error_m = adds_m if is_adds else add_m
+    return float(error_m(estimated, true, points_m)) / diameter_m
+
+
 def mssd_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
@@ -160,9 +173,12 @@ def vsd(
 
 
 def is_within_diameter(
-    error_m: Float[Tensor, "*batch"], diameter_m: float, share: float = 0.1
+    error_m: Float[Tensor, "*batch"], diameter_m: float = 1.0, share: float = 0.1
 ) -> Bool[Tensor, "*batch"]:
-    """Whether an ADD or ADD-S is below a share of the diameter; NaN (no estimate) is not."""
+    """Whether an ADD or ADD-S is below a share of the diameter; NaN (no estimate) is not.
+
+    Errors in diameters, as :func:`add_share` gives them, have a diameter of 1.
+    """
     return error_m < share * diameter_m
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import IcpConfig
@@ -103,7 +104,7 @@ def refine_pose(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
             "not finite: leave those out, and refuse a cloud of none."
         )
-    cloud = _thin(points_m.double(), config.cloud_points)
+    cloud = take_evenly(points_m.double(), config.cloud_points)
     pose = Rigid(initial.R.double(), initial.t_m.double())
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     for limit_m in _limits(config, surface.diameter_m):
@@ -171,12 +172,6 @@ def _limits(config: IcpConfig, diameter_m: float) -> list[float]:
     half = max(1, config.iterations // 2)
     shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     return [share * diameter_m for share in shares]
-
-
-def _thin(cloud: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "m 3"]:
-    if len(cloud) <= count:
-        return cloud
-    return cloud[torch.arange(count) * len(cloud) // count]
 
 
 def _middle(cloud: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:

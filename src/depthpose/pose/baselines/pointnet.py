@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.pose.baselines.config import PointNetConfig
+from depthpose.pose.sparse import RowNorm
 
 KIND = "pointnet"
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
@@ -100,20 +100,10 @@ class _Transform(nn.Module):
         return matrix.view(count, self.width, self.width) + eye
 
 
-class _RowNorm(nn.BatchNorm1d):
-    """Batch norm that takes a single row, which has no variance, by its running statistics."""
-
-    def forward(self, input: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        if len(input) > 1:
-            return super().forward(input)
-        statistics = (self.running_mean, self.running_var)
-        return F.batch_norm(input, *statistics, self.weight, self.bias, eps=self.eps)
-
-
 def _layers(widths: Sequence[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [nn.Linear(inputs, outputs, bias=False), _RowNorm(outputs), nn.ReLU()]
+        layers += [nn.Linear(inputs, outputs, bias=False), RowNorm(outputs), nn.ReLU()]
     return nn.Sequential(*layers)
 
 

@@ -1,9 +1,11 @@
 """The layout of DenseFusion's ``Linemod_preprocessed`` to instances."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from depthpose.core.errors import InputError
@@ -11,14 +13,30 @@ from depthpose.core.files import read_text
 from depthpose.core.files.disk import refused_as
 from depthpose.pose.bop.frames import Instance
 from depthpose.pose.bop.parse import camera_from_bop, integer, pose_from_bop
+from depthpose.pose.mesh import turn_about
+from depthpose.pose.types import Symmetries
 
 _LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster than the loader in Python, where PyYAML was built with it."""
+
+SYMMETRIC = (10, 11)
+"""Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
 
 
 def is_linemod(folder: Path) -> bool:
     """Whether a folder is laid out as Linemod_preprocessed."""
     return any(folder.glob("data/[0-9][0-9]/gt.yml"))
+
+
+def linemod_symmetries(number: int) -> Symmetries:
+    """Give what ``models_info.yml`` does not say: eggbox and glue, turned half about z, look alike.
+
+    BOP's ``models_info.json`` of the same meshes declares these turns.
+    """
+    if number not in SYMMETRIC:
+        return Symmetries()
+    up, origin = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double()
+    return Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi]).double()))
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.core.errors import InputError
-from depthpose.pose.bop.linemod import read_yaml
+from depthpose.pose.bop.linemod import is_linemod, linemod_symmetries, read_yaml
 from depthpose.pose.bop.parse import number, read_mapping
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import read_model, symmetries_from_bop
@@ -57,7 +57,8 @@ def read_bop_models(
 ) -> dict[int, ObjectModel]:
     """Read models with their declared symmetries, diameters and names.
 
-    The diameter is the declared one, where there is one: published numbers are shares of it.
+    The diameter is the declared one, where there is one: published numbers are shares of it. The
+    two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
 
     Raises:
         InputError: a mesh is missing, or something is damaged.
@@ -70,12 +71,15 @@ def read_bop_models(
         if path is None:
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
         info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
+        symmetries = symmetries_from_bop(info, source=source)
+        if symmetries.is_none and is_linemod(folder):
+            symmetries = linemod_symmetries(wanted)
         model = read_model(
             path,
             "mm",
             name=object_name(wanted, info),
             number=wanted,
-            symmetries=symmetries_from_bop(info, source=source),
+            symmetries=symmetries,
             config=config,
         )
         declared_m = 0.001 * number(info, "diameter", 1000 * model.diameter_m, source)

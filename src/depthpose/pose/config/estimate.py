@@ -20,6 +20,10 @@ class RefusalConfig:
     slopes: dict[str, float] = field(default_factory=dict)
     """How much each signal adds to the log odds; none: no estimate is refused for its risk."""
 
+    means: dict[str, float] = field(default_factory=dict)
+    """Of each signal over right answers: a refusal names the signal that lies farthest above its
+    mean, weighed by its slope. 0 where there is none."""
+
     min_hold: float = 0.02
     """A motion that no declared symmetry excuses must carry the seen surface across itself by this
     share of what it moves the object's points; one that only slides it along itself (a plane, a

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.refine import Surface
 from depthpose.pose.types import PoseFit, Vote
@@ -50,7 +51,7 @@ def surface_signals(
     that nobody saw may merely be hidden by something else.
     """
     limit_m = NEAR * surface.diameter_m
-    distance_m = _distances(_thin(cloud_m.double()), pose, surface)
+    distance_m = _distances(take_evenly(cloud_m.double(), _JUDGED), pose, surface)
     near_m = distance_m[distance_m < limit_m]
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
     front, unseen = _look_along_rays(cloud_m.double(), pose, surface)
@@ -79,7 +80,7 @@ def hold_of(
         The hold, and the weakest motion: (rotation, translation at the middle of the cloud), unit
         length after scaling.
     """
-    points = _thin(cloud_m.double())
+    points = take_evenly(cloud_m.double(), _JUDGED)
     local = pose.inverse().apply(points)
     distance_m, index = surface.tree.query(local.numpy(), workers=1)
     near = torch.from_numpy(distance_m < NEAR * surface.diameter_m)
@@ -134,12 +135,6 @@ def _distances(
 ) -> Float64[Tensor, " n"]:
     distance_m, _ = surface.tree.query(pose.inverse().apply(points).numpy(), workers=1)
     return torch.from_numpy(distance_m)
-
-
-def _thin(cloud: Float64[Tensor, "n 3"]) -> Float64[Tensor, "m 3"]:
-    if len(cloud) <= _JUDGED:
-        return cloud
-    return cloud[torch.arange(_JUDGED) * len(cloud) // _JUDGED]
 
 
 def _scaled(

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.pose.cloud import (
     cloud_from_depth,
     is_flying,
@@ -90,8 +91,7 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
             return Refusal(status="too few points", reason=_nothing_seen(given))
     else:
         points_m = given.points_m.float()
-    if len(points_m) > most:
-        points_m = points_m[torch.arange(most) * len(points_m) // most]
+    points_m = take_evenly(points_m, most)
     finite_m = points_m[points_m.isfinite().all(-1)]
     if len(finite_m) == 0:
         what = "is empty" if len(points_m) == 0 else "has no point with finite coordinates"

@@ -39,8 +39,12 @@ def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None
 
 
 def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) -> str:
-    """Say in a sentence what makes an answer doubtful most."""
-    worst = max(config.slopes, key=lambda name: config.slopes[name] * signals[name])
+    """Say in a sentence what makes an answer doubtful most, by how far it is above the usual."""
+
+    def excess(name: str) -> float:
+        return config.slopes[name] * (signals[name] - config.means.get(name, 0.0))
+
+    worst = max(config.slopes, key=excess)
     return (
         f"{SIGNALS[worst].format(signals[worst])}: the risk of a wrong pose is {risk:.2g}, above "
         f"the {config.max_risk:.2g} that was settled"
@@ -92,6 +96,7 @@ def calibrate_refusal(
         max_risk=_choose_limit(risks, wrong, max_wrong_share),
         bias=float(bias),
         slopes=dict(zip(_LEARNT, slopes.tolist(), strict=True)),
+        means=_means(x[wrong == 0]),
     )
 
 
@@ -114,6 +119,10 @@ def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
     found = minimize(loss, np.zeros(1 + z.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B")
     slopes = found.x[1:] / spread
     return float(found.x[0] - middle @ slopes), slopes
+
+
+def _means(x: np.ndarray) -> dict[str, float]:
+    return dict(zip(_LEARNT, x.mean(0).tolist(), strict=True)) if len(x) else {}
 
 
 def _choose_limit(risks: np.ndarray, wrong: np.ndarray, share: float) -> float:

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.draw import draw_lines
 from depthpose.pose.figures.canvas import blank, draw_discs
 
@@ -42,7 +43,7 @@ def draw_field(
     def place(xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
         return (xy - middle) * scale + size_px / 2
 
-    chosen = torch.arange(min(len(plane), _ARROWS)) * len(plane) // min(len(plane), _ARROWS)
+    chosen = take_evenly(torch.arange(len(plane)), _ARROWS)
     starts = place(plane[chosen])
     image = _draw_arrows(blank(size_px, size_px), starts, directions.double()[chosen, :2])
     image = _draw_star(image, place(marks[:1])[0])

@@ -3,6 +3,7 @@
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import make_model as make_model
 from depthpose.pose.mesh.models import read_model as read_model
+from depthpose.pose.mesh.propose import SURE as SURE
 from depthpose.pose.mesh.propose import SymmetryProposal as SymmetryProposal
 from depthpose.pose.mesh.propose import propose_symmetries as propose_symmetries
 from depthpose.pose.mesh.propose import symmetries_from_proposals as symmetries_from_proposals

@@ -22,6 +22,10 @@ MESHES = (".ply", ".stl", ".obj", ".glb")
 CLOUDS = (".pcd", ".npy", ".xyz", ".txt")
 _COARSE = 1000
 """A mesh of fewer points (a CAD box has eight) lends keypoints from inside its faces too."""
+_NO_AREA = 1e-12
+"""Of the square of the extent: a face of no more is a line or a point."""
+_LEAST_AREA = 1e-6
+"""Of the square of the extent: all faces of less are no surface. A wire has 0.003."""
 _LARGEST_M, _SMALLEST_M = 20.0, 0.002
 
 
@@ -45,8 +49,8 @@ def read_model(
         config: how many keypoints.
 
     Raises:
-        InputError: the file is missing, damaged or of another format, holds no extent, or is so
-            large or small that the unit must be another.
+        InputError: the file is missing, damaged or of another format, holds no extent or faces
+            without area, or is so large or small that the unit must be another.
     """
     scale = METRES[unit]
     vertices, faces = _read_geometry(path)
@@ -139,7 +143,38 @@ def _read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: holds {len(vertices)} points, or one that is not finite; a model needs 4 and "
             "more. Export it again."
         )
-    return vertices, faces
+    return vertices, _sound_faces(path, vertices, faces)
+
+
+def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Drop faces without area, and all but the first of those on the same three points.
+
+    A face and its reverse would cancel in the normals. Holes are no flaw.
+    """
+    if len(faces) == 0:
+        return faces
+    wrong = (faces < 0) | (faces >= len(vertices))
+    if wrong.any():
+        face, corner = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{path}: face {face} names point {faces[face, corner]}, but the {len(vertices)} "
+            f"points are numbered 0 .. {len(vertices) - 1}; the file is damaged. Export it again."
+        )
+    corners = vertices[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
+    square = float(np.ptp(vertices, axis=0).max()) ** 2
+    if area.sum() <= _LEAST_AREA * square:
+        raise InputError(
+            f"{path}: its {len(faces)} faces have no area, so there is no surface to see; all are "
+            "lines or points. Export it again as triangles, or as points without faces."
+        )
+    # By place, not by number: STL repeats the points of every face.
+    _, place = np.unique(vertices, axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
+    is_first = np.zeros(len(faces), bool)
+    is_first[first] = True
+    return faces[is_first & (area > _NO_AREA * square)]
 
 
 def _vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:

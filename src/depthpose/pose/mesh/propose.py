@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
 from depthpose.pose.mesh.sampling import fibonacci_directions, sample_surface
 from depthpose.pose.mesh.symmetry import turn_about
@@ -22,6 +23,8 @@ _COARSE = 0.04
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SHADOW_RAD = 0.25
+SURE = 0.5
+"""Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
 _MOST_AXES = 40
 """A cube has 13 axes, an icosahedron 31."""
 
@@ -59,8 +62,7 @@ class _Surface:
         self._rough_tree = KDTree(self._every(2500).numpy())
 
     def _every(self, count: int) -> Float[Tensor, "m 3"]:
-        index = torch.arange(count) * len(self.points) // count
-        return self.points[index.unique()]
+        return take_evenly(self.points, count)
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Give distance and index of the nearest sample."""
@@ -126,7 +128,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 
 
 def symmetries_from_proposals(
-    proposals: list[SymmetryProposal], min_certainty: float = 0.5
+    proposals: list[SymmetryProposal], min_certainty: float = SURE
 ) -> Symmetries:
     """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
 

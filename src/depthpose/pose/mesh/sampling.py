@@ -8,6 +8,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.pose.types import ObjectModel
 
@@ -56,7 +57,8 @@ def sample_surface(
         count: how many; a model of points may have fewer.
     """
     if len(model.faces) == 0:
-        return _thin(model, count)
+        # Farthest points would be evener, and quadratic; point models are even as they come.
+        return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.triangles_m.double()
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = doubled.norm(dim=-1)
@@ -87,15 +89,6 @@ def estimate_normals(points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     is_inward = ((points - points.mean(0)) * normals).sum(-1) < 0
     normals[is_inward] *= -1
     return torch.from_numpy(normals).to(points_m)
-
-
-def _thin(model: ObjectModel, count: int) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    total = len(model.vertices_m)
-    if count >= total:
-        return model.vertices_m, model.normals
-    # Farthest points would be evener, and quadratic; point models are even as they come.
-    index = torch.arange(count) * total // count
-    return model.vertices_m[index], model.normals[index]
 
 
 def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:

@@ -3,7 +3,7 @@
 from depthpose.pose.network.config import ResUNetConfig
 from depthpose.pose.network.fold import fold_norms, unfold_norms
 from depthpose.pose.network.published import import_fcgf, resunet_from_published
-from depthpose.pose.network.resunet import ResUNet, select_class
+from depthpose.pose.network.resunet import ResUNet
 from depthpose.pose.network.weights import KIND, network_of, read_network, write_network
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "network_of",
     "read_network",
     "resunet_from_published",
-    "select_class",
     "unfold_norms",
     "write_network",
 ]

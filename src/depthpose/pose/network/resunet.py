@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.pose.network.config import ResUNetConfig
-from depthpose.pose.sparse import SparseConv, SparseConvTranspose, Voxels
+from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 
 BRANCH_SCALE = 0.25
 """Without norms the second convolution of each block begins this much smaller: seven blocks in a
@@ -18,20 +18,6 @@ small weights learn faster. Measured with lr 2e-3: the loss after 100 steps is 0
 
 MOMENTUM = 0.05
 """Of batch norm, as FCGF trains."""
-
-
-class RowNorm(nn.BatchNorm1d):
-    """Batch norm over voxels, which takes a level of fewer than two of them.
-
-    One voxel has no variance; torch refuses it in training. Its running statistics serve instead.
-    """
-
-    def forward(self, input: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
-        """Normalise each channel over the voxels of all clouds."""
-        if len(input) > 1:
-            return super().forward(input)
-        statistics = (self.running_mean, self.running_var)
-        return F.batch_norm(input, *statistics, self.weight, self.bias, eps=self.eps)
 
 
 class ConvNorm(nn.Module):
@@ -163,14 +149,6 @@ class ResUNet(nn.Module):
         for up, block in zip(self.up, self.up_blocks, strict=True):
             voxels = _beside(block(up(voxels)), seen.pop())
         return _relu(self.mix(voxels))
-
-
-def select_class(
-    outputs: Float[Tensor, "points classes keypoints components"],
-    class_of_point: Int[Tensor, " points"],
-) -> Float[Tensor, "points keypoints components"]:
-    """Keep the channels of each point's own class."""
-    return outputs[torch.arange(len(outputs), device=outputs.device), class_of_point]
 
 
 def _same(inputs: int, outputs: int, kernel: int, config: ResUNetConfig) -> ConvNorm:

@@ -9,13 +9,14 @@ from depthpose.pose.sparse.cache import CoordinateCache
 from depthpose.pose.sparse.conv import conv
 from depthpose.pose.sparse.kernel_map import KernelMap, kernel_offsets
 from depthpose.pose.sparse.keys import COORDINATE_LIMIT, batch_coordinates
-from depthpose.pose.sparse.layers import SparseConv, SparseConvTranspose
+from depthpose.pose.sparse.layers import RowNorm, SparseConv, SparseConvTranspose
 from depthpose.pose.sparse.voxels import Voxels
 
 __all__ = [
     "COORDINATE_LIMIT",
     "CoordinateCache",
     "KernelMap",
+    "RowNorm",
     "SparseConv",
     "SparseConvTranspose",
     "Voxels",

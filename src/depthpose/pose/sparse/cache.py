@@ -4,7 +4,7 @@ from torch import Tensor
 
 from depthpose.pose.sparse.kernel_map import KernelMap, Meetings, kernel_offsets
 from depthpose.pose.sparse.keys import REACH, Keys, coarsen, unpack
-from depthpose.pose.sparse.search import MARGIN, VoxelIndex
+from depthpose.pose.sparse.search import MARGIN, VoxelIndex, reach_beyond
 
 
 class CoordinateCache:
@@ -37,13 +37,14 @@ class CoordinateCache:
 
         Args:
             level: the level that it reads.
-            kernel: its size: 1, 3, 5 or 7; with a stride 2 and 4 too.
+            kernel: its size: 1, 3, 5 or 7 (3 at most with stride 4); with a stride 2 and 4 too.
             stride: a power of two; with 1 it writes the level that it reads.
             is_transposed: True writes a finer level, False a coarser one.
         """
         assert stride & (stride - 1) == 0, f"stride must be a power of two, got {stride}"
         assert kernel % 2 or stride > 1, "an even kernel has no centre: it needs a stride"
-        assert kernel <= (2 * MARGIN - 1 if kernel % 2 else MARGIN), f"kernel {kernel} is too large"
+        reach = reach_beyond(kernel, stride)
+        assert reach <= MARGIN, f"kernel {kernel} with stride {stride} looks {reach} cells beyond"
         levels = stride.bit_length() - 1
         fine = level - levels if is_transposed else level
         assert fine >= 0, f"level {level} has no level {levels} finer"

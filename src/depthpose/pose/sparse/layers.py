@@ -1,10 +1,26 @@
 """Sparse convolutions as modules."""
 
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.pose.sparse.conv import conv
 from depthpose.pose.sparse.voxels import Voxels
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over rows (voxels, points, clouds), which takes a single one.
+
+    One row has no variance; torch refuses it in training. Its running statistics serve instead.
+    """
+
+    def forward(self, input: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Normalise each channel over all rows."""
+        if len(input) > 1:
+            return super().forward(input)
+        statistics = (self.running_mean, self.running_var)
+        return F.batch_norm(input, *statistics, self.weight, self.bias, eps=self.eps)
 
 
 class SparseConv(nn.Module):

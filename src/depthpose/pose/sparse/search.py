@@ -9,12 +9,21 @@ from depthpose.pose.sparse.keys import Keys, packed_move, unpack
 Moves = tuple[tuple[int, int, int], ...]
 
 MARGIN = 4
-"""Cells about the box: as far as a kernel looks beyond it, and one more where a coarser level's
-voxels lie outside."""
+"""Cells about the box: as far as a kernel may look beyond it (:func:`reach_beyond`). With fewer a
+look past one row's end would find the next row."""
 
 MAX_CELLS = 1 << 24
 CELLS_PER_VOXEL = 512
 """A box with more cells than these is mostly air: binary search is then the cheaper."""
+
+
+def reach_beyond(kernel: int, stride: int) -> int:
+    """Cells that a kernel looks beyond the box of the finer level's voxels.
+
+    A coarser voxel lies up to ``stride - 1`` cells below the lowest finer one in it. An odd kernel
+    looks both ways from it, an even one forward alone.
+    """
+    return kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
 
 
 class VoxelIndex:

@@ -18,13 +18,12 @@ from depthpose.pose.baselines.one_by_one import ransac_one_by_one
 from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.metrics import add_m, adds_m
+from depthpose.pose.metrics import add_share, is_within_diameter
 from depthpose.pose.network import ResUNet
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import ObjectModel, ViewSample, Vote
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 
-SUCCESS_SHARE = 0.1
 _ADD_POINTS = 1000
 LOOP_HYPOTHESES = 50
 """Of the loop: published practice."""
@@ -169,9 +168,9 @@ def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
     alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
     pose = fit_pose(keypoints_m, alike, case.model.keypoints_m).camera_from_model
     step = max(1, len(case.model.vertices_m) // _ADD_POINTS)
-    measure = adds_m if case.is_adds else add_m
-    error_m = float(measure(pose, case.truth, case.model.vertices_m[::step]))
-    return error_m < SUCCESS_SHARE * case.model.diameter_m
+    points_m, diameter_m = case.model.vertices_m[::step], case.model.diameter_m
+    share = add_share(pose, case.truth, points_m, diameter_m, is_adds=case.is_adds)
+    return bool(is_within_diameter(torch.tensor(share)))
 
 
 @torch.inference_mode()
@@ -180,9 +179,7 @@ def _directions(
 ) -> Float[Tensor, "n k 3"]:
     """Ask for the direction of every point, not of one a voxel: those of a voxel share it."""
     grid = voxelise(points_m, cloud.voxel_m, with_sight_axis=cloud.with_sight_axis)
-    turned_m = (points_m - points_m.mean(0)) @ grid.grid_from_camera.mT
-    cells = torch.floor(turned_m / cloud.voxel_m).long()
-    rows = torch.cat([torch.zeros_like(cells[:, :1]), cells], 1)
+    rows = torch.cat([torch.zeros_like(grid.cells[:, :1]), grid.cells], 1)
     voxels = Voxels.from_points(rows, duplicates="mean")
     outputs = network.forward_class(voxels, number)[..., :3] @ grid.grid_from_camera
     return torch.nn.functional.normalize(outputs, dim=-1)

@@ -32,7 +32,7 @@ class ModelsConfig:
     """Keypoints of each."""
 
     with_found_symmetries: bool = False
-    """Look for symmetries of CAD files, and count the copies as right."""
+    """Look for symmetries of models that declare none, and count the copies as right."""
 
     licence: str = "not stated; that of the models binds"
     """Under which the weights may be used."""

@@ -20,6 +20,7 @@ from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator import DepthImageRegressor
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.metrics import is_within_diameter
 from depthpose.pose.objects import Objects
 from depthpose.pose.train.baselines_config import DepthImageTraining
 from depthpose.pose.train.held_out import held_out_objects, pose_error
@@ -144,7 +145,7 @@ class DepthImageTask:
                 for index, (estimate, view) in enumerate(zip(found, views, strict=True))
             ])  # fmt: skip
             place = f"held_out/occluded_{round(100 * occlusion)}/regressed"
-            numbers[f"{place}_add_10"] = float((errors < 0.1).float().mean())
+            numbers[f"{place}_add_10"] = float(is_within_diameter(errors).float().mean())
             numbers[f"{place}_median"] = float(errors.median())
         return Evidence(numbers=numbers)
 

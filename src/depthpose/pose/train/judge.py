@@ -3,9 +3,12 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import torch
+
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
+from depthpose.pose.metrics import is_within_diameter
 from depthpose.pose.objects import Objects
 from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig
 from depthpose.pose.train.held_out import held_out_objects, pose_error
@@ -13,8 +16,6 @@ from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.pose.weights import PoseWeights
 
 _CALIBRATION_SEED = 0xCA11B
-_RIGHT = 0.1
-"""Of the diameter: ADD, or ADD-S of a symmetric object."""
 _TOGETHER = 32
 
 Table = Mapping[str, Mapping[str, float | None]]
@@ -41,9 +42,8 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     )
     estimates, errors = _posed(open_weights, Objects(weights.models, views, weights.cloud))
     try:
-        refusal = calibrate_refusal(
-            estimates, [error < _RIGHT for error in errors], config.max_wrong_share
-        )
+        is_right = is_within_diameter(torch.tensor(errors)).tolist()
+        refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
     except InputError:
         return weights
     return dataclasses.replace(weights, refusal=refusal)
@@ -56,7 +56,7 @@ def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> 
         objects = held_out_objects(weights.models, made, weights.cloud, config, occlusion)
         estimates, errors = _posed(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
-        right = sum(error < _RIGHT for error in answered)
+        right = int(is_within_diameter(torch.tensor(answered)).sum())
         table[f"{round(100 * occlusion)}"] = {
             "right": right / len(errors),
             "wrong": (len(answered) - right) / len(errors),

@@ -7,6 +7,7 @@ from pathlib import Path
 from depthpose.core.errors import InputError
 from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
 from depthpose.pose.mesh import (
+    SURE,
     propose_symmetries,
     read_model,
     symmetries_from_proposals,
@@ -23,7 +24,7 @@ def read_models(
 
     Args:
         config: which.
-        tell: told of symmetries that were found in CAD files, taken or not.
+        tell: told of symmetries that were found and are not declared, taken or not.
 
     Raises:
         InputError: none is named, or of two kinds, two have one name, or a file is damaged.
@@ -33,10 +34,13 @@ def read_models(
         raise InputError(f"{' and '.join(given)} are given; take the models from one of them")
     if config.parts:
         return tuple(make_part(p, n, config.mesh) for n, p in enumerate(config.parts, start=1))
-    if config.bop:
-        return _from_bop(Path(config.bop), config)
-    if not config.cad:
+    if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
+    models = _from_bop(Path(config.bop), config) if config.bop else _from_cad(config)
+    return tuple(_with_symmetries(model, config, tell) for model in models)
+
+
+def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
     models = tuple(
         read_model(path, config.unit, number=number, config=config.mesh)
         for number, path in enumerate(config.cad, start=1)
@@ -47,7 +51,7 @@ def read_models(
         raise InputError(
             f"two CAD files are called {twice[0]!r}, and an object is known by its name; rename one"
         )
-    return tuple(_with_symmetries(model, config, tell) for model in models)
+    return models
 
 
 def _from_bop(folder: Path, config: ModelsConfig) -> tuple[ObjectModel, ...]:
@@ -68,13 +72,20 @@ def _numbers(home: Path) -> list[int]:
 def _with_symmetries(
     model: ObjectModel, config: ModelsConfig, tell: Callable[[str], None] | None
 ) -> ObjectModel:
-    if not len(model.faces):
+    """Look for what is not declared; what is, stands."""
+    is_wanted = config.with_found_symmetries or tell is not None
+    if not is_wanted or not len(model.faces) or not model.symmetries.is_none:
         return model
-    found = symmetries_from_proposals(propose_symmetries(model))
+    proposals = propose_symmetries(model)
+    found = symmetries_from_proposals(proposals)
     if found.is_none:
         return model
     turns = 0 if found.discrete is None else len(found.discrete.R)
-    what = f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes"
+    sure = [p.certainty for p in proposals if p.certainty >= SURE]
+    what = (
+        f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
+        f"(certainty {min(sure):.2f} and more)"
+    )
     if tell is not None and config.with_found_symmetries:
         tell(f"{what}; each copy counts as right")
     elif tell is not None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 
@@ -26,7 +27,7 @@ from depthpose.pose.train.segmentation import train_segmentation
 from depthpose.pose.train.segmentation_config import SegmentationTraining
 from depthpose.pose.train.task import PoseTask
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.weights import read_pose_weights, write_pose_weights
+from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 _LIKE_THOSE_TO_COME = 64
 """Clouds whose statistics stand in for those that folding took."""
@@ -69,16 +70,25 @@ STAGES = {
 def _leave(
     path: Path, network: ResUNet | PointNet, models: tuple[ObjectModel, ...], config: PoseTraining
 ) -> Path:
-    """Calibrate the refusal, judge the whole estimator, and write weights and card."""
+    """Calibrate the refusal, write the weights, judge what the file holds, and write its card."""
     if find_shard().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
-    weights = calibrated(packed(network, models, config), config.objects, config.calibration)
-    table = judged(weights, config.objects, config.held_out)
+    weights = _as_written(packed(network, models, config), with_half=config.with_half)
+    weights = calibrated(weights, config.objects, config.calibration)
     write_pose_weights(path, weights, with_half=config.with_half)
+    table = judged(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
     with atomic_write(path.with_suffix(".md")) as part:
         part.write_text(card_text(models, weights.facts, table))
     return path
+
+
+def _as_written(weights: PoseWeights, *, with_half: bool) -> PoseWeights:
+    """Give what a file of these weights holds: 16 bits round them."""
+    with TemporaryDirectory() as home:
+        path = Path(home) / "weights.safetensors"
+        write_pose_weights(path, weights, with_half=with_half)
+        return read_pose_weights(path)
 
 
 def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
@@ -88,12 +98,15 @@ def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
 def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
     """Copy weights; of other objects, all but the last layer.
 
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up.
+
     Raises:
         InputError: a network of another shape.
     """
     found = read_pose_weights(find_weights(start)).network
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
-    free = ("classes", "norm", "with_bias") if isinstance(network, ResUNet) else ()
+    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
+    free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
     for knob, value in wanted.items():
         if knob not in free and given.get(knob) != value:
             raise InputError(

@@ -9,6 +9,8 @@ from depthpose.pose.types import Axis, PoseFit
 
 _STEPS = 4
 """Gauss-Newton from Kabsch converges quadratically; the fourth step is below float64's noise."""
+_OTHER_AXIS = 0.1
+"""Sine of the angle between two axes from which they are two."""
 
 
 def fit_pose(
@@ -61,16 +63,35 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
     """Give the motions of the camera frame that turn the object about its axes of revolution.
 
     Unit vectors of (rotation, translation): along them no observation says anything, the variance
-    is infinite, and the pose stands all the same.
+    is infinite, and the pose stands all the same. Two axes make a ball, which is free to turn
+    about the third too.
     """
     rows = []
-    for axis in axes:
+    for axis in _with_third(axes):
         direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
         point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
         # Turning by w about a line through c moves c nowhere: w x c + v = 0.
         motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
         rows.append(motion / motion.norm())
     return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
+
+
+def _with_third(axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
+    """Add what two axes imply: turns about both, one after the other, turn about every axis."""
+    for other in axes[1:]:
+        across = torch.linalg.cross(axes[0].direction, other.direction)
+        if float(across.norm()) > _OTHER_AXIS:
+            third = Axis(direction=across / across.norm(), point_m=_meeting_m(axes[0], other))
+            return axes[0], other, third
+    return axes[:1]
+
+
+def _meeting_m(first: Axis, other: Axis) -> Float[Tensor, "3"]:
+    """The centre: where two axes that are not parallel come nearest to each other."""
+    eye = torch.eye(3).to(first.direction)
+    across = torch.stack([eye - torch.outer(a.direction, a.direction) for a in (first, other)])
+    points_m = torch.stack([first.point_m, other.point_m])
+    return torch.linalg.solve(across.sum(0), (across @ points_m[..., None]).sum(0)).squeeze(-1)
 
 
 def _normal_equations(
