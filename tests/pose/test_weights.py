@@ -12,6 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import write_bop_models
 from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.objects import make_part
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -53,7 +54,7 @@ def test_network_and_objects_come_back_exactly(tmp_path: Path) -> None:
 def test_meshes_that_were_kept_back_are_put_in_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    weights = tiny_weights(dataclasses.replace(bracket(), number=3))
+    weights = tiny_weights(make_part("bracket", 3))
     bare, whole = tmp_path / "bare.safetensors", tmp_path / "whole.safetensors"
     write_pose_weights(bare, weights, with_meshes=False)
     kept = [name for name in read_checkpoint(bare).state if name.startswith("models.")]
@@ -66,7 +67,7 @@ def test_meshes_that_were_kept_back_are_put_in_again(
     mine, theirs = read_pose_weights(whole).models[0], weights.models[0]
     torch.testing.assert_close(mine.vertices_m, theirs.vertices_m, rtol=0, atol=1e-6)
     assert torch.equal(mine.keypoints_m, theirs.keypoints_m)
-    write_bop_models(tmp_path / "other", [dataclasses.replace(bottle(), number=3)])
+    write_bop_models(tmp_path / "other", [make_part("mug", 3)])
     assert main([*words[:-1], str(tmp_path / "other"), "--out", str(whole)]) == 2
     assert "another object, frame or unit" in capsys.readouterr().err
     write_bop_models(tmp_path / "few", [bottle()])
