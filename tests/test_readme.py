@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import main
+from depthpose.pose.objects import write_part
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -82,11 +83,12 @@ def test_the_commands_that_need_data_run(demo_folder: Path, real: Path) -> None:
 def test_the_commands_that_train_run(demo_folder: Path) -> None:
     """On three streets and for one step, in place of a thousand and of three thousand."""
     (demo_folder / "configs").symlink_to(ROOT / "configs")
+    write_part("bracket", demo_folder).rename(demo_folder / "part.stl")
     lines = [line for line in commands() if " make streets" in line or " train " in line]
-    assert len(lines) == 2
+    assert len(lines) == 3
     for line in lines:
         short = line.replace("--number 1000", "--number 3").replace("MY_PAIRS", "streets --steps 1")
-        assert run(short) == 0, line
+        assert run(short.replace("part.yaml", "part.yaml --steps 1")) == 0, line
 
 
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"^make (\w+)", README, re.MULTILINE))))
