@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import write_bop_models
 from depthpose.pose.config import CloudConfig, RefusalConfig
-from depthpose.pose.objects import make_part
+from depthpose.pose.objects import make_part, write_part
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -67,6 +67,9 @@ def test_meshes_that_were_kept_back_are_put_in_again(
     mine, theirs = read_pose_weights(whole).models[0], weights.models[0]
     torch.testing.assert_close(mine.vertices_m, theirs.vertices_m, rtol=0, atol=1e-6)
     assert torch.equal(mine.keypoints_m, theirs.keypoints_m)
+    file = write_part("bracket", tmp_path)
+    assert main([*words[:-1], str(file), "--out", str(whole)]) == 0
+    assert len(read_pose_weights(whole).models[0].faces) > 0
     write_bop_models(tmp_path / "other", [make_part("mug", 3)])
     assert main([*words[:-1], str(tmp_path / "other"), "--out", str(whole)]) == 2
     assert "another object, frame or unit" in capsys.readouterr().err

@@ -136,21 +136,32 @@ def pack_weights(
     return show_weights(str(out))
 
 
-def complete_weights(weights: tyro.conf.Positional[str], models: Path, out: Path) -> int:
+def complete_weights(
+    weights: tyro.conf.Positional[str], models: Path, out: Path, unit: Literal["m", "mm"] = "mm"
+) -> int:
     """Put meshes into pose weights that came without, as their licence keeps the meshes back.
 
         depthpose weights complete linemod-nc --models lm --out linemod.safetensors
+        depthpose weights complete bunny-nc --models bunny.ply --unit m --out bunny.safetensors
 
     Args:
         weights: a file, or the name of weights that came with the package.
-        models: folder of the data set in BOP's layout, whose models the weights were trained on.
+        models: folder of the data set in BOP's layout, whose models the weights were trained on; or
+            the model file of a single object.
         out: the .safetensors file to write; every other command takes it.
+        unit: of a model file; BOP's are in mm.
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.pose.bop.models import read_bop_models
+    from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
     from depthpose.pose.weights import known_numbers
 
     path = find_weights(weights)
-    complete(path, read_bop_models(models, known_numbers(path)), out)
+    numbers = known_numbers(path)
+    if models.is_file() and len(numbers) == 1:
+        meshes = {numbers[0]: read_model(models, unit, number=numbers[0])}
+    else:
+        meshes = read_bop_models(models, numbers)
+    complete(path, meshes, out)
     return show_weights(str(out))
