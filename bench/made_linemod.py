@@ -24,15 +24,14 @@ from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.report import markdown_table, write_table
-from depthpose.pose.baselines import FpfhRegistration
+from depthpose.pose.baselines import FpfhEstimator
 from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
-from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m, risk_coverage
 from depthpose.pose.objects import Objects
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput, ViewSample
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 
 SEED = 0x7E57ED
@@ -106,17 +105,13 @@ def registration(models: Sequence[ObjectModel], number: int) -> Iterator[Method]
     """Give Open3D's registration, where it is asked for."""
     if not number:
         return
-    peers = {model.name: FpfhRegistration(model) for model in models}
-    diameter_m = {model.name: model.diameter_m for model in models}
-
-    def pose(given: ViewInput) -> PoseEstimate:
-        points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, diameter_m[given.object]
-        ).float()
-        cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-        return peers[given.object].estimate(cloud)
-
-    yield Method("Open3D FPFH + RANSAC + ICP", pose, frozenset(peers), number)
+    peers = FpfhEstimator(models)
+    yield Method(
+        "Open3D FPFH + RANSAC + ICP",
+        lambda given: peers.estimate_many([given])[0],
+        frozenset(model.name for model in models),
+        number,
+    )
 
 
 def measure(method: Method, view: ViewSample, model: ObjectModel, points_m: torch.Tensor) -> Row:

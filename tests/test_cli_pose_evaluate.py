@@ -1,7 +1,9 @@
 import csv
 import json
 import shutil
+import sys
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
@@ -10,9 +12,11 @@ from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
+from depthpose.pose.baselines import fpfh
 from depthpose.pose.bop import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.weights import write_pose_weights
 
 
@@ -96,6 +100,52 @@ def test_weights_predict_once_with_true_and_predicted_masks(
     before = [(home / "poses.json").stat().st_mtime_ns for home in homes]
     assert main(["pose", "evaluate", *words]) == 0
     assert before == [(home / "poses.json").stat().st_mtime_ns for home in homes]
+
+
+class KnowsNoPose:
+    """What registration is asked for, without Open3D."""
+
+    clouds: ClassVar[list[CloudInput]] = []
+
+    def __init__(self, model: ObjectModel, _: object) -> None:
+        self.model = model
+
+    def estimate(self, given: CloudInput) -> PoseEstimate:
+        assert given.object == self.model.name
+        self.clouds.append(given)
+        return PoseEstimate(
+            name=given.name, object=given.object, status="votes do not meet", reason="none"
+        )
+
+
+def test_registration_is_a_row_beside_weights(
+    made: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fpfh, "FpfhRegistration", KnowsNoPose)
+    words = ["--bop", str(made.folder), "--weights", str(weights), "open3d", "--no-vsd"]
+    assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
+    own = [row for row in rows_of(tmp_path / "out") if row["method"] == "open3d"]
+    assert [row["object"] for row in own] == ["bracket", "bottle", "mean", "all"]
+    assert all(row["refused"] == 1 and not row["weights"] for row in own)
+    for cloud, instance in zip(KnowsNoPose.clouds, made.instances, strict=True):
+        truth = made.view(instance).truth.camera_from_model
+        diameter_m = made.objects[instance.object_id].diameter_m
+        assert len(cloud.points_m) > 100
+        assert float((cloud.points_m - truth.t_m).norm(dim=1).max()) < diameter_m
+
+
+def test_registration_wants_a_data_set_and_open3d(
+    made: BopDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    words = ["--bop", str(made.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
+    assert main(["pose", "evaluate", *words]) == 2
+    assert "pip install 'depthpose[open3d]'" in capsys.readouterr().err
+    assert main(["pose", "predict", *words]) == 2
+    assert "open3d: it looks for the models of a data set" in capsys.readouterr().err
 
 
 def test_what_cannot_be_measured_is_refused(

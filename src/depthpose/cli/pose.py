@@ -139,7 +139,8 @@ def evaluate(
         bop: folder of the data set.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
-        weights: files or names, of the method or of a baseline.
+        weights: files or names, of the method or of a baseline; the word open3d is registration by
+            Open3D (an extra), which has none.
         csv: BOP results of any method.
         predictions: folders with poses.json.
         masks: truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP
@@ -161,7 +162,7 @@ def evaluate(
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
     )
-    methods = pose_methods.pose_methods(weights, config)
+    methods = pose_methods.pose_methods(weights, config, tuple(dataset.objects.values()))
     shown = pose_masks.find_masks(masks, dataset, out) if methods else []
     paths = [
         pose_methods.predict_all(dataset, method, one, out) for method in methods for one in shown

@@ -12,7 +12,7 @@ from depthpose.cli.pose_names import distinct_names
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.pose.baselines import DepthImageNet
+from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
@@ -25,6 +25,8 @@ from depthpose.pose.predictions import (
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
 
+REGISTRATION = "open3d"
+"""The word for Open3D's features, RANSAC and ICP, where weights are named."""
 _SAME_DIAMETER = 0.05
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
@@ -45,17 +47,42 @@ class PoseMethod:
     settings: Mapping[str, Any]
 
 
-def pose_methods(words: Sequence[str], config: EstimateConfig) -> list[PoseMethod]:
+def pose_methods(
+    words: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
+) -> list[PoseMethod]:
     """Build the estimators of weights files of any kinds, given by their paths or by names.
 
     Files of one name are told apart by the folders that they lie in.
 
+    Args:
+        words: paths or names; the word ``open3d`` is registration, which has no weights.
+        config: of the estimators that have weights.
+        models: what registration looks for.
+
     Raises:
         InputError: there are no such weights, they pose nothing, or are given twice.
+        MissingExtraError: registration is asked for, and Open3D is not installed.
     """
-    paths = [find_weights(word) for word in words]
-    names = distinct_names([(path.parent, path.stem) for path in paths])
-    return [_method(path, name, config) for path, name in zip(paths, names, strict=True)]
+    paths = [None if word == REGISTRATION else find_weights(word) for word in words]
+    names = distinct_names([(p.parent, p.stem) if p else (None, REGISTRATION) for p in paths])
+    return [
+        _method(path, name, config) if path else _registration(name, models)
+        for path, name in zip(paths, names, strict=True)
+    ]
+
+
+def _registration(name: str, models: Sequence[ObjectModel]) -> PoseMethod:
+    if not models:
+        raise InputError(
+            f"{REGISTRATION}: it looks for the models of a data set; give --bop to 'pose evaluate'"
+        )
+    return PoseMethod(
+        name=name,
+        estimate_many=FpfhEstimator(models).estimate_many,
+        takes_clouds=False,
+        models=models,
+        settings={"kind": "registration", "fpfh": config_to_dict(FpfhConfig())},
+    )
 
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:

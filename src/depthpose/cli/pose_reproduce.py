@@ -33,7 +33,8 @@ def table_3_1(
         depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
 
     Args:
-        weights: the method's, then those of each baseline.
+        weights: the method's, then those of each baseline; the word open3d is registration by
+            Open3D (an extra), which has none.
         out: folder for all that is written.
         linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
         bop: any other data set in BOP's layout.

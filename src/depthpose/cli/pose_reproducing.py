@@ -86,7 +86,7 @@ def reproduce_by_object(
 ) -> int:
     """Predict what is missing, measure, set beside the print, and write everything."""
     dataset = order.dataset
-    methods = pose_methods.pose_methods(weights, rule.estimate)
+    methods = pose_methods.pose_methods(weights, rule.estimate, tuple(dataset.objects.values()))
     claim_folder(out, _settings(order, methods, rule))
     shown = pose_masks.find_masks(masks, dataset, out) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]

@@ -8,5 +8,6 @@ from depthpose.pose.baselines.crop import cut_depth as cut_depth
 from depthpose.pose.baselines.depth_image import DepthImageNet as DepthImageNet
 from depthpose.pose.baselines.depth_image import poses_of as poses_of
 from depthpose.pose.baselines.depth_image import rotation_from_6d as rotation_from_6d
+from depthpose.pose.baselines.fpfh import FpfhEstimator as FpfhEstimator
 from depthpose.pose.baselines.fpfh import FpfhRegistration as FpfhRegistration
 from depthpose.pose.baselines.pointnet import PointNet as PointNet

@@ -1,6 +1,7 @@
 """FPFH features, RANSAC and ICP of Open3D: the classical peer, which needs no training."""
 
 import time
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -12,8 +13,9 @@ from torch import Tensor
 from depthpose.core.errors import MissingExtraError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines.config import FpfhConfig
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 _LEAST = 3
 """Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
@@ -115,6 +117,31 @@ class FpfhRegistration:
             source, self._target, self.config.icp_voxels * self._voxel_m, model_from_camera,
             r.TransformationEstimationPointToPlane(),
         )  # fmt: skip
+
+
+class FpfhEstimator:
+    """Registration of several objects from their masked depth, asked as the networks are.
+
+    Args:
+        models: the objects; an input says by name which of them it shows.
+        config: lengths and counts.
+
+    Raises:
+        MissingExtraError: Open3D is not installed.
+    """
+
+    def __init__(self, models: Sequence[ObjectModel], config: FpfhConfig | None = None) -> None:
+        self._peers = {model.name: FpfhRegistration(model, config) for model in models}
+
+    def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
+        """Pose one after the other."""
+        return [self._estimate(given) for given in inputs]
+
+    def _estimate(self, given: ViewInput) -> PoseEstimate:
+        peer = self._peers[given.object]
+        points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
+        cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
+        return peer.estimate(cloud)
 
 
 def _inverse_of(model_from_camera: np.ndarray, like: Tensor) -> Rigid:
