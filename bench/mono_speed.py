@@ -94,12 +94,12 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
         memory = torch.cuda.max_memory_allocated()
     assert net.synthesiser is not None
     assert image.camera is not None
-    draw = net.synthesiser.synthesise
+    synthesise = net.synthesiser.synthesise
     size = focal_size(image.camera, net.synthesiser.generator.config.virtual_focal_px)
     left = resize_image(image.left, *size)
-    right = draw(left)
+    right = synthesise(left[None])[0]
     whole_s = seconds(lambda: net.estimate_pair(image), device)
-    drawing = count_flops(lambda: draw(left))
+    drawing = count_flops(lambda: synthesise(left[None]))
     matching = matcher_flops(net, *size)
     peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
     return {
@@ -107,7 +107,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
         "precision": precision,
         "seconds": whole_s,
         "first_s": first,
-        "draw_s": seconds(lambda: draw(left), device),
+        "draw_s": seconds(lambda: synthesise(left[None]), device),
         "match_s": seconds(lambda: net.matcher.match(left, right), device),
         "memory_mb": memory / 1e6,
         "draw_gflop": drawing / 1e9,

@@ -63,10 +63,11 @@ def step_rates(pairs: PairsConfig) -> dict[str, float]:
     stereo = read_config(CONFIGS / "compact-stereo.yaml", StereoTraining)
     tune = read_config(CONFIGS / "compact-finetune.yaml", FinetuneTraining)
     generator, matcher = UNetGenerator(view.generator), PSMNet(stereo.matcher)
+    frozen = PSMNet(stereo.matcher)
     crops = {
         "view": (ViewTask(generator, view, None), view),
         "stereo": (StereoTask(matcher, stereo, None), stereo),
-        "finetune": (FinetuneTask(generator, matcher, tune, None), tune),
+        "finetune": (FinetuneTask(generator, frozen, tune, None), tune),
     }
     rates = {}
     for name, (task, config) in crops.items():
