@@ -85,6 +85,23 @@ def test_made_frames_are_a_data_set_that_the_check_accepts(
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
 
 
+def test_symmetries_of_a_cad_file_are_told_and_declared_if_wanted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_part("flange", tmp_path)
+    words = ["data", "make", "objects", "--cad", str(file), "--unit", "mm", "--number", "1"]
+    assert main([*words, "--out", str(tmp_path / "plain")]) == 0
+    assert "if that is so, say --symmetries found" in capsys.readouterr().out
+    assert main([*words, "--symmetries", "found", "--out", str(tmp_path / "found")]) == 0
+    assert "each copy counts as right" in capsys.readouterr().out
+    plain, found = (
+        json.loads((tmp_path / name / "models" / "models_info.json").read_text())["1"]
+        for name in ("plain", "found")
+    )
+    assert "symmetries_discrete" not in plain
+    assert len(found["symmetries_discrete"]) == 5
+
+
 def test_frames_of_an_edited_cad_file_go_to_another_folder(
     part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

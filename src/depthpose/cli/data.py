@@ -153,6 +153,7 @@ def make_objects(
     seed: int = 0,
     distance: tuple[float, float] = (0.6, 1.1),
     sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light",
+    symmetries: Literal["none", "found"] = "none",
 ) -> int:
     """Make frames of objects on a table, with picture, depth, masks and poses, in BOP's layout.
 
@@ -170,6 +171,8 @@ def make_objects(
         seed: another seed, other frames.
         distance: nearest and farthest view [m].
         sensor: whose errors the depth has.
+        symmetries: found looks whether a part looks alike from several sides, and declares it;
+            without, you are told of what is found.
     """
     from tqdm import tqdm
 
@@ -177,18 +180,23 @@ def make_objects(
     from depthpose.core.run import claim_folder
     from depthpose.pose.bop import write_bop_models, write_bop_scene
     from depthpose.pose.config import ObjectsConfig, SensorConfig
-    from depthpose.pose.mesh import read_model
+    from depthpose.pose.mesh import read_model, with_found_symmetries
     from depthpose.pose.objects import make_frames
 
     if number < 1:
         raise InputError(f"--number {number}: at least 1 frame")
-    models = [read_model(path, unit, number=i) for i, path in enumerate(cad, start=1)]
+    models = [
+        with_found_symmetries(
+            read_model(path, unit, number=i), tqdm.write, is_taken=symmetries == "found"
+        )
+        for i, path in enumerate(cad, start=1)
+    ]
     config = ObjectsConfig(
         seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number
     )
     said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
     files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
-    claim_folder(out, {**said, "cad": files, "unit": unit})
+    claim_folder(out, {**said, "cad": files, "unit": unit, "symmetries": symmetries})
     write_bop_models(out, models)
     scenes = [
         range(first, min(first + _FRAMES_A_SCENE, number))

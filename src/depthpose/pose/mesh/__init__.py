@@ -7,6 +7,7 @@ from depthpose.pose.mesh.propose import SURE as SURE
 from depthpose.pose.mesh.propose import SymmetryProposal as SymmetryProposal
 from depthpose.pose.mesh.propose import propose_symmetries as propose_symmetries
 from depthpose.pose.mesh.propose import symmetries_from_proposals as symmetries_from_proposals
+from depthpose.pose.mesh.propose import with_found_symmetries as with_found_symmetries
 from depthpose.pose.mesh.sampling import estimate_normals as estimate_normals
 from depthpose.pose.mesh.sampling import farthest_points as farthest_points
 from depthpose.pose.mesh.sampling import sample_surface as sample_surface

@@ -1,7 +1,8 @@
 """Symmetries found: what a new CAD file looks like when it is turned, and how sure that is."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -151,6 +152,37 @@ def symmetries_from_proposals(
     kept = kept if axes else _completed(kept)
     discrete = Rigid(torch.stack([t.R for t in kept]), torch.stack([t.t_m for t in kept]))
     return Symmetries(discrete=discrete, continuous=axes)
+
+
+def with_found_symmetries(
+    model: ObjectModel, tell: Callable[[str], None] | None, *, is_taken: bool
+) -> ObjectModel:
+    """Look for the symmetries of a model that declares none, and count them if that is wanted.
+
+    Args:
+        model: with faces; points alone are left as they are.
+        tell: told what was found, taken or not; None looks for nothing that is not taken.
+        is_taken: give the model these symmetries.
+    """
+    if not (is_taken or tell) or not len(model.faces) or not model.symmetries.is_none:
+        return model
+    proposals = propose_symmetries(model)
+    found = symmetries_from_proposals(proposals)
+    if found.is_none:
+        return model
+    turns = 0 if found.discrete is None else len(found.discrete.R)
+    certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
+    if tell is not None:
+        tell(
+            f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
+            f"(certainty {certainty:.2f} and more); "
+            + (
+                "each copy counts as right"
+                if is_taken
+                else "if that is so, say --symmetries found: no network can tell the copies apart"
+            )
+        )
+    return replace(model, symmetries=found) if is_taken else model
 
 
 def _completed(turns: list[Rigid]) -> list[Rigid]:

@@ -1,17 +1,11 @@
 """The objects of a training, from CAD files or a data set."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from depthpose.core.errors import InputError
 from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
-from depthpose.pose.mesh import (
-    SURE,
-    propose_symmetries,
-    read_model,
-    symmetries_from_proposals,
-)
+from depthpose.pose.mesh import read_model, with_found_symmetries
 from depthpose.pose.objects import make_part
 from depthpose.pose.train.config import ModelsConfig
 from depthpose.pose.types import ObjectModel
@@ -37,7 +31,8 @@ def read_models(
     if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
     models = _from_bop(Path(config.bop), config) if config.bop else _from_cad(config)
-    return tuple(_with_symmetries(model, config, tell) for model in models)
+    is_taken = config.with_found_symmetries
+    return tuple(with_found_symmetries(model, tell, is_taken=is_taken) for model in models)
 
 
 def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
@@ -67,30 +62,3 @@ def _numbers(home: Path) -> list[int]:
     if not found:
         raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
     return found
-
-
-def _with_symmetries(
-    model: ObjectModel, config: ModelsConfig, tell: Callable[[str], None] | None
-) -> ObjectModel:
-    """Look for what is not declared; what is, stands."""
-    is_wanted = config.with_found_symmetries or tell is not None
-    if not is_wanted or not len(model.faces) or not model.symmetries.is_none:
-        return model
-    proposals = propose_symmetries(model)
-    found = symmetries_from_proposals(proposals)
-    if found.is_none:
-        return model
-    turns = 0 if found.discrete is None else len(found.discrete.R)
-    sure = [p.certainty for p in proposals if p.certainty >= SURE]
-    what = (
-        f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
-        f"(certainty {min(sure):.2f} and more)"
-    )
-    if tell is not None and config.with_found_symmetries:
-        tell(f"{what}; each copy counts as right")
-    elif tell is not None:
-        tell(
-            f"{what}; if that is so, start with --symmetries found: no network can tell the "
-            "copies apart, and this training would fail"
-        )
-    return replace(model, symmetries=found) if config.with_found_symmetries else model
