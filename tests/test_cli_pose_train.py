@@ -85,6 +85,20 @@ def test_made_frames_are_a_data_set_that_the_check_accepts(
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
 
 
+def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_path: Path) -> None:
+    made, config, run = tmp_path / "made", tmp_path / "masks.yaml", tmp_path / "run"
+    words = ["data", "make", "objects", "--cad", str(part), "--unit", "mm", "--number", "1"]
+    assert main([*words, "--out", str(made)]) == 0
+    config.write_text(
+        "images: {folder: nowhere}\nheld_out: {folder: nowhere}\n"
+        "network: {widths: [8, 8, 8, 8], long_side_px: 160}\naugment: {crop_px: [96, 128]}\n"
+        "loop: {steps: 1, batch_size: 1, validate_every_steps: 1}\n"
+    )
+    words = ["pose", "train", "--what", "segmentation", "--config", str(config), "--device", "cpu"]
+    assert main([*words, "--data", str(made), "--out", str(run)]) == 0
+    assert "held_out/iou_objects" in (run / "metrics.jsonl").read_text()
+
+
 def test_symmetries_of_a_cad_file_are_told_and_declared_if_wanted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -83,8 +83,8 @@ def _with_data(chosen: Any, data: str) -> Any:  # noqa: ANN401 - any config of a
     changes = {}
     if (models := getattr(chosen, "models", None)) is not None and models.bop is not None:
         changes["models"] = dataclasses.replace(models, bop=data)
-    for part in ("frames", "images"):
-        if getattr(chosen, part, None) is not None:
+    for part in ("frames", "images", "held_out"):
+        if hasattr(getattr(chosen, part, None), "folder"):
             changes[part] = dataclasses.replace(getattr(chosen, part), folder=data)
     if not changes:
         raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
