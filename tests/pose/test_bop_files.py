@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tests.pose.made_frames import make_dataset
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -13,6 +14,7 @@ from depthpose.pose.bop import (
     Detection,
     decode_rle,
     encode_rle,
+    open_bop,
     read_detections,
     read_results,
     read_targets,
@@ -31,6 +33,18 @@ def test_masks_of_every_kind_are_read(tmp_path: Path) -> None:
     for name, values in kinds.items():
         Image.fromarray(values).save(tmp_path / f"{name}.png")
         assert torch.equal(read_mask(tmp_path / f"{name}.png"), torch.from_numpy(mask > 0)), name
+
+
+def test_depth_may_be_tiff_as_in_itodd(tmp_path: Path) -> None:
+    made = make_dataset(tmp_path / "made", frames=1)
+    depth_m = made.view(made.instances[0]).input.depth_m
+    file = made.instances[0].depth
+    Image.open(file).save(file.with_suffix(".tif"))
+    file.unlink()
+    again = open_bop(made.folder, "test")
+    assert again.instances[0].depth.suffix == ".tif"
+    read_m = again.view(again.instances[0]).input.depth_m
+    torch.testing.assert_close(read_m, depth_m, rtol=0, atol=0, equal_nan=True)
 
 
 def test_results_go_out_and_come_back(tmp_path: Path) -> None:

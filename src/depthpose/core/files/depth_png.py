@@ -21,7 +21,7 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     """Read depth [m] from a 16-bit PNG; NaN where the file holds 0.
 
     Args:
-        path: a 16-bit greyscale PNG.
+        path: a 16-bit greyscale PNG, or a TIFF of that kind, as BOP's ITODD has.
         unit_m: metres a unit.
 
     Raises:
@@ -62,7 +62,7 @@ def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> No
 def _read_units(path: AnyPath, unit: float) -> Float32[Tensor, "h w"]:
     _check_unit(path, unit)
     with opened_image(path) as image:
-        if (image.format, image.mode) != ("PNG", "I;16"):
+        if image.format not in ("PNG", "TIFF") or image.mode != "I;16":
             raise InputError(
                 f"{path}: a {image.format} of mode {image.mode}, where depth or disparity needs a "
                 "16-bit greyscale PNG; an 8-bit or colour file is a picture of it, not the data"

@@ -122,7 +122,7 @@ def _make_instance(
         index=index,
         object_id=integer(entry, "obj_id", source),
         K=K,
-        depth=scene / "depth" / f"{image:06d}.png",
+        depth=_depth(scene, image),
         depth_unit_m=unit_m,
         mask=mask if mask.is_file() else None,
         rgb=_picture(scene, image),
@@ -130,6 +130,11 @@ def _make_instance(
         visible_fraction=visible if visible >= 0 else None,
         is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
     )
+
+
+def _depth(scene: Path, image: int) -> Path:
+    tiff = scene / "depth" / f"{image:06d}.tif"  # of ITODD
+    return tiff if tiff.is_file() else tiff.with_suffix(".png")
 
 
 def _picture(scene: Path, image: int) -> Path | None:

@@ -101,7 +101,7 @@ def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
         number: make_ruler(
             model,
             diameter_of(model, config),
-            is_adds=is_adds(dataset, model, config),
+            is_adds=is_adds(model, config),
             vsd_delta_m=config.vsd_delta_m if config.with_vsd else None,
         )
         for number, model in dataset.objects.items()

@@ -1,7 +1,6 @@
 """What a success means for an object: which diameter, and which of the two ADDs."""
 
 from depthpose.core.errors import InputError
-from depthpose.pose.bop import BopDataset
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.types import ObjectModel
 
@@ -10,9 +9,6 @@ PVNET_DIAMETERS_M = {
     10: 0.176364, 11: 0.164857, 12: 0.148204, 13: 0.303153, 14: 0.285155, 15: 0.208394,
 }  # fmt: skip
 """Of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
-
-LINEMOD_SYMMETRIC = (10, 11)
-"""Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
 
 _OTHER_DATA_SET = 0.25
 
@@ -34,10 +30,6 @@ def diameter_of(model: ObjectModel, config: EvaluationConfig) -> float:
     return printed_m
 
 
-def is_adds(dataset: BopDataset, model: ObjectModel, config: EvaluationConfig) -> bool:
-    """Whether an object is measured by ADD-S.
-
-    The ``models_info.yml`` of Linemod_preprocessed declares no symmetries: its two are known.
-    """
-    is_known = dataset.layout != "BOP" and model.number in LINEMOD_SYMMETRIC
-    return config.adds == "all" or is_known or not model.symmetries.is_none
+def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
+    """Whether an object is measured by ADD-S."""
+    return config.adds == "all" or not model.symmetries.is_none
