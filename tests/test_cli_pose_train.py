@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import main
+from depthpose.core.config import read_config
 from depthpose.pose.objects import write_part
+from depthpose.pose.train import STAGES, PoseTraining, Run
 from depthpose.pose.weights import read_pose_weights
 
 _TINY = """
@@ -83,6 +85,28 @@ def test_made_frames_are_a_data_set_that_the_check_accepts(
     assert "sensor.kinds = ['structured light'], but now it is" in capsys.readouterr().err
     assert main([*words, "--number", "0"]) == 2
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
+
+
+def test_a_cad_file_begins_with_the_weights_that_ship(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[str | None] = []
+
+    def stand_in(config: PoseTraining, run: Run) -> Path:
+        started.append(config.start)
+        return run.folder / "pose.safetensors"
+
+    monkeypatch.setitem(STAGES, "pose", (PoseTraining, stand_in))
+    (tmp_path / "c.yaml").write_text("{}")
+    words = ["pose", "train", "--cad", str(part), "--unit", "mm", "--out", str(tmp_path / "run")]
+    more = [[], ["--start", "nothing"], ["--start", "a.safetensors"]]
+    for extra in [*more, ["--config", str(tmp_path / "c.yaml")]]:
+        assert main([*words, *extra]) == 0
+    assert started == ["parts", None, "a.safetensors", None]
+    own = read_config(
+        Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml", PoseTraining
+    )
+    assert own.start == "parts"
 
 
 def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_path: Path) -> None:

@@ -7,6 +7,12 @@ from typing import Any, Literal
 from depthpose.cli.training import changed, progress_bar
 from depthpose.core.errors import InputError
 
+_START = "parts"
+"""The weights that ship and may go with any licence."""
+
+_NOTHING = "nothing"
+"""The word for no weights."""
+
 
 def train(
     out: Path,
@@ -43,7 +49,8 @@ def train(
         config: YAML with what differs from the defaults.
         data: folder of a data set; it takes the place of the config's, for models and frames.
         what: which network; all but pose are compared with it, or cut the object out for it.
-        start: weights to begin with.
+        start: weights to begin with, by name or file. A CAD file without a config begins with
+            'parts', which saves two thirds of the first minutes; 'nothing' begins anew.
         steps: optimiser steps in place of the config's length.
         workers: processes that make views beside the one that trains.
         seed: decides initial weights, views and their order.
@@ -62,7 +69,11 @@ def train(
     loop = changed(chosen.loop, seed=seed, device=device, precision=precision, workers=workers)
     if steps is not None:
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    if start is None and what == "pose" and cad and config is None:
+        start = _START
     chosen = changed(dataclasses.replace(chosen, loop=loop), start=start)
+    if start == _NOTHING:
+        chosen = dataclasses.replace(chosen, start=None)
     if cad or unit or symmetries:
         chosen = dataclasses.replace(chosen, models=_models(chosen, what, cad, unit, symmetries))
     if data is not None:
