@@ -9,11 +9,12 @@ a time, on one thread; of several weights each answers for the objects that it k
 (ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
 is ours with every answer that votes can give, whatever its risk; of these risks.png says how many
 are wrong if only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
-view, and a picture of each curve.
+view, and a picture of each curve. What another run measured stands beside it by ``--also``.
 """
 
 import argparse
 import dataclasses
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -182,6 +183,12 @@ def conditions(words: argparse.Namespace) -> Iterator[tuple[Condition, int]]:
         yield from ((Condition(resolution=r), words.sweep) for r in RESOLUTIONS if r != 1)
 
 
+def earlier(folders: Sequence[Path], name: str) -> Iterator[Row]:
+    """Give the rows that earlier runs wrote."""
+    for folder in folders:
+        yield from json.loads((folder / f"{name}.json").read_text())
+
+
 def draw(rows: Sequence[Row], out: Path) -> None:
     """Draw success of all objects over each knob, the others at their usual value."""
     usual = Condition()._asdict()
@@ -221,6 +228,13 @@ def main() -> None:
     parser.add_argument("--open3d", type=int, default=0, help="views of each object; 0: not run")
     parser.add_argument("--number", type=int, default=250, help="views of each object")
     parser.add_argument("--sweep", type=int, default=50, help="views at each noise and resolution")
+    parser.add_argument(
+        "--also",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="folders of earlier runs, of other methods on the same views",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/made_linemod"))
     words = parser.parse_args()
     torch.set_num_threads(1)
@@ -233,8 +247,7 @@ def main() -> None:
         *loaded("depth image", words.depth_image, words.number, DepthImageRegressor),
         *registration(models, words.open3d),
     ]
-    rows: list[Row] = []
-    views: list[Row] = []
+    rows, views = ([*earlier(words.also, name)] for name in ("rows", "views"))
     for at, number in conditions(words):
         summed, every = run_condition(methods, models, at, number)
         rows, views = rows + summed, views + every
