@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.checkpoint import read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
@@ -164,8 +165,10 @@ def test_an_object_that_is_not_seen_has_no_mask() -> None:
 
 
 def test_probabilities_add_up_to_one_and_the_network_runs_from_a_file(tmp_path: Path) -> None:
-    write_segmentation(tmp_path / "w.safetensors", tiny_weights())
-    segmenter = Segmenter.load(tmp_path / "w.safetensors")
+    bound = replace(tiny_weights(), facts={"terms": "For research alone."})
+    write_segmentation(tmp_path / "w.safetensors", bound)
+    with pytest.warns(LicenceNotice, match="For research alone"):
+        segmenter = Segmenter.load(tmp_path / "w.safetensors")
     assert segmenter.objects == ("cat", "can")
     probability = class_probabilities(segmenter.weights.network, torch.rand(3, 50, 70))
     torch.testing.assert_close(probability.sum(0), torch.ones(50, 70))

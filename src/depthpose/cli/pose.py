@@ -84,7 +84,7 @@ def predict(
     )
     (method,) = pose_methods([weights], config)
     if bop is not None:
-        return _predict_bop(method, (bop, split, masks), out, batch)
+        return _predict_bop(method, (bop, split, masks), out, batch, config.device)
     if cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
@@ -163,7 +163,7 @@ def evaluate(
         voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
     )
     methods = pose_methods.pose_methods(weights, config, tuple(dataset.objects.values()))
-    shown = pose_masks.find_masks(masks, dataset, out) if methods else []
+    shown = pose_masks.find_masks(masks, dataset, out, device) if methods else []
     paths = [
         pose_methods.predict_all(dataset, method, one, out) for method in methods for one in shown
     ]
@@ -177,6 +177,7 @@ def _predict_bop(
     given: tuple[Path, str, str],
     out: Path,
     batch: int,
+    device: str,
 ) -> int:
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_masks import find_masks
@@ -185,7 +186,7 @@ def _predict_bop(
     folder, split, word = given
     dataset = open_bop(folder, split)
     dataset = dataset.of_objects(*posing.known_objects(dataset, method))
-    (masks,) = find_masks([word], dataset, out)
+    (masks,) = find_masks([word], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = posing.bop_jobs(dataset, masks, method)
     predictions = posing.predict_all(method, jobs, out, {**settings, **masks.settings}, batch)

@@ -39,8 +39,16 @@ class Masks:
     settings: Mapping[str, Any]
 
 
-def find_masks(words: Sequence[str], dataset: BopDataset, out: Path) -> list[Masks]:
+def find_masks(
+    words: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
+) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights.
+
+    Args:
+        words: which masks.
+        dataset: whose images are shown.
+        out: where a segmentation writes what it finds.
+        device: of a segmentation.
 
     Raises:
         InputError: one is none of these, or the data set came without predicted masks.
@@ -51,7 +59,9 @@ def find_masks(words: Sequence[str], dataset: BopDataset, out: Path) -> list[Mas
         for word, path in zip(words, paths, strict=True)
     ]
     return [
-        _shipped_masks(word, dataset) if path is None else _file_masks(path, name, dataset, out)
+        _shipped_masks(word, dataset)
+        if path is None
+        else _file_masks(path, name, dataset, out, device)
         for word, path, name in zip(words, paths, distinct_names(files), strict=True)
     ]
 
@@ -85,9 +95,9 @@ def _shipped_masks(word: str, dataset: BopDataset) -> Masks:
     )
 
 
-def _file_masks(path: Path, name: str, dataset: BopDataset, out: Path) -> Masks:
+def _file_masks(path: Path, name: str, dataset: BopDataset, out: Path, device: str) -> Masks:
     is_list = path.suffix == ".json"
-    detections = read_detections(path) if is_list else _segmented(path, name, dataset, out)
+    detections = read_detections(path) if is_list else _segmented(path, name, dataset, out, device)
     return Masks(
         name=name,
         jobs=lambda names: detection_jobs(dataset, names, detections),
@@ -95,12 +105,14 @@ def _file_masks(path: Path, name: str, dataset: BopDataset, out: Path) -> Masks:
     )
 
 
-def _segmented(path: Path, name: str, dataset: BopDataset, out: Path) -> list[Detection]:
+def _segmented(
+    path: Path, name: str, dataset: BopDataset, out: Path, device: str
+) -> list[Detection]:
     """Segment the images that are not segmented yet, for every object that the weights know.
 
     Other objects or images may be asked for next time: what is there stays, what lacks is added.
     """
-    segmenter = Segmenter.load(path)
+    segmenter = Segmenter.load(path, device)
     numbers = _numbers_of(segmenter, dataset, path)
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})

@@ -88,7 +88,7 @@ def reproduce_by_object(
     dataset = order.dataset
     methods = pose_methods.pose_methods(weights, rule.estimate, tuple(dataset.objects.values()))
     claim_folder(out, _settings(order, methods, rule))
-    shown = pose_masks.find_masks(masks, dataset, out) if methods else []
+    shown = pose_masks.find_masks(masks, dataset, out, rule.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], rule.evaluation)
     numbers = {model.name: number for number, model in dataset.objects.items()}

@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from depthpose.core.arrays import Image
-from depthpose.core.checkpoint import find_weights
+from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation.config import SegmentationConfig
 from depthpose.pose.segmentation.network import FCN
@@ -61,7 +61,9 @@ class Segmenter:
         Raises:
             InputError: there is no such file, or it holds something else.
         """
-        return cls(read_segmentation(find_weights(name)), device)
+        weights = read_segmentation(find_weights(name))
+        say_terms(weights.facts)
+        return cls(weights, device)
 
     @property
     def objects(self) -> tuple[str, ...]:
