@@ -9,8 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from depthpose.core.checkpoint import read_checkpoint, save_checkpoint
-from depthpose.core.checkpoint import LicenceNotice
+from depthpose.core.checkpoint import LicenceNotice, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.segmentation import (
