@@ -1,0 +1,126 @@
+"""``depthpose doctor``."""
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from time import perf_counter
+
+from depthpose.core.errors import InputError
+
+_REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
+_EXTRAS_OF_OURS = ("dev",)
+"""Extras that nobody needs who only uses the package."""
+
+_SHIFT_PX = 12
+"""Of the pair that the depth room is tried on."""
+
+
+def doctor() -> int:
+    """Say what this installation has, and try one small estimate of each room.
+
+    Names versions, devices, extras (and how to install what lacks) and weights. Ends with exit
+    code 1 if an estimate failed. Put what it prints into a report of a problem.
+
+        depthpose doctor
+    """
+    from depthpose.core.checkpoint import SHIPPED
+    from depthpose.core.run import environment
+
+    for name, value in {**environment(), "device": _devices(), "weights in": SHIPPED}.items():
+        print(f"{name}: {value}")
+    print(*_extras(), *_weights(), sep="\n")
+    tries = {"depth room": _try_depth, "pose room": _try_pose}
+    works = [_tried(room, work) for room, work in tries.items()]
+    return 0 if all(works) else 1
+
+
+def _devices() -> str:
+    import torch
+
+    found = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return ", ".join(f"cuda:{i} {name}" for i, name in enumerate(found)) or "cpu alone"
+
+
+def _extras() -> Iterator[str]:
+    """Give a line for each extra: what it needs, or the command that installs it."""
+    lacking: dict[str, list[str]] = {}
+    for line in metadata.requires("depthpose") or ():
+        found = _REQUIREMENT.match(line)
+        assert found is not None, line
+        package, extra = found.groups()
+        if extra is None or extra in _EXTRAS_OF_OURS:
+            continue
+        lacking.setdefault(extra, [])
+        if not _is_installed(package):
+            lacking[extra].append(package)
+    for extra, packages in lacking.items():
+        how = f"lacks {', '.join(packages)}: pip install 'depthpose[{extra}]'"
+        yield f"extra {extra}: {how if packages else 'installed'}"
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _weights() -> Iterator[str]:
+    from depthpose.core.checkpoint import SHIPPED, read_checkpoint
+
+    for path in sorted(SHIPPED.glob("*.safetensors")):
+        try:
+            found = read_checkpoint(path)
+        except InputError as error:
+            yield f"weights {path.stem}: {error}"
+        else:
+            yield f"weights {path.stem}: {found.kind}, {found.facts.get('licence', 'no licence')}"
+
+
+def _tried(room: str, work: Callable[[], str]) -> bool:
+    began = perf_counter()
+    try:
+        said = work()
+    except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
+        print(f"{room}: failed: {type(error).__name__}: {error}", file=sys.stderr)
+        return False
+    print(f"{room}: {said}, {perf_counter() - began:.1f} s with loading")
+    return True
+
+
+def _try_depth() -> str:
+    """Match a pair whose disparity is known everywhere."""
+    import torch
+
+    from depthpose.depth.estimator import FakestereoNet
+
+    noise = torch.rand(3, 48, 160, generator=torch.Generator().manual_seed(0))
+    scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
+    scene = scene.clamp(0, 1)
+    left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
+    found = FakestereoNet.load("default").estimate(left, None, right=right, with_check=False)
+    median_px = float(found.disparity_px[:, 2 * _SHIFT_PX :].median())
+    if abs(median_px - _SHIFT_PX) > 1:
+        raise InputError(f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px")
+    return f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
+
+
+def _try_pose() -> str:
+    """Pose a part in a view that is made on the spot."""
+    from depthpose.pose.config import ObjectsConfig
+    from depthpose.pose.estimator import GeoPoseNet
+    from depthpose.pose.metrics import adds_m
+    from depthpose.pose.objects import Objects
+
+    net = GeoPoseNet.load("parts")
+    flange = next(model for model in net.weights.models if model.name == "flange")
+    view = Objects((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(0)
+    (found,) = net.estimate_many([view.input])
+    if found.camera_from_model is None:
+        raise InputError(f"a made view of a flange was refused: {found.reason}")
+    off_m = adds_m(found.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
+    if off_m > flange.diameter_m / 10:
+        raise InputError(f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)")
+    return f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"

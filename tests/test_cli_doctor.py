@@ -1,0 +1,46 @@
+"""``depthpose doctor``."""
+
+from importlib import metadata
+
+import pytest
+
+from depthpose import __version__
+from depthpose.cli import main
+from depthpose.core.errors import InputError
+from depthpose.pose.estimator import GeoPoseNet
+
+
+def test_doctor_names_what_is_here_and_tries_each_room(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    version = metadata.version
+
+    def without_open3d(name: str) -> str:
+        if name == "open3d":
+            raise metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(metadata, "version", without_open3d)
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert f"depthpose: {__version__}" in said
+    assert "extra open3d: lacks open3d: pip install 'depthpose[open3d]'" in said
+    assert "extra train: installed" in said
+    assert "extra dev" not in said
+    assert "weights default: fakestereo, MIT" in said
+    assert "weights parts: geoposenet, MIT" in said
+    assert "depth room: a pair shifted by 12 px was matched at 1" in said
+    assert "pose room: a made flange was posed " in said
+
+
+def test_a_room_that_fails_is_named_and_the_other_is_tried(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> GeoPoseNet:
+        raise InputError(f"weights {name!r}: damaged")
+
+    monkeypatch.setattr(GeoPoseNet, "load", refuse)
+    assert main(["doctor"]) == 1
+    said = capsys.readouterr()
+    assert "depth room: a pair" in said.out
+    assert "pose room: failed: InputError: weights 'parts': damaged" in said.err
