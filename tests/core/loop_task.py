@@ -63,6 +63,13 @@ def weights(task: ToyTask) -> dict[str, Tensor]:
     return {f"{n}.{k}": t for n, m in task.modules.items() for k, t in m.state_dict().items()}
 
 
+def save_slowly(state: object, path: Path) -> None:
+    """Stand in for ``torch.save`` on a slow disk: a half file for a long time."""
+    del state
+    path.write_bytes(b"half")
+    time.sleep(60)
+
+
 if __name__ == "__main__":
     folder, steps, accumulate, pause_s = Path(sys.argv[1]), *map(float, sys.argv[2:5])
     config = LoopConfig(
@@ -73,5 +80,7 @@ if __name__ == "__main__":
         workers=int((sys.argv[5:] or ["0"])[0]),
         device="cpu",
     )
+    if sys.argv[6:] == ["slow disk"]:
+        torch.save = save_slowly
     toy = ToyTask(pause_s)
     train(toy, ToySamples(), config, folder, resume=True)

@@ -49,6 +49,10 @@ def _refuse_irregular(path: AnyPath, status: os.stat_result) -> None:
         )
 
 
+_PART = ".part-"
+"""Begins the names of files that are being written."""
+
+
 @contextmanager
 def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
     """Turn whatever a decoder raises on bad bytes into an :class:`InputError`.
@@ -79,7 +83,7 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
         InputError: the disk is full, or the place cannot be written to.
     """
     target = Path(path)
-    part = target.with_name(f".part-{secrets.token_hex(6)}{target.suffix}")
+    part = target.with_name(f"{_PART}{secrets.token_hex(6)}{target.suffix}")
     try:
         _refuse_to_replace(target)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -95,6 +99,13 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what writers that were killed left behind; none may be at work there."""
+    for part in folder.rglob(f"{_PART}*"):
+        with suppress(OSError):
+            part.unlink()
 
 
 def write_bytes(path: AnyPath, data: bytes) -> None:

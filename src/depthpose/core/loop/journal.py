@@ -19,7 +19,7 @@ import torch
 
 from depthpose.core.checkpoint import read_torch_file
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.files import atomic_write, write_image
+from depthpose.core.files import atomic_write, remove_parts, write_image
 from depthpose.core.loop.task import Evidence
 
 _STATE = "state.pt"
@@ -35,9 +35,10 @@ class Journal:
         self._board: Any = None
 
     def open(self, step: int) -> None:
-        """Begin at ``step``: lines of later steps, which a kill left behind, are dropped."""
+        """Begin at ``step``: what a kill left behind goes, lines of later steps and half files."""
         if not self._is_writer:
             return
+        remove_parts(self.folder)
         path = self.folder / _METRICS
         kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
         with atomic_write(path) as part:
