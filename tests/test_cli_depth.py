@@ -18,6 +18,7 @@ from depthpose.core.files import (
     write_image,
     write_video,
 )
+from depthpose.core.loop import read_metrics
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
@@ -174,9 +175,11 @@ def test_training_by_config_and_words(
 ) -> None:
     (tmp_path / "view.yaml").write_text(VIEW)
     words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
-    words += ["--data", str(pairs), "--out", str(tmp_path / "run")]
+    words += ["--data", str(pairs), "--held-out", str(pairs), "--out", str(tmp_path / "run")]
     assert main([*words, "--steps", "2"]) == 0
     assert "generator.safetensors" in capsys.readouterr().out
+    assert "held_out/l1" in read_metrics(tmp_path / "run")[-1]
+    assert list((tmp_path / "run" / "pictures").glob("*.png"))
     assert (tmp_path / "run" / "generator.safetensors").is_file()
     assert main([*words, "--steps", "2"]) == 2
     assert "Add --resume" in capsys.readouterr().err

@@ -9,12 +9,16 @@ import tyro
 
 from depthpose.core.errors import InputError
 
+_LOOKED_AT = 20
+"""Held-out pairs of a folder, where nothing else is said."""
+
 
 def train(
     stage: tyro.conf.Positional[Literal["view", "stereo", "finetune"]],
     out: Path,
     config: Path | None = None,
     data: tuple[str, ...] = (),
+    held_out: tuple[str, ...] = (),
     generator: str | None = None,
     matcher: str | None = None,
     start: str | None = None,
@@ -38,6 +42,8 @@ def train(
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
         data: folders of pairs; they replace the config's.
+        held_out: folders of pairs that validation looks at, and none of which is learnt from; of
+            each 20, evenly taken, where the config says no other number.
         generator: finetune: weights of the generator to begin with.
         matcher: finetune: weights of the matcher, which is not changed.
         start: view, stereo: weights to begin with.
@@ -49,6 +55,7 @@ def train(
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
+    from depthpose.depth.config import PairsConfig
     from depthpose.depth.train import STAGES, Run
 
     kind, run_stage = STAGES[stage]
@@ -57,6 +64,11 @@ def train(
     if steps is not None:
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
     pairs = changed(chosen.pairs, folders=data or None)
+    if held_out:
+        looked_at = chosen.held_out or PairsConfig(focal_px=pairs.focal_px, limit=_LOOKED_AT)
+        chosen = dataclasses.replace(
+            chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
+        )
     words = {"generator": generator, "matcher": matcher, "start": start}
     knobs = {field.name: field.type for field in dataclasses.fields(kind)}
     for word, value in words.items():
