@@ -50,7 +50,7 @@ def predict(
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
-        depthpose pose predict --bop lm --split test --weights linemod-nc --out out
+        depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
 
     Args:
         out: folder for the results.

@@ -23,7 +23,7 @@ class ResUNetConfig:
 
     norm: Literal["batch", "none"] = "batch"
     """batch trains within hundreds of steps and is folded for use; none is the published network,
-    which barely leaves the start (see docs: its residual branches begin scaled down)."""
+    which barely leaves the start, though its residual branches begin scaled down."""
 
     with_bias: bool = False
     """A bias for each inner convolution, as folding batch norm leaves one."""
