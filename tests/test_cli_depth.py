@@ -10,6 +10,7 @@ from tests.made_street import make_street
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
+from depthpose.core.draw import draw_depth
 from depthpose.core.files import (
     read_image,
     read_map,
@@ -76,8 +77,14 @@ def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
     assert predict(home, tmp_path / "out", str(tmp_path / "drive.avi"), *words) == 0
     assert len(list((tmp_path / "out").glob("drive_*.depth_m.npy"))) == 4
     video = read_video(tmp_path / "out" / "drive.color.mp4")
-    assert len(list(video)) == 4
+    shown = list(video)
+    assert len(shown) == 4
     assert video.fps == pytest.approx(5.0)
+    for (_, picture), file in zip(
+        shown, sorted((tmp_path / "out").glob("*.depth_m.npy")), strict=True
+    ):
+        wanted = draw_depth(read_map(file), 1.0, 40.0)
+        assert float((picture - wanted).abs().mean()) < 0.05, file
 
 
 def test_one_broken_image_stops_no_other(

@@ -87,7 +87,9 @@ def test_the_commands_that_train_run(demo_folder: Path) -> None:
     lines = [line for line in commands() if " make streets" in line or " train " in line]
     assert len(lines) == 3
     for line in lines:
-        short = line.replace("--number 1000", "--number 3").replace("--data streets", "--data streets --steps 1")
+        short = line.replace("--number 1000", "--number 3").replace(
+            "--data streets", "--data streets --steps 1"
+        )
         assert run(short.replace("part.yaml", "part.yaml --steps 1")) == 0, line
 
 

@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from depthpose.core.draw import (
@@ -8,9 +7,7 @@ from depthpose.core.draw import (
     draw_outline,
     draw_points,
     draw_share,
-    find_range_m,
 )
-from depthpose.core.errors import InputError
 
 
 def test_near_is_brighter_than_far_all_along() -> None:
@@ -45,24 +42,6 @@ def test_points_grow_to_the_size_that_is_asked_for() -> None:
     depth_m[4, 4] = 10.0
     picture = draw_points(torch.ones(3, 9, 9), depth_m, radius_px=2)
     assert int((picture[0] != 0.35).sum()) == 25
-
-
-def test_the_range_of_a_video_leaves_strays_out() -> None:
-    frames = [torch.linspace(5, 50, 1000)[None], torch.tensor([[torch.nan, 0.01, 900.0]])]
-    near_m, far_m = find_range_m(frames)
-    assert near_m == pytest.approx(5 + 0.02 * 45, abs=0.2)
-    assert far_m == pytest.approx(50 - 0.02 * 45, abs=0.2)
-
-
-def test_one_depth_everywhere_still_makes_a_scale() -> None:
-    near_m, far_m = find_range_m([torch.full((2, 2), 7.0)])
-    assert bool(torch.isfinite(draw_depth(torch.full((2, 2), 7.0), near_m, far_m)).all())
-
-
-@pytest.mark.parametrize("frames", [[], [torch.full((2, 2), torch.nan)]])
-def test_a_range_of_nothing_is_refused(frames: list[torch.Tensor]) -> None:
-    with pytest.raises(InputError, match="no frame has a valid depth"):
-        find_range_m(frames)
 
 
 def test_lines_are_where_they_should_be() -> None:

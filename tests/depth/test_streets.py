@@ -1,5 +1,10 @@
+import dataclasses
+from collections import Counter
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,9 +17,16 @@ from depthpose.depth.streets import (
     Streets,
     draw_scene,
     draw_street,
+    furniture,
     kitti_rig,
     make_scene,
+    people,
+    roadside,
+    vegetation,
+    vehicles,
 )
+from depthpose.depth.streets.road import draw_road
+from depthpose.depth.streets.sensor import draw_sensors
 
 PLAIN = StreetsConfig(scale=0.25, jpeg_share=0.0, rectification_error_px=0.0)
 
@@ -40,6 +52,59 @@ def test_a_frame_is_a_function_of_seed_and_index() -> None:
     assert other.truth.occluded is not None
     assert torch.equal(one.truth.occluded, other.truth.occluded)
     assert not torch.equal(one.input.left, Streets(replace(config, seed=1))[5].input.left)
+
+
+def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: Counter[str] = Counter()
+
+    def counted(module: ModuleType, name: str) -> None:
+        make = getattr(module, name)
+
+        def note(*words: Any, **more: Any) -> Any:  # noqa: ANN401
+            drawn[f"vehicle {words[0]}" if name == "vehicle" else name] += 1
+            return make(*words, **more)
+
+        monkeypatch.setattr(module, name, note)
+
+    for module, names in {
+        people: ("walker", "rider"),
+        vehicles: ("vehicle",),
+        vegetation: ("tree", "bush", "hedge"),
+        furniture: ("lamp", "sign", "fence"),
+        roadside: ("add_house",),
+    }.items():
+        for name in names:
+            counted(module, name)
+    scenes = [make_scene((0, index)) for index in range(24)]
+    assert len({scene.place for scene in scenes}) >= 3
+    assert sum(kind.startswith("vehicle") for kind in drawn) >= 3
+    for what in ("walker", "rider", "tree", "bush", "hedge", "add_house", "lamp", "sign", "fence"):
+        assert drawn[what] > 0, what
+    assert {scene.weather.is_overcast for scene in scenes} == {True, False}
+    assert any(scene.weather.haze_m < 600 for scene in scenes)
+    turns = np.stack([scene.camera_from_world for scene in scenes])
+    assert len(np.unique(turns.round(4), axis=0)) == len(scenes)  # pitch, yaw and roll
+
+
+def test_roads_bend_climb_and_cross() -> None:
+    roads = [draw_road(np.random.default_rng(seed)) for seed in range(40)]
+    heights = np.array([np.ptp(road.centre[:, 2]) for road in roads])
+    headings = np.rad2deg([np.ptp(road.centre[:, 4]) for road in roads])
+    assert (heights > 1).any()
+    assert (heights < 0.5).any()
+    assert (headings > 10).any()
+    assert (headings < 1).any()
+    sides = {len(street.sides) for road in roads for street in road.side_streets}
+    assert sides == {1, 2}  # junctions and crossings
+    assert any(not road.side_streets for road in roads)
+    assert len({road.lanes for road in roads}) >= 2
+
+
+def test_cameras_differ_in_light_noise_and_compression() -> None:
+    rng, light = np.random.default_rng(0), torch.full((6, 8, 3), 0.2)
+    left = [draw_sensors(rng, light, 0.5)[0] for _ in range(30)]
+    for field in dataclasses.fields(left[0]):
+        assert len({str(getattr(sensor, field.name)) for sensor in left}) > 1, field.name
 
 
 def photometric_error(frame: StreetFrame, shift_px: float) -> float:

@@ -1,14 +1,11 @@
 """Maps as pictures. A picture is for eyes only: values are read from the NPY beside it."""
 
 import math
-from collections.abc import Iterable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
-
-from depthpose.core.errors import InputError
 
 # From near to far: a warm, bright end and a dark, cold one, of falling lightness, so that the order
 # survives a grey-scale print and colour blindness.
@@ -27,29 +24,6 @@ def draw_depth(
     A fixed scale makes two pictures comparable and a video steady; grey marks invalid pixels.
     """
     return draw_share((depth_m / near_m).log() / math.log(far_m / near_m))
-
-
-def find_range_m(
-    depths_m: Iterable[Float[Tensor, "_ _"]], left_out: float = 0.02
-) -> tuple[float, float]:
-    """Find the near and far end of a scale for all frames of a video, from a few of them.
-
-    Given to :func:`draw_depth` with every frame, it keeps a colour the same metres throughout.
-
-    Args:
-        depths_m: depth of some frames, NaN where invalid.
-        left_out: share of the pixels left out at either end: a single stray pixel moves no colour.
-
-    Raises:
-        InputError: no frame has a valid pixel.
-    """
-    valid_m = torch.cat([depth[torch.isfinite(depth)] for depth in depths_m] or [torch.empty(0)])
-    if len(valid_m) == 0:
-        raise InputError("find_range_m: no frame has a valid depth; give frames that have one.")
-    sorted_m = valid_m.sort().values
-    last = len(sorted_m) - 1
-    near_m, far_m = (float(sorted_m[round(share * last)]) for share in (left_out, 1 - left_out))
-    return near_m, max(far_m, 1.01 * near_m)  # one depth everywhere still makes a scale
 
 
 def draw_disparity(
