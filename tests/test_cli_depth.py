@@ -1,6 +1,10 @@
 """``depth predict`` and ``depth train``, as a user runs them."""
 
 import json
+import random
+import subprocess
+import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -60,6 +64,20 @@ def test_a_folder_of_images_becomes_depth(home: Path, tmp_path: Path) -> None:
     before = (tmp_path / "0.depth_m.npy").stat().st_mtime_ns
     assert predict(home, tmp_path, str(home / "images"), *camera) == 0
     assert (tmp_path / "0.depth_m.npy").stat().st_mtime_ns == before, "finished work is kept"
+
+
+def test_processes_share_a_folder_of_images(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (str(home / "images"), "--camera", str(home / "cam.json"))
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    done: list[set[str]] = []
+    for rank in "10":
+        monkeypatch.setenv("RANK", rank)
+        assert predict(home, tmp_path / "shared", *words) == 0
+        done.append({path.name for path in (tmp_path / "shared").glob("*.depth_m.npy")})
+    assert len(done[0]) in (1, 2)
+    assert done[0] < done[1] == {f"{k}.depth_m.npy" for k in range(3)}
 
 
 def test_a_focal_length_stands_for_a_centred_camera(home: Path, tmp_path: Path) -> None:
@@ -193,6 +211,43 @@ def test_training_by_config_and_words(
     assert main([*words, "--steps", "2", "--resume"]) == 0
     assert main([*words, "--steps", "3", "--resume"]) == 2
     assert "loop.steps = 2, but now it is 3" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_kills_at_any_moment_change_no_weight_of_a_stage(pairs: Path, tmp_path: Path) -> None:
+    """Before the first step too, while samples are read, and while weights are written."""
+    text = VIEW.replace("steps: 4", "steps: 200, save_every_steps: 7, validate_every_steps: 50")
+    (tmp_path / "view.yaml").write_text(text)
+    words = [sys.executable, "-m", "depthpose", "depth", "train", "view", "--resume"]
+    words += ["--config", str(tmp_path / "view.yaml"), "--data", str(pairs)]
+    words += ["--held-out", str(pairs), "--out"]
+    subprocess.run([*words, str(tmp_path / "whole")], check=True, capture_output=True)
+    moments, killed = random.Random(1), tmp_path / "killed"
+    state = killed / "state.pt"
+    # The first two meet a run that has saved nothing, the others one that went on.
+    for sign in (killed / "run.json", killed / "run.json", state, state, state):
+        before = sign.stat().st_mtime_ns if sign is state and sign.exists() else 0
+        process = subprocess.Popen([*words, str(killed)], stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while not (sign.exists() and sign.stat().st_mtime_ns != before):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(moments.uniform(0.0, 0.2))
+        process.kill()
+        process.wait()
+    assert torch.load(state, weights_only=True)["step"] < 200
+    subprocess.run([*words, str(killed)], check=True, capture_output=True)
+    one, other = (
+        read_checkpoint(folder / "generator.safetensors").state
+        for folder in (tmp_path / "whole", killed)
+    )
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[key], other[key]) for key in one)
+    assert not list(killed.rglob(".part-*"))
+    assert all(read_image(path).numel() for path in (killed / "pictures").glob("*.png"))
+    steps = [row["step"] for row in read_metrics(killed)]
+    assert steps == sorted(steps)
 
 
 @pytest.mark.parametrize(
