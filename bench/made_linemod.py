@@ -212,7 +212,8 @@ def draw_risks(views: Sequence[Row], out: Path) -> None:
         own = [v for v in views if v["method"] == OPEN and all(v[k] == at[k] for k in at)]
         if own:
             found = risk_coverage(finite(own, "risk"), finite(own, "error") < 0.1)
-            curves[f"{occlusion:.0%} hidden"] = list(zip(*(x.tolist() for x in found), strict=True))
+            points = list(zip(*(x.tolist() for x in found), strict=True))
+            curves[f"{occlusion:.0%} hidden"] = points[:: max(1, len(points) // 40)]
     if curves:
         draw_curves(out / "risks.png", {"share of views answered": curves}, "wrong among answers")
 
