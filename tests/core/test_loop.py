@@ -56,7 +56,10 @@ def interrupted(folder: Path, config: LoopConfig, after: int) -> None:
         trained(folder, config, on_step=stop)
 
 
-@pytest.mark.parametrize("changes", [{}, {"ema_decay": 0.9}, {"accumulate": 2, "clip_norm": 0.1}])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"ema_decay": 0.9}, {"accumulate": 2, "clip_norm": 0.1}, {"precision": "bf16"}],
+)
 def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, changes: dict[str, object]
 ) -> None:
