@@ -23,7 +23,7 @@ loop: {steps: 2, batch_size: 2, device: cpu}
 
 @pytest.fixture(scope="module")
 def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_part("connector", tmp_path_factory.mktemp("cad"))
+    return write_part("bracket", tmp_path_factory.mktemp("cad"))
 
 
 def test_a_cad_file_becomes_weights_with_a_card(
@@ -37,8 +37,8 @@ def test_a_cad_file_becomes_weights_with_a_card(
     assert f"trained weights: {out / 'pose.safetensors'}" in said
     assert "| 0 | " in said
     (model,) = read_pose_weights(out / "pose.safetensors").models
-    assert model.name == "connector"
-    assert model.diameter_m == pytest.approx(0.133, abs=0.001)
+    assert model.name == "bracket"
+    assert model.diameter_m == pytest.approx(0.160, abs=0.001)
     # The folder is that of this config.
     again = [*words, "--cad", str(part), "--unit", "mm", "--seed", "5", "--resume"]
     assert main(again) == 2
