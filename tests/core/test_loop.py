@@ -47,6 +47,12 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
         assert torch.equal(one[name], other[name]), name
 
 
+def assert_same_state(*folders: Path) -> None:
+    one, other = (torch.load(f / "state.pt", weights_only=True)["modules"] for f in folders)
+    for network in one:
+        assert_equal(one[network], other[network])
+
+
 def interrupted(folder: Path, config: LoopConfig, after: int) -> None:
     def stop(progress: Progress) -> None:
         if progress.step == after:
@@ -321,9 +327,7 @@ def test_a_kill_while_the_state_is_written_leaves_no_half_file(tmp_path: Path) -
     assert (killed / "state.pt").read_bytes() == before
     trained(killed, loop(), resume=True)
     assert not list(killed.rglob(".part-*"))
-    states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (whole, killed)]
-    for network in states[0]:
-        assert_equal(states[0][network], states[1][network])
+    assert_same_state(whole, killed)
 
 
 @pytest.mark.slow
@@ -353,9 +357,7 @@ def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
         [sys.executable, *program(killed, steps, 1)], check=True, env=environment(),
         capture_output=True,
     )  # fmt: skip
-    states = [torch.load(f / "state.pt", weights_only=True)["modules"] for f in (whole, killed)]
-    for network in states[0]:
-        assert_equal(states[0][network], states[1][network])
+    assert_same_state(whole, killed)
     assert not list(killed.glob(".part-*"))
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tests.pose.made_object import bottle, bracket, tiny_weights
+from tests.pose.stopping import StoppedError, stop_after
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
@@ -319,16 +320,8 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
 def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:
     whole = train_pose(_training(), Run(folder=tmp_path / "whole"))
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
-
-    class _Stopped(Exception):  # noqa: N818
-        pass
-
-    def stop(progress: object) -> None:
-        if getattr(progress, "step", 0) == 2:
-            raise _Stopped
-
-    with pytest.raises(_Stopped):
-        train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop))
+    with pytest.raises(StoppedError):
+        train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop_after(2)))
     cut = train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
     one, other = (read_pose_weights(path).network.state_dict() for path in (whole, cut))
     assert all(torch.equal(one[name], other[name]) for name in one)

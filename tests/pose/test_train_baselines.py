@@ -8,6 +8,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tests.pose.made_object import bottle, bracket
+from tests.pose.stopping import StoppedError, stop_after
 
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
@@ -288,16 +289,8 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
     config, train = dataclasses.replace(config, loop=loop), STAGES[what][1]
     whole = train(config, Run(folder=tmp_path / "whole"))
-
-    class _Stopped(Exception):  # noqa: N818
-        pass
-
-    def stop(progress: object) -> None:
-        if getattr(progress, "step", 0) == 2:
-            raise _Stopped
-
-    with pytest.raises(_Stopped):
-        train(config, Run(folder=tmp_path / "cut", on_step=stop))
+    with pytest.raises(StoppedError):
+        train(config, Run(folder=tmp_path / "cut", on_step=stop_after(2)))
     cut = train(config, Run(folder=tmp_path / "cut", resume=True))
     one, other = (read_checkpoint(path).state for path in (whole, cut))
     assert one.keys() == other.keys()

@@ -102,9 +102,10 @@ def _try_depth() -> str:
     left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
     found = FakestereoNet.load("default").estimate(left, None, right=right, with_check=False)
     median_px = float(found.disparity_px[:, 2 * _SHIFT_PX :].median())
+    said = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
-        raise InputError(f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px")
-    return f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
+        raise RuntimeError(said)
+    return said
 
 
 def _try_pose() -> str:
@@ -119,8 +120,9 @@ def _try_pose() -> str:
     view = Objects((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(0)
     (found,) = net.estimate_many([view.input])
     if found.camera_from_model is None:
-        raise InputError(f"a made view of a flange was refused: {found.reason}")
+        raise RuntimeError(f"a made view of a flange was refused: {found.reason}")
     off_m = adds_m(found.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
+    said = f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
     if off_m > flange.diameter_m / 10:
-        raise InputError(f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)")
-    return f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
+        raise RuntimeError(said)
+    return said

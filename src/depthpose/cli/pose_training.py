@@ -71,9 +71,9 @@ def train(
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
     if start is None and what == "pose" and cad and config is None:
         start = _START
-    chosen = changed(dataclasses.replace(chosen, loop=loop), start=start)
-    if start == _NOTHING:
-        chosen = dataclasses.replace(chosen, start=None)
+    chosen = dataclasses.replace(chosen, loop=loop)
+    if start is not None:
+        chosen = dataclasses.replace(chosen, start=None if start == _NOTHING else start)
     if cad or unit or symmetries:
         chosen = dataclasses.replace(chosen, models=_models(chosen, what, cad, unit, symmetries))
     if data is not None:

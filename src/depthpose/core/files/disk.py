@@ -102,8 +102,8 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what writers that were killed left behind; none may be at work there."""
-    for part in folder.rglob(f"{_PART}*"):
+    """Remove what killed writers left in a folder, not below it; none may be at work there."""
+    for part in folder.glob(f"{_PART}*"):
         with suppress(OSError):
             part.unlink()
 

@@ -24,6 +24,7 @@ from depthpose.core.loop.task import Evidence
 
 _STATE = "state.pt"
 _METRICS = "metrics.jsonl"
+_PICTURES = "pictures"
 
 
 class Journal:
@@ -38,7 +39,8 @@ class Journal:
         """Begin at ``step``: what a kill left behind goes, lines of later steps and half files."""
         if not self._is_writer:
             return
-        remove_parts(self.folder)
+        for folder in (self.folder, self.folder / _PICTURES):
+            remove_parts(folder)
         path = self.folder / _METRICS
         kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
         with atomic_write(path) as part:
@@ -65,7 +67,7 @@ class Journal:
         if evidence.numbers:
             self.log(step, evidence.numbers)
         for name, picture in evidence.pictures.items():
-            write_image(self.folder / "pictures" / f"{step:07d}_{name}.png", picture)
+            write_image(self.folder / _PICTURES / f"{step:07d}_{name}.png", picture)
             self._board.add_image(name, picture, step)
 
     def save(self, state: Mapping[str, Any]) -> None:
