@@ -7,8 +7,8 @@
 Every view is a rendering of its own, by a seed that no training has. A method is given one view at
 a time, on one thread; of several weights each answers for the objects that it knows. Success is ADD
 (ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
-is ours with every answer that votes can give, whatever its risk; of these risks.png says how many
-are wrong if only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
+is every answer that votes can give, whatever its risk; of ours risks.png says how many are wrong if
+only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
 view, and a picture of each curve. What another run measured stands beside it by ``--also``.
 """
 
@@ -82,13 +82,13 @@ def loaded(
         yield from _of(f"{name} + ICP" if with_icp else name, nets, number)
 
 
-def without_refusal(files: Sequence[str], number: int) -> Iterator[Method]:
-    """Give ours with every answer, however risky."""
+def without_refusal(name: str, files: Sequence[str], number: int) -> Iterator[Method]:
+    """Give every answer of a network whose points vote, however risky."""
     found = [read_pose_weights(find_weights(file)) for file in files]
     open_ = [
         dataclasses.replace(w, refusal=dataclasses.replace(w.refusal, max_risk=1.0)) for w in found
     ]
-    yield from _of(OPEN, [GeoPoseNet(weights) for weights in open_], number)
+    yield from _of(name, [GeoPoseNet(weights) for weights in open_], number)
 
 
 def _of(name: str, nets: Sequence[Any], number: int) -> Iterator[Method]:
@@ -243,8 +243,9 @@ def main() -> None:
     models = list(read_bop_models(words.bop, numbers).values())
     methods = [
         *loaded("Geo-PoseNet", words.ours, words.number, GeoPoseNet),
-        *without_refusal(words.ours, words.number),
+        *without_refusal(OPEN, words.ours, words.number),
         *loaded("PointNet", words.pointnet, words.number, GeoPoseNet),
+        *without_refusal("PointNet + ICP, nothing refused", words.pointnet, words.number),
         *loaded("depth image", words.depth_image, words.number, DepthImageRegressor),
         *registration(models, words.open3d),
     ]

@@ -29,7 +29,7 @@ from depthpose.pose.baselines import (
 from depthpose.pose.baselines.crop import EMPTY, DepthCrop
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.types import CloudInput, ViewInput
+from depthpose.pose.types import CloudInput, SeenPoints, ViewInput
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
 SMALL = DepthImageConfig(classes=3, crop_px=32, widths=(4, 4, 8, 8))
@@ -227,7 +227,13 @@ def test_each_point_is_answered_for_its_class_about_its_clouds_mean() -> None:
     rows = torch.zeros(6, 4, dtype=torch.long)
     # Wherever the cloud is: only places about its mean are looked at.
     classes = torch.tensor([0, 1, 1, 0, 1, 0])
-    own = network.directions(points + 1.0, rows, classes)
+    seen = SeenPoints(
+        points_m=points + 1.0,
+        coordinates=rows,
+        features=torch.ones(6, 1),
+        class_of_point=classes,
+    )
+    own = network.directions(seen)
     about = network(points - points.mean(0), rows[:, 0])
     torch.testing.assert_close(own, about[torch.arange(6), classes], rtol=1e-4, atol=1e-5)
 

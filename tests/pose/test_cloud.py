@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import pytest
@@ -58,28 +59,35 @@ def test_too_small_a_cloud_is_refused_with_a_reason() -> None:
     assert "0 points" in (refusal_of(empty) or "")
 
 
+def plain(voxel_m: float) -> CloudConfig:
+    return CloudConfig(voxel_m=voxel_m, with_sight_axis=False)
+
+
 def test_voxels_are_what_a_plain_loop_gives() -> None:
     points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.03
-    voxels = voxelise(points, 0.01)
+    voxels = voxelise(points, plain(0.01))
     seen: dict[tuple[int, ...], int] = {}
     for i, cell in enumerate(((points - points.mean(0)) / 0.01).floor().long().tolist()):
         seen.setdefault(tuple(cell), i)
     assert voxels.kept.tolist() == list(seen.values())
     assert [tuple(c) for c in voxels.coordinates.tolist()] == list(seen)
+    cells = ((points - points.mean(0)) / 0.01).floor().long()
+    assert torch.equal(voxels.coordinates[voxels.row_of_point], cells)
+    assert torch.equal(voxels.features, torch.ones(len(seen), 1))
 
 
 def test_voxels_do_not_know_where_the_object_is() -> None:
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double()
-    here, there = voxelise(points, 0.1), voxelise(points + 0.5, 0.1)
+    here, there = voxelise(points, plain(0.1)), voxelise(points + 0.5, plain(0.1))
     assert torch.equal(here.coordinates, there.coordinates)
     assert torch.equal(here.kept, there.kept)
 
 
 def test_voxels_of_nothing_and_of_millimetres_are_refused() -> None:
     with pytest.raises(InputError, match="no point"):
-        voxelise(torch.empty(0, 3), 0.01)
+        voxelise(torch.empty(0, 3), CloudConfig())
     with pytest.raises(InputError, match="are its points in mm"):
-        voxelise(torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]), 0.001)
+        voxelise(torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]), plain(0.001))
 
 
 def test_samples_are_a_subset_in_order_and_reproducible() -> None:
@@ -115,14 +123,14 @@ def test_the_real_cat(real: Path) -> None:
     cloud = cloud_from_depth(depth, mask, intrinsic.double(), 0.1545)
     assert 2000 < len(cloud) <= 2212
     assert float((cloud.amax(0) - cloud.amin(0)).norm()) < 0.25
-    assert 50 < len(voxelise(cloud, 0.008).kept) < 500
+    assert 50 < len(voxelise(cloud, plain(0.008)).kept) < 500
 
 
 def test_a_point_that_is_none_does_not_move_all_others() -> None:
     points_m = torch.rand(50, 3)
     points_m[3, 0] = torch.nan
     with pytest.raises(InputError, match="voxelise: 1 points are not finite; leave such"):
-        voxelise(points_m, 0.1)
+        voxelise(points_m, plain(0.1))
 
 
 def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
@@ -131,11 +139,68 @@ def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
     ahead = ahead - ahead.mean(0) + torch.tensor([0.0, 0.0, 0.8])
     away = turn_axis_to(torch.tensor([0.5, -0.3, 1.0])).float()
     side = ahead @ away.mT
-    first = voxelise(ahead, 0.01, with_sight_axis=True)
-    second = voxelise(side, 0.01, with_sight_axis=True)
+    first = voxelise(ahead, CloudConfig(voxel_m=0.01))
+    second = voxelise(side, CloudConfig(voxel_m=0.01))
     assert torch.allclose(first.grid_from_camera, torch.eye(3), atol=1e-6)
     assert torch.allclose(second.grid_from_camera @ away, torch.eye(3), atol=1e-6)
     # Rounding moves a point or two across a wall.
     same = (first.coordinates[:, None] == second.coordinates[None]).all(-1).any(1)
     assert float(same.float().mean()) > 0.98
-    assert torch.equal(voxelise(side, 0.01).grid_from_camera, torch.eye(3))
+    assert torch.equal(voxelise(side, plain(0.01)).grid_from_camera, torch.eye(3))
+
+
+def shape_of(points: torch.Tensor, voxel_m: float = 0.01) -> torch.Tensor:
+    config = CloudConfig(voxel_m=voxel_m, with_shape=True)
+    features = voxelise(points, config).features
+    assert features.shape[1] == config.features
+    return features
+
+
+def test_the_shape_of_a_voxel_is_what_a_plain_loop_gives() -> None:
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)).double() * 0.03
+    config = CloudConfig(voxel_m=0.01, with_sight_axis=False, with_shape=True)
+    voxels = voxelise(points, config)
+    places = (points - points.mean(0)) / 0.01
+    for row, cell in enumerate(voxels.coordinates):
+        mine = places[(places.floor() == cell).all(-1)]
+        inside = 2 * (mine.mean(0) - cell) - 1
+        expected = torch.cat([torch.ones(1), inside, torch.tensor([math.log2(len(mine))])])
+        torch.testing.assert_close(voxels.features[row, :5], expected.float(), atol=1e-5, rtol=0)
+    assert float(voxels.features[:, 4].max()) > 1
+
+
+def test_a_plane_has_its_normal_toward_the_camera_and_a_ball_is_bent() -> None:
+    generator = torch.Generator().manual_seed(3)
+    flat = torch.rand(600, 3, generator=generator) * torch.tensor([0.1, 0.1, 0.0])
+    tilt = turn_axis_to(torch.tensor([0.3, 0.2, -1.0]))
+    plane = (flat.double() @ tilt.mT + torch.tensor([0.1, -0.2, 0.9])).float()
+    features = shape_of(plane)
+    turn = voxelise(plane, CloudConfig()).grid_from_camera
+    normal = (turn.double() @ tilt[:, 2]).float()
+    normal = normal * -torch.sign(normal @ (turn @ plane.mean(0)))
+    assert float(normal[2]) < -0.5  # the third axis of the grid points away from the camera
+    torch.testing.assert_close(features[:, 5:8], normal.expand(len(features), 3), atol=1e-3, rtol=0)
+    assert float(features[:, 8].max()) < 1e-5
+    ball = torch.randn(600, 3, generator=generator) * 0.01 + torch.tensor([0.0, 0.0, 1.0])
+    assert 0.1 < float(shape_of(ball)[:, 8].mean()) < 1
+
+
+def test_the_shape_turns_with_the_camera() -> None:
+    generator = torch.Generator().manual_seed(4)
+    ahead = torch.rand(500, 3, generator=generator).double() * 0.1 + torch.tensor([0.0, 0.0, 0.8])
+    ahead -= torch.tensor([*ahead.mean(0)[:2], 0.0])
+    away = turn_axis_to(torch.tensor([0.5, -0.3, 1.0])).double()
+    here, there = shape_of(ahead), shape_of(ahead @ away.mT)
+    if len(here) == len(there):
+        near = (here - there).abs().amax(1) < 1e-3
+        assert float(near.float().mean()) > 0.95
+    else:
+        pytest.fail(f"{len(here)} voxels became {len(there)}")
+
+
+def test_three_points_have_a_shape_too() -> None:
+    few = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
+    features = shape_of(few)
+    assert bool(features.isfinite().all())
+    torch.testing.assert_close(features[:, 8], torch.zeros(3))
+    assert bool(shape_of(few[:1]).isfinite().all())

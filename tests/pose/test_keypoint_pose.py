@@ -8,6 +8,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.bop import open_bop
 from depthpose.pose.cloud import voxelise
+from depthpose.pose.config import CloudConfig
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import prepare_surface, refine_pose
 from depthpose.pose.types import Axis
@@ -156,7 +157,8 @@ def test_the_whole_way_on_the_real_cat(real: Path) -> None:
     data = open_bop(real / "pose/lm")
     sample, model = data[0], data.objects[data.instances[0].object_id]
     true = sample.truth.camera_from_model
-    points = sample.input.points_m[voxelise(sample.input.points_m, 0.004).kept].double()
+    kept = voxelise(sample.input.points_m, CloudConfig(voxel_m=0.004)).kept
+    points = sample.input.points_m[kept].double()
     keypoints = true.apply(model.keypoints_m.double())
     directions = torch.nn.functional.normalize(keypoints - points[:, None], dim=-1)
     noise = torch.randn(directions.shape, generator=generator(0), dtype=torch.float64)

@@ -25,6 +25,7 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     turn_about,
     unit_advice,
+    with_found_symmetries,
 )
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
@@ -306,6 +307,23 @@ def test_symmetries_of_plain_bodies_are_found(mesh: trimesh.Trimesh, turns: int,
     for turn in symmetry_transforms(found, max_step=0.5).R:
         assert float(geodesic_rad(turn.mT @ turn, torch.eye(3, dtype=turn.dtype))) < 1e-3
     assert cloud.shape == (300, 3)
+
+
+def test_a_nearly_round_block_of_points_is_square() -> None:
+    block = trimesh.creation.box((0.1, 0.1, 0.2))
+    points, faces = trimesh.sample.sample_surface_even(block, 2600, seed=0)
+    noise = np.random.default_rng(0).normal(0.0, 0.001, (len(points), 1))
+    points = torch.from_numpy(np.asarray(points + noise * block.face_normals[faces]))
+    model = make_model(points, torch.zeros(0, 3).long(), name="block")
+    told: list[str] = []
+    rough = with_found_symmetries(model, told.append, is_taken=True, tolerance=0.045)
+    # 45 degrees about the long axis move an edge by 20 mm, 0.085 diameters.
+    (nearly,) = (p for p in propose_symmetries(model, 0.045) if p.kind == "continuous")
+    assert 0.2 < nearly.certainty < 0.5
+    assert rough.symmetries.continuous == ()
+    assert rough.symmetries.discrete is not None
+    assert len(rough.symmetries.discrete.R) == 7
+    assert "7 turns" in told[0]
 
 
 def test_real_symmetries(real: Path) -> None:

@@ -11,6 +11,7 @@ from depthpose.pose.objects import make_part
 from depthpose.pose.train import PoseTask, PoseTraining
 from depthpose.pose.train.clouds import CloudBatch
 from depthpose.pose.train.task import keypoint_copies
+from depthpose.pose.types import SeenPoints
 
 _SMALL = ResUNetConfig(classes=1, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
 _STEP = 0.05
@@ -22,12 +23,7 @@ class _Stubborn(ResUNet):
 
     answer: torch.Tensor
 
-    def directions(
-        self,
-        points_m: torch.Tensor,  # noqa: ARG002
-        coordinates: torch.Tensor,  # noqa: ARG002
-        class_of_point: torch.Tensor,  # noqa: ARG002
-    ) -> torch.Tensor:
+    def directions(self, seen: SeenPoints) -> torch.Tensor:  # noqa: ARG002
         return self.answer
 
 
@@ -36,6 +32,7 @@ def _batch(pose: Rigid, points_m: torch.Tensor) -> CloudBatch:
     return CloudBatch(
         points_m=points_m.float(),
         coordinates=torch.nn.functional.pad(cells, (1, 0)),
+        features=torch.ones(len(cells), 1),
         class_of=torch.tensor([0]),
         R=pose.R[None].float(),
         t_m=pose.t_m[None].float(),

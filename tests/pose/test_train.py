@@ -5,6 +5,7 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -47,7 +48,7 @@ from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objec
 from depthpose.pose.train.judge import calibrated, card_text, judged
 from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
-from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
+from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
@@ -114,12 +115,8 @@ class _Oracle(ResUNet):
     """Answers with the true directions, whatever it is shown."""
 
     truth: torch.Tensor
-    seen: tuple[torch.Tensor, ...] = ()
 
-    def directions(
-        self, points_m: torch.Tensor, coordinates: torch.Tensor, class_of_point: torch.Tensor
-    ) -> torch.Tensor:
-        self.seen = (points_m, coordinates, class_of_point)
+    def directions(self, seen: SeenPoints) -> torch.Tensor:  # noqa: ARG002
         return self.truth
 
 
@@ -296,6 +293,32 @@ def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> Non
             dataclasses.replace(config, network=other, models=_FOUR_KEYPOINTS),
             Run(folder=tmp_path / "other"),
         )
+
+
+@pytest.mark.parametrize("norm", ["batch", "none"])
+def test_a_start_that_was_told_less_of_a_voxel_does_not_listen_to_more(
+    tmp_path: Path, norm: Literal["batch", "none"]
+) -> None:
+    first = train_pose(_training(), Run(folder=tmp_path / "first"))
+    still = AdamConfig(learning_rate=1e-12)
+    cloud = dataclasses.replace(_CLOUD, with_shape=True)
+    network = dataclasses.replace(_SMALL, norm=norm, with_bias=norm == "none")
+    loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
+    config = _training(cloud=cloud, network=network, start=str(first), adam=still, loop=loop)
+    then = train_pose(config, Run(folder=tmp_path / "then"))
+    found = [read_pose_weights(path) for path in (first, then)]
+    networks = [n for n in (weights.network for weights in found) if isinstance(n, ResUNet)]
+    assert [network.config.inputs for network in networks] == [1, 9]
+    answers = []
+    for weights, network in zip(found, networks, strict=True):
+        view = TrainingClouds(_models()[:1], _MADE, None, weights.cloud, seed=1)[0]
+        answers.append(network.directions(TrainingClouds.collate([view]).seen).detach())
+    # A batch norm has other statistics after its first batch, and nothing else changed.
+    assert float((answers[1] - answers[0]).norm() / answers[0].norm()) < 0.1
+    with pytest.raises(InputError, match="inputs = 9, but the config says 1"):
+        train_pose(_training(start=str(then)), Run(folder=tmp_path / "less"))
+    with pytest.raises(InputError, match=r"takes 9 features of a voxel, .* clouds give 1\. Set"):
+        dataclasses.replace(found[1], cloud=_CLOUD)
 
 
 def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -11,6 +12,7 @@ from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.config import CloudConfig
 
 _LARGEST_CELL = 2**20
+_NEIGHBOURS = 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -18,16 +20,21 @@ class Voxels:
     """Which cells of a grid a cloud fills, and the point that was kept in each.
 
     Attributes:
-        cells: cell of every point, ``floor((x - mean) / voxel)`` of the turned cloud.
-        coordinates: those of the kept points; no two are equal.
-        kept: index of that point in the cloud, ascending: the first of its cell.
+        coordinates: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two
+            are equal.
+        kept: index of the point of each cell, ascending: the first of its cell.
+        row_of_point: which of the cells each point of the cloud lies in.
         grid_from_camera: how the cloud was turned before.
+        features: of each cell, in the axes of the grid: the number 1 or, with shape, also the place
+            of its mean in the cell (-1 to 1), log2 of its number of points, the normal toward the
+            camera, and the curvature (0 in a plane, 1 in a ball).
     """
 
-    cells: Int64[Tensor, "n 3"]
     coordinates: Int64[Tensor, "m 3"]
     kept: Int64[Tensor, " m"]
+    row_of_point: Int64[Tensor, " n"]
     grid_from_camera: Float[Tensor, "3 3"]
+    features: Float[Tensor, "m c"]
 
 
 def cloud_from_depth(
@@ -108,9 +115,7 @@ def sample_points(
     return points_m[index.to(points_m.device)]
 
 
-def voxelise(
-    points_m: Float[Tensor, "n 3"], voxel_m: float, *, with_sight_axis: bool = False
-) -> Voxels:
+def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> Voxels:
     """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
 
     The grid's axes are the camera's, or with ``with_sight_axis`` turned so that the third points at
@@ -130,19 +135,55 @@ def voxelise(
         raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
     mean_m = points_m.mean(0)
     turn = torch.eye(3).to(points_m)
-    if with_sight_axis and float(mean_m.norm()) > 0:
+    if config.with_sight_axis and float(mean_m.norm()) > 0:
         turn = turn_axis_to(mean_m).mT.to(points_m)
-    cells = torch.floor((points_m - mean_m) @ turn.mT / voxel_m).long()
+    places = (points_m - mean_m) @ turn.mT / config.voxel_m
+    cells = torch.floor(places).long()
     extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
     if extent > _LARGEST_CELL:
         raise InputError(
-            f"voxelise: the cloud is {extent} voxels of {voxel_m} m wide; are its points in mm, "
-            "or is one of them far away? Give metres."
+            f"voxelise: the cloud is {extent} voxels of {config.voxel_m} m wide; are its points in "
+            "mm, or is one of them far away? Give metres."
         )
     local = cells - cells.amin(0)
     key = (local[:, 0] * extent + local[:, 1]) * extent + local[:, 2]
     _, cell = torch.unique(key, return_inverse=True)
     order = torch.arange(len(cells), device=cells.device)
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
-    kept = first.scatter_reduce_(0, cell, order, "amin").sort().values
-    return Voxels(cells=cells, coordinates=cells[kept], kept=kept, grid_from_camera=turn)
+    kept, rank = first.scatter_reduce_(0, cell, order, "amin").sort()
+    row_of_point = rank.argsort()[cell]
+    features = torch.ones(len(kept), 1).to(kept.device)
+    if config.with_shape:
+        parts = (_means(places - cells, row_of_point), _planes(points_m, kept, turn))
+        features = torch.cat([features, *parts], 1)
+    return Voxels(
+        coordinates=cells[kept],
+        kept=kept,
+        row_of_point=row_of_point,
+        grid_from_camera=turn,
+        features=features,
+    )
+
+
+def _means(inside: Float[Tensor, "n 3"], row_of_point: Int64[Tensor, " n"]) -> Float[Tensor, "m 4"]:
+    """Average the points of each cell about its middle, in half cells; count them."""
+    counts = torch.bincount(row_of_point).to(inside)[:, None]
+    sums = inside.new_zeros(len(counts), 3).index_add(0, row_of_point, inside)
+    return torch.cat([2 * sums / counts - 1, counts.log2()], 1).float()
+
+
+def _planes(
+    points_m: Float[Tensor, "n 3"], kept: Int64[Tensor, " m"], turn: Float[Tensor, "3 3"]
+) -> Float[Tensor, "m 4"]:
+    """Lay a plane through the nearest 20 of each kept point: its normal, and how bent it is."""
+    every, some = points_m.double().cpu(), points_m[kept].double().cpu()
+    count = min(_NEIGHBOURS, len(every))
+    index = KDTree(every.numpy()).query(some.numpy(), k=count, workers=1)[1]
+    near = every[torch.as_tensor(index).reshape(len(some), count)]
+    near = near - near.mean(1, keepdim=True)
+    spread, axes = torch.linalg.eigh(near.mT @ near)
+    normals = axes[:, :, 0]
+    is_behind = (normals * some).sum(-1, keepdim=True) > 0
+    normals = torch.where(is_behind, -normals, normals) @ turn.double().cpu().mT
+    bend = 3 * spread[:, :1].clamp(min=0) / spread.sum(1, keepdim=True).clamp(min=1e-30)
+    return torch.cat([normals, bend], 1).float().to(points_m.device)

@@ -1,9 +1,10 @@
 """What flows through the pose room: input apart from truth, the object, and the estimate."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
-from jaxtyping import Bool, Float, Int64
+import torch
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -36,6 +37,27 @@ class CloudInput:
     name: str
     points_m: Float[Tensor, "n 3"]
     object: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenPoints:
+    """What a network whose points vote is shown: one or several clouds, one after the other.
+
+    Attributes:
+        points_m: one of each voxel, in the axes of its cloud's grid about its camera.
+        coordinates: (cloud, x, y, z) of its voxel.
+        features: of its voxel.
+        class_of_point: which object each belongs to.
+    """
+
+    points_m: Float[Tensor, "points 3"]
+    coordinates: Int[Tensor, "points 4"]
+    features: Float[Tensor, "points c"]
+    class_of_point: Int[Tensor, " points"]
+
+    def to(self, device: str | torch.device) -> "SeenPoints":
+        """Give the same on a device."""
+        return SeenPoints(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

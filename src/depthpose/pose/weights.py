@@ -59,6 +59,11 @@ class PoseWeights:
                 f"the network knows {config.classes} classes, but {len(self.models)} models are "
                 "given; class k is models[k]. Give one model for each."
             )
+        if isinstance(config, ResUNetConfig) and config.inputs != self.cloud.features:
+            raise InputError(
+                f"the network takes {config.inputs} features of a voxel, but its clouds give "
+                f"{self.cloud.features}. Set with_shape of the cloud as it was in training."
+            )
         wanted = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:
             if wanted not in (None, len(model.keypoints_m)):

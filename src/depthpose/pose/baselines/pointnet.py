@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from depthpose.pose.baselines.config import PointNetConfig
 from depthpose.pose.sparse import RowNorm
+from depthpose.pose.types import SeenPoints
 
 KIND = "pointnet"
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
@@ -45,25 +46,14 @@ class PointNet(nn.Module):
         outputs = self.final(self.features(points_m, cloud))
         return outputs.view(len(outputs), c.classes, c.keypoints, c.components)
 
-    def directions(
-        self,
-        points_m: Float[Tensor, "points 3"],
-        coordinates: Int[Tensor, "points 4"],
-        class_of_point: Int[Tensor, " points"],
-    ) -> Float[Tensor, "points keypoints components"]:
-        """Answer for each point's own class: what every network that votes offers.
-
-        Args:
-            points_m: of all clouds, one cloud after the other.
-            coordinates: (cloud, x, y, z) of each point's voxel; only the cloud is looked at.
-            class_of_point: which object each point belongs to.
-        """
-        cloud = coordinates[:, 0].long()
+    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers."""
+        points_m, cloud = seen.points_m, seen.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)
         sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
         local_m = points_m - (sums_m / sizes[:, None])[cloud]
         rows = torch.arange(len(points_m), device=points_m.device)
-        return self(local_m, cloud)[rows, class_of_point]
+        return self(local_m, cloud)[rows, seen.class_of_point]
 
     def features(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]

@@ -43,6 +43,10 @@ class CloudConfig:
     an object at the side of its image is then what it sees in the middle. The published method
     leaves the cloud as it is."""
 
+    with_shape: bool = False
+    """Tell the network of each voxel where in it the points lie on average, how many they are, and
+    the normal and curvature there; the published method tells it that there is a point."""
+
     max_points: int | None = 1500
     """At most so many points, chosen at random before voxels are made; None: all."""
 
@@ -72,6 +76,11 @@ class CloudConfig:
                 f"max_offset_diameters is {self.max_offset_diameters}, but no point is nearer than "
                 "0; take 1"
             )
+
+    @property
+    def features(self) -> int:
+        """Numbers that the network is told of each voxel."""
+        return 9 if self.with_shape else 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from depthpose.pose.estimator.given import (
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.refine import Surface, prepare_surface
-from depthpose.pose.types import PoseEstimate
+from depthpose.pose.types import PoseEstimate, SeenPoints
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _NAME = "input"
@@ -170,20 +170,21 @@ class GeoPoseNet:
         start = time.perf_counter()
         counts = [len(cloud.points_m) for cloud in clouds]
         cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
-        coordinates = torch.cat([cloud.coordinates for cloud in clouds])
-        rows = torch.cat([cloud_of_point[:, None], coordinates], 1).to(self.config.device)
-        class_of_point = torch.tensor(numbers)[cloud_of_point].to(self.config.device)
-        points_m = torch.cat([cloud.points_m @ cloud.grid_from_camera.mT for cloud in clouds])
-        outputs = (
-            self._network.directions(points_m.to(self.config.device), rows, class_of_point)
-            .float()
-            .cpu()
+        grids = [cloud.voxels for cloud in clouds]
+        coordinates = torch.cat([grid.coordinates for grid in grids])
+        turned = (c.points_m @ c.voxels.grid_from_camera.mT for c in clouds)
+        seen = SeenPoints(
+            points_m=torch.cat(list(turned)),
+            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
+            features=torch.cat([grid.features for grid in grids]),
+            class_of_point=torch.tensor(numbers)[cloud_of_point],
         )
-        turned = [
-            _in_camera(some, cloud.grid_from_camera)
-            for some, cloud in zip(outputs.split(counts), clouds, strict=True)
+        outputs = self._network.directions(seen.to(self.config.device)).float().cpu()
+        answers = [
+            _in_camera(some, grid.grid_from_camera)
+            for some, grid in zip(outputs.split(counts), grids, strict=True)
         ]
-        return turned, time.perf_counter() - start
+        return answers, time.perf_counter() - start
 
     def _pose(
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]

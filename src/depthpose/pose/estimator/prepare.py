@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.pose.cloud import (
+    Voxels,
     cloud_from_depth,
     is_flying,
     refusal_of,
@@ -32,14 +33,12 @@ class Prepared:
     Attributes:
         cloud_m: all usable points, what flies about left out.
         points_m: those that the network sees and that vote, one a voxel.
-        coordinates: their voxels.
-        grid_from_camera: how the network's grid lies.
+        voxels: of the network's grid.
     """
 
     cloud_m: Float[Tensor, "n 3"]
     points_m: Float[Tensor, "m 3"]
-    coordinates: Int64[Tensor, "m 3"]
-    grid_from_camera: Float[Tensor, "3 3"]
+    voxels: Voxels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,13 +74,8 @@ def prepare_cloud(
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
-    voxels = voxelise(sampled_m, cloud.voxel_m, with_sight_axis=cloud.with_sight_axis)
-    return Prepared(
-        cloud_m=kept_m,
-        points_m=sampled_m[voxels.kept],
-        coordinates=voxels.coordinates,
-        grid_from_camera=voxels.grid_from_camera,
-    )
+    voxels = voxelise(sampled_m, cloud)
+    return Prepared(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels)
 
 
 def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:

@@ -41,8 +41,10 @@ def seen_points(
     prepared = prepare_cloud(given, model, net.weights.cloud, net.config)
     if isinstance(prepared, Refusal):
         return None
-    rows = torch.cat([torch.zeros_like(prepared.coordinates[:, :1]), prepared.coordinates], 1)
-    return prepared.points_m, network.point_features(Voxels.from_points(rows)).float()
+    grid = prepared.voxels
+    rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
+    voxels = Voxels.from_points(rows, grid.features)
+    return prepared.points_m, network.point_features(voxels).float()
 
 
 def draw_features(

@@ -155,18 +155,23 @@ def symmetries_from_proposals(
 
 
 def with_found_symmetries(
-    model: ObjectModel, tell: Callable[[str], None] | None, *, is_taken: bool
+    model: ObjectModel,
+    tell: Callable[[str], None] | None,
+    *,
+    is_taken: bool,
+    tolerance: float = 0.02,
 ) -> ObjectModel:
     """Look for the symmetries of a model that declares none, and count them if that is wanted.
 
     Args:
-        model: with faces; points alone are left as they are.
+        model: a mesh, or points with normals.
         tell: told what was found, taken or not; None looks for nothing that is not taken.
         is_taken: give the model these symmetries.
+        tolerance: as for :func:`propose_symmetries`.
     """
-    if not (is_taken or tell) or not len(model.faces) or not model.symmetries.is_none:
+    if not (is_taken or tell) or not model.symmetries.is_none:
         return model
-    proposals = propose_symmetries(model)
+    proposals = propose_symmetries(model, tolerance)
     found = symmetries_from_proposals(proposals)
     if found.is_none:
         return model
@@ -245,17 +250,23 @@ def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) ->
 def _measure(
     surface: _Surface, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
-    """Measure the full circle about an axis, or else every turn of order 2 to 12."""
+    """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12.
+
+    A rough square block is nearly round, and surely square.
+    """
     axis = Axis(direction=direction, point_m=surface.centre_m)
     circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
+    found: list[SymmetryProposal] = []
     if bool(surface.is_promising(circle).all()):
         worst = float(surface.deviation(circle).max())
         if worst <= limit:
-            return [_proposal("continuous", axis, None, worst, tolerance)]
+            found = [_proposal("continuous", axis, None, worst, tolerance)]
+        if worst <= tolerance:
+            return found
     angles = _fractions()
     angles = angles[surface.is_promising(_turns(direction, angles))]
     if len(angles) == 0:
-        return []
+        return found
     deviation = surface.deviation(_turns(direction, angles))
     kept: list[SymmetryProposal] = []
     for i in deviation.argsort().tolist():
@@ -264,7 +275,7 @@ def _measure(
         is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SHADOW_RAD for p in kept)
         if value <= limit and not is_shadow:
             kept.append(_proposal("discrete", axis, angle, value, tolerance))
-    return kept
+    return found + kept
 
 
 def _follow(surface: _Surface, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

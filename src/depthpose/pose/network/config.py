@@ -38,7 +38,7 @@ class ResUNetConfig:
     """Channels of the levels coming up, finest first; the first are the features of a point."""
 
     inputs: int = 1
-    """Features of a point that is given: the number 1 alone."""
+    """Features of a voxel that are given: the number 1 alone, or its shape too (9)."""
 
     descriptor: int | None = None
     """Outputs that are no directions, for FCGF's published descriptors; None: directions."""

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from depthpose.pose.network.config import ResUNetConfig
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
+from depthpose.pose.types import SeenPoints
 
 BRANCH_SCALE = 0.25
 """Without norms the second convolution of each block begins this much smaller: seven blocks in a
@@ -117,20 +118,10 @@ class ResUNet(nn.Module):
             answers[mine] = self._answer(features[mine], number).to(answers)
         return answers
 
-    def directions(
-        self,
-        points_m: Float[Tensor, "points 3"],  # noqa: ARG002 - the grid says where they are
-        coordinates: Int[Tensor, "points 4"],
-        class_of_point: Int[Tensor, " points"],
-    ) -> Float[Tensor, "points keypoints components"]:
-        """Answer for each point's own class: what every network that votes offers.
-
-        Args:
-            points_m: of all clouds, one cloud after the other.
-            coordinates: (cloud, x, y, z) of each point's voxel.
-            class_of_point: which object each point belongs to.
-        """
-        return self.forward_classes(Voxels.from_points(coordinates), class_of_point)
+    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints components"]:
+        """Answer for each point's own class: what every network that votes offers."""
+        voxels = Voxels.from_points(seen.coordinates, seen.features)
+        return self.forward_classes(voxels, seen.class_of_point)
 
     def _answer(self, features: Tensor, number: int) -> Float[Tensor, "n keypoints components"]:
         assert self.final.bias is not None

@@ -178,8 +178,8 @@ def _directions(
     network: ResUNet, points_m: Points, number: int, cloud: CloudConfig
 ) -> Float[Tensor, "n k 3"]:
     """Ask for the direction of every point, not of one a voxel: those of a voxel share it."""
-    grid = voxelise(points_m, cloud.voxel_m, with_sight_axis=cloud.with_sight_axis)
-    rows = torch.cat([torch.zeros_like(grid.cells[:, :1]), grid.cells], 1)
-    voxels = Voxels.from_points(rows, duplicates="mean")
+    grid = voxelise(points_m, cloud)
+    rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
+    voxels = Voxels.from_points(rows, grid.features)
     outputs = network.forward_class(voxels, number)[..., :3] @ grid.grid_from_camera
-    return torch.nn.functional.normalize(outputs, dim=-1)
+    return torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]

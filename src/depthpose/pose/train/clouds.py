@@ -16,7 +16,7 @@ from depthpose.pose.cloud import refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.objects import Objects
 from depthpose.pose.train.config import FramesConfig
-from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
+from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth, SeenPoints
 
 _TRIES = 20
 
@@ -26,6 +26,7 @@ class Cloud(NamedTuple):
 
     points_m: Float[Tensor, "n 3"]
     coordinates: Int[Tensor, "n 3"]
+    features: Float[Tensor, "n c"]
     class_number: int
     R: Float[Tensor, "3 3"]
     t_m: Float[Tensor, "3"]
@@ -37,6 +38,7 @@ class CloudBatch(NamedTuple):
     Attributes:
         points_m: of all clouds, each in the axes of its grid about its camera.
         coordinates: (cloud, x, y, z) of each point's voxel.
+        features: of each voxel.
         class_of: class of each cloud.
         R: rotation of each cloud's pose.
         t_m: translation.
@@ -44,6 +46,7 @@ class CloudBatch(NamedTuple):
 
     points_m: Float[Tensor, "points 3"]
     coordinates: Int[Tensor, "points 4"]
+    features: Float[Tensor, "points c"]
     class_of: Int[Tensor, " clouds"]
     R: Float[Tensor, "clouds 3 3"]
     t_m: Float[Tensor, "clouds 3"]
@@ -52,6 +55,16 @@ class CloudBatch(NamedTuple):
     def instance(self) -> Int[Tensor, " points"]:
         """Which cloud each point belongs to."""
         return self.coordinates[:, 0].long()
+
+    @property
+    def seen(self) -> SeenPoints:
+        """What the network is shown: everything but the truth."""
+        return SeenPoints(
+            points_m=self.points_m,
+            coordinates=self.coordinates,
+            features=self.features,
+            class_of_point=self.class_of[self.instance],
+        )
 
 
 class TrainingClouds:
@@ -137,11 +150,12 @@ def voxelised_cloud(
     Cloud and truth are turned with the grid.
     """
     points = sample_points(sample.input.points_m, config.max_points, generator)
-    voxels = voxelise(points, config.voxel_m, with_sight_axis=config.with_sight_axis)
+    voxels = voxelise(points, config)
     turn, pose = voxels.grid_from_camera.float(), sample.truth.camera_from_model
     return Cloud(
         points_m=points[voxels.kept].float() @ turn.mT,
         coordinates=voxels.coordinates,
+        features=voxels.features,
         class_number=class_number,
         R=turn @ pose.R.float(),
         t_m=turn @ pose.t_m.float(),
@@ -156,6 +170,7 @@ def collate_clouds(clouds: Sequence[Cloud]) -> CloudBatch:
         coordinates=torch.cat(
             [torch.cat([n, c.coordinates], 1) for n, c in zip(numbers, clouds, strict=True)]
         ),
+        features=torch.cat([c.features for c in clouds]),
         class_of=torch.tensor([c.class_number for c in clouds]),
         R=torch.stack([c.R for c in clouds]),
         t_m=torch.stack([c.t_m for c in clouds]),

@@ -34,6 +34,9 @@ class ModelsConfig:
     with_found_symmetries: bool = False
     """Look for symmetries of models that declare none, and count the copies as right."""
 
+    symmetry_tolerance: float = 0.02
+    """How far, in diameters, a turned copy may lie off. Scans, rough and dented, take more."""
+
     licence: str = "not stated; that of the models binds"
     """Under which the weights may be used."""
 
@@ -129,8 +132,10 @@ class PoseTraining:
     """Made views at the start that all show the first object. Several objects together take long to
     get beyond votes for the middle of the cloud; one alone does not, and the others follow it."""
 
-    cloud: CloudConfig = field(default_factory=lambda: CloudConfig(max_points=1000))
-    """Voxel size, and points of a cloud."""
+    cloud: CloudConfig = field(
+        default_factory=lambda: CloudConfig(max_points=1000, with_shape=True)
+    )
+    """Voxel size, points of a cloud, and what the network is told of each voxel."""
 
     network: ResUNetConfig = field(
         default_factory=lambda: ResUNetConfig(

@@ -161,7 +161,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     """Train the regression of depth images; give its weights file."""
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.tell)
-    config = dataclasses.replace(config, network=with_classes(config.network, models))
+    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
     network = DepthImageNet(config.network)
     if config.start is not None:
         found = read_pose_weights(find_weights(config.start)).network

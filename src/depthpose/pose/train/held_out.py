@@ -91,10 +91,8 @@ class HeldOut:
         device = next(network.parameters()).device
         for start in range(0, len(clouds), _TOGETHER):
             part = clouds[start : start + _TOGETHER]
-            batch = collate_clouds(part)
-            classes = batch.class_of[batch.instance].to(device)
-            points_m, rows = batch.points_m.to(device), batch.coordinates.to(device)
-            outputs = network.directions(points_m, rows, classes).float()[..., :3]
+            seen = collate_clouds(part).seen.to(device)
+            outputs = network.directions(seen).float()[..., :3]
             sizes = [len(cloud.points_m) for cloud in part]
             yield from zip(part, outputs.split(sizes), strict=True)
 

@@ -31,8 +31,15 @@ def read_models(
     if not config.bop and not config.cad:
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
     models = _from_bop(Path(config.bop), config) if config.bop else _from_cad(config)
-    is_taken = config.with_found_symmetries
-    return tuple(with_found_symmetries(model, tell, is_taken=is_taken) for model in models)
+    return tuple(
+        with_found_symmetries(
+            model,
+            tell,
+            is_taken=config.with_found_symmetries,
+            tolerance=config.symmetry_tolerance,
+        )
+        for model in models
+    )
 
 
 def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:

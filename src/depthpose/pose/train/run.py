@@ -83,8 +83,16 @@ def packed(
     )
 
 
-def with_classes(network: Any, models: Sequence[ObjectModel]) -> Any:  # noqa: ANN401
-    """Give a network's config as many classes as there are objects, and as many keypoints."""
-    sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m)}
+def with_classes(
+    network: Any,  # noqa: ANN401
+    models: Sequence[ObjectModel],
+    cloud: CloudConfig,
+) -> Any:  # noqa: ANN401
+    """Give a network's config the classes and keypoints of the objects, the inputs of the cloud."""
+    sizes = {
+        "classes": len(models),
+        "keypoints": len(models[0].keypoints_m),
+        "inputs": cloud.features,
+    }
     known = {field.name for field in dataclasses.fields(network)}
     return dataclasses.replace(network, **{k: v for k, v in sizes.items() if k in known})

@@ -37,7 +37,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     """Train a network of directions, ours or the PointNet; give its weights file."""
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.tell)
-    config = dataclasses.replace(config, network=with_classes(config.network, models))
+    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
     clouds = TrainingClouds(
         models,
         config.objects,
@@ -98,12 +98,15 @@ def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
 def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
     """Copy weights; of other objects, all but the last layer.
 
-    Written weights are folded: they have no norms, but biases. Batch norm takes both up.
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up. What they
+    were not told of a voxel, they begin by not listening to.
 
     Raises:
         InputError: a network of another shape.
     """
     found = read_pose_weights(find_weights(start)).network
+    if isinstance(found, ResUNet) and isinstance(network, ResUNet):
+        found = _listening(found, network.config.inputs)
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
@@ -119,9 +122,21 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
         and network.config.norm != "none"
     ):
         batch = clouds.collate([clouds[ticket] for ticket in range(_LIKE_THOSE_TO_COME)])
-        unfold_norms(found, network, Voxels.from_points(batch.coordinates))
+        unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
         return
     state = found.state_dict()
     if found.config.classes != network.config.classes:
         state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
     network.load_state_dict(state)
+
+
+def _listening(network: ResUNet, inputs: int) -> ResUNet:
+    """Give a network more inputs, to which it does not listen yet."""
+    more = inputs - network.config.inputs
+    if more <= 0:
+        return network
+    state, first = network.state_dict(), "down.0.conv.weight"
+    silent = state[first].new_zeros(len(state[first]), more, state[first].shape[2])
+    wider = ResUNet(dataclasses.replace(network.config, inputs=inputs))
+    wider.load_state_dict({**state, first: torch.cat([state[first], silent], 1)})
+    return wider.eval()

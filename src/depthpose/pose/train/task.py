@@ -41,9 +41,7 @@ class PoseTask:
     def step(self, batch: CloudBatch) -> Iterator[Turn]:
         """One turn: all clouds at once."""
         instance = batch.instance
-        outputs = self.network.directions(
-            batch.points_m, batch.coordinates, batch.class_of[instance]
-        ).float()
+        outputs = self.network.directions(batch.seen).float()
         found, copies_m = outputs[..., :3], self._posed(batch)
         loss = direction_loss(found, batch.points_m, copies_m, instance, self.config.loss)
         facts: dict[str, Tensor] = {"directions": loss.detach()}
