@@ -9,6 +9,9 @@ from matplotlib.figure import Figure
 
 mpl.use("Agg")
 
+_MOST_INSIDE = 5
+"""So many names fit into a plot; more stand beside it."""
+
 Curves = Mapping[str, Sequence[tuple[float, float]]]
 
 
@@ -24,7 +27,10 @@ def draw_curves(
         y_name: of the vertical axis.
         log: horizontal axes in powers of ten, with a place for 0.
     """
-    figure = Figure(figsize=(1.5 + 4 * len(axes_of), 3.8), layout="constrained")
+    names = list(dict.fromkeys(name for curves in axes_of.values() for name in curves))
+    is_beside = len(names) > _MOST_INSIDE
+    width = 1.5 + 4 * len(axes_of) + (2.5 if is_beside else 0)
+    figure = Figure(figsize=(width, 3.8), layout="constrained")
     plots = figure.subplots(1, len(axes_of), sharey=True, squeeze=False)[0]
     for axes, (x_name, curves) in zip(plots, axes_of.items(), strict=True):
         _draw(axes, curves)
@@ -33,7 +39,8 @@ def draw_curves(
         if log:
             axes.set_xscale("symlog", linthresh=10)
     plots[0].set_ylabel(y_name)
-    plots[-1].legend()
+    beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)} if is_beside else {}
+    plots[-1].legend(**beside)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
 

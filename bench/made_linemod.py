@@ -9,7 +9,7 @@ a time, on one thread; of several weights each answers for the objects that it k
 (ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
 is every answer that votes can give, whatever its risk; of ours risks.png says how many are wrong if
 only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
-view, and a picture of each curve. What another run measured stands beside it by ``--also``.
+view, and success.png with all curves. What another run measured stands beside it by ``--also``.
 """
 
 import argparse
@@ -192,6 +192,7 @@ def earlier(folders: Sequence[Path], name: str) -> Iterator[Row]:
 def draw(rows: Sequence[Row], out: Path) -> None:
     """Draw success of all objects over each knob, the others at their usual value."""
     usual = Condition()._asdict()
+    plots: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for knob, what in (("occlusion", "share of the silhouette that is hidden"),
                        ("noise", "times the sensor's usual noise"),
                        ("resolution", "times 640 x 480")):  # fmt: skip
@@ -201,7 +202,9 @@ def draw(rows: Sequence[Row], out: Path) -> None:
             if row["object"] == "all" and others_usual:
                 curves.setdefault(row["method"], []).append((row[knob], row["success"]))
         if any(len(points) > 1 for points in curves.values()):
-            draw_curves(out / f"{knob}.png", {what: curves}, "share with ADD(-S) < 10 %")
+            plots[what] = curves
+    if plots:
+        draw_curves(out / "success.png", plots, "share with ADD(-S) < 10 %")
 
 
 def draw_risks(views: Sequence[Row], out: Path) -> None:

@@ -94,7 +94,7 @@ class HeldOutConfig:
 class CalibrationConfig:
     """Made views by which the refusal is chosen, after the training."""
 
-    number: int = 150
+    number: int = 600
     """Of each object; 0: nothing is ever refused for its risk."""
 
     occlusion: tuple[float, float] = (0.0, 0.6)
@@ -107,7 +107,7 @@ class CalibrationConfig:
         """Refuse too few views to choose by, and shares that are none."""
         if self.number and self.number < 20:
             raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
-                             "views: take 150, or 0 for no refusal")  # fmt: skip
+                             "views: take 600, or 0 for no refusal")  # fmt: skip
         if not 0 < self.max_wrong_share < 1:
             raise InputError(
                 f"max_wrong_share is {self.max_wrong_share}, but a share is between 0 and 1; take "
