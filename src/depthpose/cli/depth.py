@@ -25,6 +25,7 @@ def predict(
     max_memory: str | None = None,
     batch: int = 1,
     cloud: bool = False,
+    view: str | None = None,
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
 
@@ -51,6 +52,7 @@ def predict(
         batch: images of one size that go through the networks together: for a GPU; a processor is
             busy with one.
         cloud: write a coloured point cloud, NAME.ply.
+        view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
     """
     from depthpose.cli import methods, predicting
 
@@ -67,7 +69,7 @@ def predict(
     lens = predicting.read_lens(camera, focal_px)
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
     look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
-    return predicting.predict_all(sources, lens, method, out, look)
+    return predicting.predict_all(sources, lens, method, out, look, view)
 
 
 def match(

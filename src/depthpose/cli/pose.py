@@ -39,6 +39,7 @@ def predict(
     icp: bool = True,
     batch: int = 16,
     device: str = "cpu",
+    view: str | None = None,
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
@@ -71,6 +72,7 @@ def predict(
         icp: slide the voted pose onto the cloud.
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
+        view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
     """
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_methods import pose_methods
@@ -84,7 +86,7 @@ def predict(
     )
     (method,) = pose_methods([weights], config)
     if bop is not None:
-        return _predict_bop(method, (bop, split, masks), out, batch, config.device)
+        return _predict_bop(method, (bop, split, masks), out, batch, config.device, view)
     if cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
@@ -102,7 +104,7 @@ def predict(
         jobs = posing.view_jobs(depth, mask, camera, name)
         settings |= {"camera": str(camera.resolve()), "mask": str(mask.resolve())}
     claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
-    predictions = posing.predict_all(method, jobs, out, settings, batch)
+    predictions = posing.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0
     posing.write_files(predictions, jobs, out, method)
@@ -178,6 +180,7 @@ def _predict_bop(
     out: Path,
     batch: int,
     device: str,
+    view: str | None,
 ) -> int:
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_masks import find_masks
@@ -189,7 +192,8 @@ def _predict_bop(
     (masks,) = find_masks([word], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = posing.bop_jobs(dataset, masks, method)
-    predictions = posing.predict_all(method, jobs, out, {**settings, **masks.settings}, batch)
+    settings |= masks.settings
+    predictions = posing.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0
     posing.write_bop_files(predictions, dataset, out, method)

@@ -13,7 +13,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.pose_masks import Masks
-from depthpose.cli.pose_methods import PoseMethod, match_names
+from depthpose.cli.pose_methods import EstimateMany, PoseMethod, match_names
+from depthpose.cli.viewing import open_viewer
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import (
     list_images,
@@ -142,27 +143,23 @@ def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[
 
 
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
-                batch: int) -> list[Prediction] | None:  # fmt: skip
+                batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
     """Estimate what is not finished; several processes share the work and meet in the files.
 
     Returns:
         All predictions in the order of the jobs; None in a process that is not the first.
     """
     shard = find_shard()
-    settings = {**method.settings, **settings}
-
-    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
-        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
-
-    claim_folder(out, settings)
+    claim_folder(out, {**method.settings, **settings})
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
     done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        names = predict(estimate_many, left, home, settings, batch)
-        for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
-            pass
+        with open_viewer(view) as viewer:
+            shown = method if viewer is None else viewer.watching(method)
+            names = predict(_safely(shown), left, home, {**method.settings, **settings}, batch)
+            for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
+                pass
     if shard.rank:
         return None
     return _gather(jobs, out, shard)
@@ -271,6 +268,16 @@ def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
 
 def _model(method: PoseMethod, name: str) -> ObjectModel:
     return next(model for model in method.models if model.name == name)
+
+
+def _safely(method: PoseMethod) -> EstimateMany:
+    """Let a method pass by what could not be read."""
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
+        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
+
+    return estimate_many
 
 
 def _unread(given: Unreadable) -> PoseEstimate:

@@ -29,6 +29,7 @@ def train(
     device: Literal["auto", "cpu"] | None = None,
     precision: Literal["fp32", "bf16", "fp16"] | None = None,
     resume: bool = False,
+    view: str | None = None,
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
@@ -57,6 +58,7 @@ def train(
         device: auto takes what accelerate finds; cpu takes no GPU.
         precision: arithmetic of the forward pass.
         resume: go on from the state that OUT holds.
+        view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -79,7 +81,7 @@ def train(
     if data is not None:
         chosen = _with_data(chosen, data)
     is_first = find_shard().rank == 0
-    with progress_bar() as on_step:
+    with progress_bar(view) as on_step:
         run = Run(folder=out, resume=resume, on_step=on_step, tell=print if is_first else None)
         path = run_stage(chosen, run)
     if is_first:

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.methods import Method
+from depthpose.cli.viewing import Viewer, open_viewer
 from depthpose.core.camera import Camera, StereoRig, read_camera
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
@@ -90,7 +91,9 @@ def find_sources(words: Sequence[str]) -> list[Path]:
     return found
 
 
-def predict_all(sources: list[Path], lens: Lens, method: Method, out: Path, look: Look) -> int:
+def predict_all(
+    sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
+) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
     known = lens.camera
     facts = {"K": known.K.tolist()} if known else {"focal_px": lens.focal_px}
@@ -98,10 +101,11 @@ def predict_all(sources: list[Path], lens: Lens, method: Method, out: Path, look
     claim_names(out, {source.stem: source for source in sources})
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
-    predictor = Predictor(lens=lens, net=method.net, out=out, look=look)
-    done = predictor.predict_images([path for path in mine if not _is_video(path)])
-    for path in filter(_is_video, mine):
-        done += predictor.predict_video(path)
+    with open_viewer(view) as viewer:
+        predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
+        done = predictor.predict_images([path for path in mine if not _is_video(path)])
+        for path in filter(_is_video, mine):
+            done += predictor.predict_video(path)
     failures = predictor.failures
     if failures and len(sources) == 1:
         raise failures[0]
@@ -119,6 +123,7 @@ class Predictor:
     net: FakestereoNet
     out: Path
     look: Look
+    viewer: Viewer | None = None
     failures: list[InputError] = field(default_factory=list)
 
     def predict_images(self, sources: list[Path]) -> int:
@@ -166,6 +171,8 @@ class Predictor:
                 if self.look.with_cloud:
                     write_estimate_cloud(self.out, given, estimate)
                 write_estimate(self.out, given, estimate, self.look.range_m)
+                if self.viewer is not None:
+                    self.viewer.show_depth(given, estimate)
         except InputError as error:
             if len(inputs) > 1:
                 return [name for given in inputs for name in self._predict_chunk([given])]

@@ -1,7 +1,8 @@
 """``depthpose depth train view|stereo|finetune``."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +28,7 @@ def train(
     device: Literal["auto", "cpu"] | None = None,
     precision: Literal["fp32", "bf16", "fp16"] | None = None,
     resume: bool = False,
+    view: str | None = None,
 ) -> int:
     """Train the generator (view), the matcher (stereo), or the generator through it (finetune).
 
@@ -52,6 +54,7 @@ def train(
         device: auto takes what accelerate finds; cpu takes no GPU.
         precision: arithmetic of the forward pass.
         resume: go on from the state that OUT holds.
+        view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -75,7 +78,7 @@ def train(
         if value is not None and (word not in knobs or (word != "start" and stage != "finetune")):
             raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
     chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
-    with progress_bar() as on_step:
+    with progress_bar(view) as on_step:
         path = run_stage(chosen, Run(folder=out, resume=resume, on_step=on_step))
     if find_shard().rank == 0:
         print(f"trained weights: {path}")
@@ -87,26 +90,29 @@ def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
     return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
 
 
-class progress_bar:  # noqa: N801 - reads as a verb where it is used
-    """A bar with time left and the latest numbers."""
+@contextmanager
+def progress_bar(view: str | None = None) -> Iterator[Callable[[Any], None]]:
+    """A bar with time left and the latest numbers; with ``view``, curves of them in Rerun too."""
+    from tqdm import tqdm
 
-    def __enter__(self) -> Callable[[Any], None]:
-        from tqdm import tqdm
+    from depthpose.cli.viewing import open_viewer
+    from depthpose.core.run import find_shard
 
-        from depthpose.core.run import find_shard
+    # Opened before the length is known; other processes than the first never show a step.
+    is_first = find_shard().rank == 0
+    with (
+        tqdm(unit=" steps", disable=None if is_first else True) as bar,
+        open_viewer(view if is_first else None) as viewer,
+    ):
 
-        # Opened before the length is known; other processes than the first never show a step.
-        self.bar = tqdm(unit=" steps", disable=True if find_shard().rank else None)
-        return self.show
+        def show(progress: Any) -> None:  # noqa: ANN401
+            if bar.total is None:
+                bar.reset(progress.steps)
+                bar.initial = bar.n = progress.step - 1
+            bar.update(progress.step - bar.n)
+            if progress.numbers:
+                bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
+            if viewer is not None:
+                viewer.show_step(progress)
 
-    def show(self, progress: Any) -> None:  # noqa: ANN401
-        """Move the bar to where the training is."""
-        if self.bar.total is None:
-            self.bar.reset(progress.steps)
-            self.bar.initial = self.bar.n = progress.step - 1
-        self.bar.update(progress.step - self.bar.n)
-        if progress.numbers:
-            self.bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.close()
+        yield show
