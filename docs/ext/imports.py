@@ -82,13 +82,14 @@ def draw(package: str) -> str:
     imports = imports_within(package)
     places = place(imports)
     height = (max(levels(imports).values()) + 1) * ROW_PX
-    groups = "".join(_module(module, imports, places) for module in imports)
-    boxes = "".join(_box(module, *places[module]) for module in imports)
+    # From the top down: a box hides the arrows that pass behind it.
+    downwards = sorted(imports, key=lambda module: places[module][1])
+    groups = "".join(_module(module, imports, places) for module in downwards)
     return (
         f'<svg class="imports" viewBox="0 0 {WIDTH_PX} {height}" role="img" '
         f'aria-label="imports within {package}"><defs><marker id="tip" viewBox="0 0 8 8" '
         'refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
-        f'<path d="M0 0 8 4 0 8z"/></marker></defs>{groups}{boxes}</svg>'
+        f'<path d="M0 0 8 4 0 8z"/></marker></defs>{groups}</svg>'
     )
 
 
@@ -98,13 +99,13 @@ def _wish(imported: Set[str], places: Mapping[str, tuple[float, float]]) -> floa
 
 
 def _module(module: str, imports: Imports, places: Mapping[str, tuple[float, float]]) -> str:
-    """Draw the arrows of one module, those that others imply apart."""
+    """Draw one module and its arrows, those that others imply apart."""
     far = implied(imports, module)
     arrows = "".join(
         _arrow(places[module], places[other], "implied" if other in far else "import")
         for other in sorted(imports[module])
     )
-    return f'<g class="from-{module.rsplit(".", 1)[-1]}">{arrows}</g>'
+    return f"<g>{arrows}{_box(module, *places[module])}</g>"
 
 
 def _arrow(start: tuple[float, float], end: tuple[float, float], kind: str) -> str:
@@ -121,9 +122,9 @@ def _box(module: str, x: float, y: float) -> str:
     name = module.rsplit(".", 1)[-1]
     width = len(name) * LETTER_PX + 14
     return (
-        f'<g class="module"><rect x="{x - width / 2:.1f}" y="{y - BOX_PX / 2:.1f}" '
+        f'<rect x="{x - width / 2:.1f}" y="{y - BOX_PX / 2:.1f}" '
         f'width="{width:.1f}" height="{BOX_PX}" rx="4"/>'
-        f'<text x="{x:.1f}" y="{y + 4:.1f}">{name}</text></g>'
+        f'<text x="{x:.1f}" y="{y + 4:.1f}">{name}</text>'
     )
 
 

@@ -27,7 +27,7 @@ def site_link(match: re.Match[str]) -> str:
     return f"]({target}"
 
 
-def rewrite_links(app: Sphinx, *event: object) -> None:
+def rewrite_links(*event: object) -> None:
     """Rewrite the links of a page, or of a file that a page includes."""
     content = cast("list[str]", event[-1])
     content[0] = re.sub(r"\]\(((?!https?:|#)[^)#\s]+)", site_link, content[0])
@@ -65,12 +65,12 @@ def _shared(name: str, here: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def keep_colon(app: Sphinx, what: str, *event: object) -> None:
+def keep_colon(*event: object) -> None:
     """Keep napoleon from taking what stands before a colon for a type: ours are annotated.
 
     It looks at the first line alone: an empty comment.
     """
-    if what in ("attribute", "data", "property"):
+    if event[1] in ("attribute", "data", "property"):
         cast("list[str]", event[-1])[:0] = ["..", ""]
 
 
