@@ -40,7 +40,6 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
 html_show_copyright = False
-# Read from a folder, a search works too: its index is a script.
-html_theme_options = {"sidebar_hide_name": False}
+highlight_language = "text"
 pygments_style = "friendly"
 pygments_dark_style = "monokai"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from tests.written import ROOT, Block, read_blocks, run, run_block
 
-TUTORIALS = sorted((ROOT / "docs/tutorials").glob("*.md"))
+TUTORIALS = sorted(set((ROOT / "docs/tutorials").glob("*.md")) - {ROOT / "docs/tutorials/index.md"})
 QUICK = {"bop", "camera", "replace"}
 MARKS = {"", "slow", "long", "data", "manual", "slurm", "exit 2"}
 

@@ -88,7 +88,8 @@ def draw(package: str) -> str:
     return (
         f'<svg class="imports" viewBox="0 0 {WIDTH_PX} {height}" role="img" '
         f'aria-label="imports within {package}"><defs><marker id="tip" viewBox="0 0 8 8" '
-        'refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        'refX="7" refY="4" markerWidth="8" markerHeight="8" markerUnits="userSpaceOnUse" '
+        'orient="auto">'
         f'<path d="M0 0 8 4 0 8z"/></marker></defs>{groups}</svg>'
     )
 
