@@ -113,8 +113,9 @@ def test_the_job_script_trains_and_goes_on(folder: Path) -> None:
 def test_accelerate_knows_the_words_of_the_job_script() -> None:
     from accelerate.commands.launch import launch_command_parser
 
-    words = re.sub(r"\$\(\(.*?\)\)|\$\w+", "1", job_script().split("accelerate launch")[1])
-    parsed = launch_command_parser().parse_args(shlex.split(words.rstrip().rstrip("'")))
+    words = job_script().split("accelerate launch")[1].replace("\\\n", " ").rstrip("'\n")
+    words = re.sub(r"\$\(\(.*?\)\)|\$\w+", "1", words)
+    parsed = launch_command_parser().parse_args(shlex.split(words))
     assert parsed.module
     assert parsed.training_script == "depthpose"
     assert parsed.training_script_args[-1] == "--resume"
