@@ -6,7 +6,7 @@ READY := .venv/.ready
 # Real samples for the tests that need them; those tests skip, and say so, where there are none.
 export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
 
-.PHONY: all setup demo test test-slow check bench clean
+.PHONY: all setup demo test test-slow check docs bench clean
 all: check test
 
 setup: $(READY)
@@ -32,6 +32,11 @@ check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+
+# A dead link or a name that nobody documents fails it.
+docs: $(READY)
+	$(BIN)/sphinx-build -q -W --keep-going docs $(OUT)/docs
+	@echo "the pages: $(OUT)/docs/index.html"
 
 bench: $(READY)
 	$(BIN)/python bench/startup.py

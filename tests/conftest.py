@@ -1,3 +1,4 @@
+import contextlib
 import os
 from pathlib import Path
 
@@ -11,3 +12,14 @@ def real() -> Path:
     if not folder:
         pytest.skip("DEPTHPOSE_DATA names no folder of real samples")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which ``depthpose demo`` has run."""
+    from depthpose.cli import main
+
+    folder = tmp_path_factory.mktemp("demo")
+    with contextlib.chdir(folder):
+        assert main(["demo"]) == 0
+    return folder

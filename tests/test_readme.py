@@ -1,40 +1,21 @@
 """What the README tells a newcomer to type, typed."""
 
-import contextlib
 import re
-import shlex
 from pathlib import Path
 
 import pytest
+from tests.written import ROOT, read_blocks, run
+from tests.written import commands as commands_of
 
-from depthpose.cli import main
 from depthpose.pose.objects import write_part
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+BLOCKS = read_blocks(ROOT / "README.md")
 PUBLISHED = "pretrained_model_KITTI2015.tar"
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-
-
 def commands() -> list[str]:
-    lines = "\n".join(blocks("bash")).splitlines()
-    return [line for line in lines if line.startswith("depthpose ")]
-
-
-def run(line: str) -> int:
-    return main(shlex.split(line)[1:])
-
-
-@pytest.fixture(scope="module")
-def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which ``depthpose demo`` has run."""
-    folder = tmp_path_factory.mktemp("readme")
-    with contextlib.chdir(folder):
-        assert run("depthpose demo") == 0
-    return folder
+    return commands_of(BLOCKS)
 
 
 @pytest.fixture
@@ -60,8 +41,9 @@ def test_the_commands_that_pose_run(demo_folder: Path) -> None:
 
 def test_the_python_lines_run_and_end_in_metres(demo_folder: Path) -> None:
     names: dict[str, object] = {}
-    for block in blocks("python"):
-        exec(block, names)  # the README is ours
+    for block in BLOCKS:
+        if block.language == "python":
+            exec(block.code, names)  # the README is ours
     assert names["depth_m"].ndim == 2  # pyright: ignore[reportAttributeAccessIssue]
 
 

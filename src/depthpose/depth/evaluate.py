@@ -130,7 +130,7 @@ def evaluate(
     Args:
         dataset: frames with truth; those without are listed as skipped.
         predictions: folder of ``NAME.disparity_px.npy`` (see ``predictions``).
-        protocol: a key of :data:`PROTOCOLS`.
+        protocol: a key of ``PROTOCOLS``.
         caps_m: truth beyond a cap does not count and predictions are clamped to it; one row each.
         progress: wraps the sequence of frames, to show how far it is.
 

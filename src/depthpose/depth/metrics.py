@@ -17,7 +17,7 @@ class DepthErrors:
     """The seven numbers of Eigen et al. (2014), of one image.
 
     Attributes:
-        abs_rel: mean of |p - t| / t.
+        abs_rel: mean of ``|p - t| / t``.
         sq_rel: mean of (p - t)^2 / t [m].
         rmse: root of the mean of (p - t)^2 [m].
         rmse_log: the same of natural logarithms.
@@ -40,7 +40,7 @@ class DisparityErrors:
     """KITTI's stereo measures over a set of pixels.
 
     Attributes:
-        epe_px: mean end-point error, |p - t|.
+        epe_px: mean end-point error, ``|p - t|``.
         d1_all: share of pixels off by more than 3 px and by more than 5 % of the truth.
     """
 

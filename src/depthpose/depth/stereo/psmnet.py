@@ -126,7 +126,7 @@ class PSMNet(nn.Module):
         """Match the pair.
 
         Returns:
-            Disparity of the left view [px]: after each of the three hourglasses while training,
+            Disparity of the left view [px], after each of the three hourglasses while training,
             after the last alone in eval mode. The last is always the answer.
 
         Raises:

@@ -34,7 +34,7 @@ class FCN(nn.Module):
         """Give logits, background first; both sides of the image are multiples of 32.
 
         Colours have ImageNet's mean and spread taken off
-        (:func:`~depthpose.pose.resnet.normalise_colors`).
+        (``pose.resnet.normalise_colors``).
         """
         features = self.encoder(image)[::-1]
         found = self.scores[0](features[0])

@@ -17,7 +17,7 @@ def join_by_object(
         rows: of ``pose.evaluate``, with ``method`` and ``masks``.
         numbers: BOP's number of each object, by the name that the rows bear.
         with_published: set the printed rows of LineMOD before ours, and the differences to
-            :data:`PEERS` after; else (table 3.1) the differences of the first method to the others.
+            ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 
     Returns:
         Rows with ``source``: ``published``, ``ours`` or ``difference`` (ours minus the other). The

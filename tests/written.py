@@ -1,0 +1,73 @@
+"""What a page of the documentation tells its reader to type, typed.
+
+A fenced block says after its language what it is: ```` ```bash ```` and ```` ```python ```` run as
+they stand, and what follows as ```` ```text ```` must be in what they print. Marks:
+
+    slow     takes more than some seconds
+    long     a training: one step of it is run
+    data     needs real samples
+    exit N   ends with that exit code
+    manual   opens something, or never ends: not run
+    slurm    a job script, run with the scheduler played
+"""
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from depthpose.cli import main
+
+ROOT = Path(__file__).parents[1]
+_FENCE = re.compile(r"^```(\w+)(?: ([\w ]+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block, and the text that follows it as its output."""
+
+    language: str
+    mark: str
+    code: str
+    printed: tuple[str, ...] = ()
+
+
+def read_blocks(page: Path) -> list[Block]:
+    """Read the fenced blocks of a page; a text belongs to the block before it."""
+    blocks: list[Block] = []
+    for language, mark, code in _FENCE.findall(page.read_text()):
+        if language == "text":
+            last = blocks.pop()
+            blocks.append(Block(last.language, last.mark, last.code, tuple(code.splitlines())))
+        else:
+            blocks.append(Block(language, mark, code))
+    return blocks
+
+
+def commands(blocks: list[Block]) -> list[str]:
+    """Every line that calls depthpose."""
+    lines = "\n".join(block.code for block in blocks if block.language == "bash").splitlines()
+    return [line for line in lines if line.startswith("depthpose ")]
+
+
+def run(line: str) -> int:
+    """Run one command in this process; give its exit code."""
+    return main(shlex.split(line, comments=True)[1:])
+
+
+def run_block(
+    block: Block, names: dict[str, object], capfd: pytest.CaptureFixture[str], more: str = ""
+) -> None:
+    """Run a block, and hold what it prints against the text that follows it."""
+    capfd.readouterr()
+    if block.language == "python":
+        exec(block.code, names)  # the page is ours
+    else:
+        code = int(block.mark.removeprefix("exit ")) if block.mark.startswith("exit") else 0
+        for line in commands([block]):
+            assert run(line + more) == code, line
+    shown = "".join(capfd.readouterr())
+    for line in block.printed:
+        assert line in shown, f"{line!r} is not in\n{shown}"
