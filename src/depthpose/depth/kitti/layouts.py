@@ -121,7 +121,9 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 
 
 def _pairs(folder: Path) -> Iterable[Frame]:
-    camera, text = _existing(folder / "camera.json"), _existing(folder / "calib.txt")
+    cameras = (_existing(folder / f"camera{suffix}") for suffix in (".json", ".yaml", ".yml"))
+    camera = next((path for path in cameras if path is not None), None)
+    text = _existing(folder / "calib.txt")
     for left in _images(folder / "left"):
         yield Frame(
             name=left.stem,
