@@ -46,9 +46,10 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
     found = dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
     try:
         rows = [row.split() for row in found["cam0"].strip().strip("[]").split(";")]
+        values = [float(value) for row in rows for value in row]
         return CameraFacts(
             kind="a Middlebury calibration",
-            K=torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64),
+            K=torch.tensor(values, dtype=torch.float64).reshape(3, 3),
             size=(int(found["width"]), int(found["height"])),
             baseline_m=float(found["baseline"]) / 1000,
             cx_right_minus_left_px=float(found["doffs"]),
@@ -58,7 +59,7 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
             f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
             "baseline, width and height."
         ) from error
-    except (ValueError, OverflowError) as error:
+    except (ValueError, OverflowError, RuntimeError) as error:  # no 9 numbers have no 3x3
         raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
 
 

@@ -56,7 +56,8 @@ def check_rectified(
 
     Offsets below 6 rows and disparities below 192 columns are found; images wider than 1280 are
     scaled down first, which widens both. Too few matches (a dark or bare scene, a larger offset)
-    give None, never an alarm.
+    give None, never an alarm; unless enough match once the right image is mirrored or turned over,
+    which is said.
 
     Raises:
         InputError: the sizes differ.

@@ -28,8 +28,8 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         f"{folder}: no layout that is known here. It holds {found}. Known: "
         "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
         "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
-        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json, .yaml)."
-        f"{hint}"
+        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json, "
+        f".yaml).{hint}"
     )
 
 
