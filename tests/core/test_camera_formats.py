@@ -207,6 +207,10 @@ WRONG: dict[str, tuple[str, str]] = {
         r"\(160, 120\) lies far off the centre of the image of 640x480: K looks like that of about "
         r"32\dx24\d\. Multiply fx, fy, cx and cy by (2|1\.99)",
     ),
+    "distortion in words": (
+        "K: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nD: '[-0.3, 0.1]'",
+        "its d are no list of numbers; write",
+    ),
     "no centre": ("500 500 0 0", r"lies in the corner .* take the centre, \(319\.5, 239\.5\)"),
 }
 

@@ -22,7 +22,9 @@ _ROS = ("projectionmatrix", "distortionmodel", "p")
 _BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LEVEL = 1e-3
 _UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc in ROS)"
-_UNDISTORT_FISHEYE = "cv2.fisheye.undistortImage(image, K, distortion, Knew=K)"
+_UNDISTORT_FISHEYE = (
+    "cv2.fisheye.undistortImage(image, K, distortion, Knew=K), or Knew=P[:, :3] where there is a P"
+)
 _RECTIFY = (
     "cv2.initUndistortRectifyMap and cv2.remap, each view with its own K, R and P "
     "(stereo_image_proc in ROS)"
@@ -104,7 +106,8 @@ def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...])
     """One ``camera_info``: of a single camera, or of the right one of a pair (``Tx = -fx B``)."""
     kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", _size(names)
     if P[0, 3] == 0 and P[1, 3] == 0:
-        return _bent(facts_from_projections(kind, P, None, size), distortion, _UNDISTORT_P)
+        facts = facts_from_projections(kind, P, None, size)
+        return _bent(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
     left = P.copy()
     left[:, 3] = 0
     return _bent(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
@@ -148,8 +151,7 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     facts = CameraFacts(
         kind=kind, K=torch.from_numpy(K), size=_size(names), baseline_m=_level_baseline(names)
     )
-    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
-    return _bent(facts, distortion, _UNDISTORT_FISHEYE if is_fisheye else facts.undistort)
+    return _bent(facts, distortion, _lens_remedy(names, facts.undistort))
 
 
 def _level_baseline(names: Names) -> float | None:
@@ -170,13 +172,27 @@ def _bent(facts: CameraFacts, distortion: tuple[float, ...], undistort: str) -> 
     return CameraFacts(**{**vars(facts), "distortion": distortion, "undistort": undistort})
 
 
+def _lens_remedy(names: Names, of_pinhole: str) -> str:
+    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
+    return _UNDISTORT_FISHEYE if is_fisheye else of_pinhole
+
+
 def _distortion(names: Names) -> tuple[float, ...]:
-    """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1."""
+    """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1.
+
+    Raises:
+        InputError: coefficients that are no numbers, which would be passed over in silence.
+    """
     found = [scalar(names, name) for name in _BENT]
     for name, value in names.items():
-        if name in _D or (name.startswith("dist") and name != "distortionmodel"):
+        is_list = name in _D or name.startswith(("distcoef", "distortioncoef"))
+        if is_list or name.startswith("distortion"):
             is_named = isinstance(value, Mapping) and "data" not in value
-            found += numbers(list(value.values()) if is_named else value) or []
+            inner = value.get("data") if isinstance(value, Mapping) and not is_named else value
+            some = numbers(list(value.values()) if is_named else value)
+            if some is None and is_list and inner:
+                raise InputError(f"its {name} are no list of numbers; write [k1, k2, p1, p2, k3]")
+            found += some or []
     return tuple(value for value in found if value is not None)
 
 
