@@ -35,8 +35,8 @@ def test_a_camera_file_of_any_format_and_a_stored_depth_and_mask(tmp_path: Path,
     (tmp_path / "camera").write_text(text)
     (tmp_path / "mask.json").write_text(json.dumps(RUNS))
     write_depth_png(tmp_path / "d.png", DEPTH_M, 0.001)
-    files = [tmp_path / name for name in ("d.png", "mask.json", "camera")]
-    view = view_input(*files, "part", "view", "mm")
+    depth, mask, camera = (tmp_path / name for name in ("d.png", "mask.json", "camera"))
+    view = view_input(depth, mask, camera, "part", "view", "mm")
     assert torch.equal(view.K, K)
     assert torch.equal(view.mask, MASK)
     torch.testing.assert_close(view.depth_m, DEPTH_M, atol=6e-4, rtol=0)
