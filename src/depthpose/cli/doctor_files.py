@@ -231,7 +231,8 @@ def _beside(one: Seen, seen: Sequence[Seen]) -> Iterator[str]:
     """Say what is odd about a file beside the others."""
     for other in seen:
         if other.camera is not None:
-            yield from _beside_camera(one, other.camera)
+            for said in _beside_camera(one, other.camera):
+                yield f"beside {other.path.name}: {said}"
         is_depth = other.depth_units is not None
         if one.mask is not None and is_depth and other.size != one.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
