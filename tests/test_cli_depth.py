@@ -133,7 +133,7 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give --camera FILE.json, or --focal-px"),
+        ([], "give --camera FILE, or --focal-px"),
         (["--focal-px", "0.5"], "not a focal length in pixels"),
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
         (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),

@@ -52,6 +52,16 @@ LZF_PCD = (
 )
 JSON = b'{"width": 640, "height": 480, "K": [[500, 0, 320], [0, 5e2, 240], [0, 0, 1]], '
 CAMERA = JSON + b'"baseline_m": 0.5, "cx_right_minus_left_px": 1.5, "depth_unit_m": 0.001}'
+ROS = (
+    b"image_width: 640\nimage_height: 480\ndistortion_coefficients: {data: [0.0, 0]}\n"
+    b"projection_matrix:\n  rows: 3\n  data: [500, 0, 320, -60.0, 0, 5e2, 240, 0, 0, 0, 1, 0]\n"
+)
+XML = (
+    b'<?xml version="1.0"?>\n<opencv_storage><size>640 480</size><K type_id="opencv-matrix">'
+    b"<rows>3</rows><cols>3</cols><dt>d</dt><data>500. 0. 320. 0. 500. 240. 0. 0. 1.</data></K>"
+    b"<T>-0.1 0. 0.</T></opencv_storage>\n"
+)
+MIDDLEBURY = b"cam0=[700 0 310; 0 700 240; 0 0 1]\ndoffs=10\nbaseline=193\nwidth=640\nheight=480\n"
 CALIB = b"calib_time: 09-Jan-2012\nP2: 7.2e+02 0 6.1e+02\nP_rect_02: 1 2 3\ncam0=[1 0; 0 1]\n"
 
 
@@ -99,6 +109,10 @@ CASES: dict[str, tuple[str, tuple[Reader, ...], bytes]] = {
     "xyz": (".xyz", (read_cloud,), b"# x y z\n1 2 3\n4,5,6\n"),
     "velodyne": (".bin", (read_points_bin,), np.ones((3, 4), "<f4").tobytes()),
     "camera": (".json", (read_camera, read_rig, read_json), CAMERA),
+    "ROS camera": (".yaml", (read_camera, read_rig), ROS),
+    "OpenCV camera": (".xml", (read_camera, read_rig), XML),
+    "Middlebury camera": (".txt", (read_camera, read_rig), MIDDLEBURY),
+    "TUM camera": (".txt", (read_camera,), b"535.4 539.2 320.1 247.6 0 0 0 0 0\n"),
     "calibration": (".txt", (read_key_values, read_text), CALIB),
 }
 

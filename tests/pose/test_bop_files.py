@@ -21,7 +21,7 @@ from depthpose.pose.bop import (
     write_detections,
     write_results,
 )
-from depthpose.pose.bop.dataset import read_mask
+from depthpose.pose.bop.masks import read_mask
 
 
 def test_masks_of_every_kind_are_read(tmp_path: Path) -> None:

@@ -320,7 +320,7 @@ def test_terms_are_said_and_names_are_found(part: ObjectModel, tmp_path: Path) -
         ),
         (
             {"depth": torch.ones(100, 100), "mask": torch.ones(100, 100), "camera": K},
-            "its principal point at \\(160, 120\\), outside the depth image of 100x100",
+            "the principal point \\(160, 120\\) lies outside the image of 100x100",
         ),
         (
             {"depth": torch.ones(100, 100), "mask": torch.ones(100, 100), "camera": K.T},

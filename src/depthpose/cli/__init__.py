@@ -17,7 +17,10 @@ COMMANDS = {
         "demo:demo",
         "run everything on a made street and open the books: out/demo/report.html",
     ),
-    "doctor": ("doctor:doctor", "versions, devices, extras, weights, and one try of each room"),
+    "doctor": (
+        "doctor:doctor",
+        "what is installed, and a try of each room; or what files are",
+    ),
     "data make streets": (
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",

@@ -40,8 +40,8 @@ def predict(
     Args:
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
-        camera: JSON file: {"width", "height", "K": 3x3}. A baseline in it is not looked at: one
-            image has none.
+        camera: JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D,
+            BOP, ROS or OpenCV. A baseline in it is not looked at: one image has none.
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
         weights: weights with a generator, by name or file ('depthpose weights list').
         matcher: psmnet (that of the weights), or sgbm, OpenCV's.
@@ -66,7 +66,7 @@ def predict(
     if matcher == "sgbm" and config != MatcherConfig():
         raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
     sources = predicting.find_sources(images)
-    lens = predicting.read_lens(camera, focal_px)
+    lens = predicting.read_lens(camera, focal_px, sources[0])
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
     look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
     return predicting.predict_all(sources, lens, method, out, look, view)
@@ -98,7 +98,8 @@ def match(
     Args:
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'.
         right: right image, folder or pattern; images are paired in sorted order.
-        camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}.
+        camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
+            Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
         out: folder for the results.
         weights: PSMNet weights, a .safetensors file.
         matcher: psmnet (the default with --weights) or sgbm, OpenCV's, which needs no weights.

@@ -4,7 +4,10 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from importlib import metadata
+from pathlib import Path
 from time import perf_counter
+
+import tyro
 
 from depthpose.core.errors import InputError
 
@@ -16,14 +19,26 @@ _SHIFT_PX = 12
 """Of the pair that the depth room is tried on."""
 
 
-def doctor() -> int:
-    """Say what this installation has, and try one small estimate of each room.
+def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
+    """Say what this installation has and try each room; or look at the files you mean to use.
 
-    Names versions, devices, extras (and how to install what lacks) and weights. Ends with exit
-    code 1 if an estimate failed. Put what it prints into a report of a problem.
+    Without files: versions, devices, extras (and how to install what lacks), weights, and one small
+    estimate of each room. Put what it prints into a report of a problem. With files: what each is,
+    in which unit, and what is odd about it, alone and beside the others: pictures (two of one size
+    are a pair, left first), depth maps, cameras, clouds, meshes, masks. Exit code 1: an estimate
+    failed, or something is odd.
 
         depthpose doctor
+        depthpose doctor left.png right.png camera.yaml
+        depthpose doctor depth.png mask.png camera.json part.stl cloud.ply
+
+    Args:
+        files: what you are about to use.
     """
+    if files:
+        from depthpose.cli.doctor_files import look_at_all
+
+        return look_at_all(files)
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
-from depthpose.core.files import list_images, read_image
+from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
@@ -28,8 +28,8 @@ class Pairs:
     @classmethod
     def find(cls, left: str, right: str, camera: Path) -> "Pairs":
         """List both sides, and refuse sides that cannot be paired."""
-        rig = read_rig(camera)
         lefts, rights = list_images(left), list_images(right)
+        rig = read_rig(camera, image_size(lefts[0]))
         if len(lefts) != len(rights):
             raise InputError(
                 f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "

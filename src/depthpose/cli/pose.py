@@ -26,7 +26,7 @@ def predict(
     out: Path,
     weights: str = "parts",
     cloud: Path | None = None,
-    unit: Unit = "m",
+    unit: Unit | None = None,
     depth: Path | None = None,
     mask: Path | None = None,
     camera: Path | None = None,
@@ -58,10 +58,12 @@ def predict(
         weights: of a pose network, by name or file ('depthpose weights list').
         cloud: points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z
             forward; or a folder of such files.
-        unit: of the clouds.
+        unit: of the clouds, metres by default; of depth images, where their camera says none.
         depth: 16-bit PNG in the camera's depth_unit_m, or a folder of them.
-        mask: not black is the object; or a folder of masks with the names of the depth images.
-        camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}.
+        mask: picture, not black is the object, or .json with COCO's run lengths; or a folder of
+            masks with the names of the depth images.
+        camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of BOP, TUM RGB-D,
+            ROS, OpenCV, KITTI or Middlebury.
         object: which of the objects that the weights know.
         bop: folder of a data set in BOP's layout, or of Linemod_preprocessed.
         split: of the data set.
@@ -95,14 +97,15 @@ def predict(
     name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
-        jobs = posing.cloud_jobs(cloud, unit, name)
-        settings |= {"unit": unit}
+        jobs = posing.cloud_jobs(cloud, unit or "m", name)
+        settings |= {"unit": unit or "m"}
     else:
         assert depth is not None
         if mask is None or camera is None:
             raise InputError("--depth needs --mask and --camera beside it")
-        jobs = posing.view_jobs(depth, mask, camera, name)
+        jobs = posing.view_jobs(depth, mask, camera, name, unit)
         settings |= {"camera": str(camera.resolve()), "mask": str(mask.resolve())}
+        settings |= {} if unit is None else {"unit": unit}
     claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
     predictions = posing.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:

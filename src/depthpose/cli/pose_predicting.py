@@ -87,13 +87,15 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
     return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
 
 
-def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[Any]]:
+def view_jobs(
+    depth: Path, mask: Path, camera: Path, object: str, unit: Unit | None = None
+) -> list[Job[Any]]:
     """Take a depth image and its mask, or those of one name in two folders.
 
     Raises:
         InputError: there is none, two have one name, or a depth image has no mask.
     """
-    depths, pictures = list_images(depth), list_images(mask)
+    depths, pictures = list_images(depth), _list_masks(mask)
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
     masks = {path.stem: path for path in pictures}
@@ -105,9 +107,15 @@ def view_jobs(depth: Path, mask: Path, camera: Path, object: str) -> list[Job[An
             f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
         )
     return [
-        _job(p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem))
+        _job(p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit))
         for p in depths
     ]
+
+
+def _list_masks(mask: Path) -> list[Path]:
+    """List mask pictures, or files of run lengths where there are such."""
+    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []
+    return runs or list_images(mask)
 
 
 def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:

@@ -17,6 +17,7 @@ from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
+    image_size,
     list_images,
     read_image,
     read_map,
@@ -56,20 +57,20 @@ class Look:
     batch: int
 
 
-def read_lens(camera: Path | None, focal_px: float | None) -> Lens:
-    """Read what the user knows of the camera.
+def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
+    """Read what the user knows of the camera; where its file says no size, that of an image.
 
     Raises:
         InputError: neither of the two is given, or both.
     """
     if (camera is None) == (focal_px is None):
         raise InputError(
-            "metres from one image need its focal length: give --camera FILE.json, or --focal-px "
+            "metres from one image need its focal length: give --camera FILE, or --focal-px "
             "(a phone's main camera has about 0.75 times the image's width)."
         )
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
-    read = None if camera is None else read_camera(camera)
+    read = None if camera is None else read_camera(camera, _size_of(first))
     if isinstance(read, StereoRig):
         print("the camera's baseline is not looked at: one image has none", file=sys.stderr)
     return Lens(camera=read, focal_px=focal_px)
@@ -183,6 +184,13 @@ class Predictor:
     def _is_finished(self, name: str) -> bool:
         has_cloud = not self.look.with_cloud or (self.out / f"{name}.ply").is_file()
         return has_cloud and is_finished(self.out, name)
+
+
+def _size_of(source: Path) -> tuple[int, int]:
+    if not _is_video(source):
+        return image_size(source)
+    _, frame = next(iter(read_video(source)))
+    return frame.shape[2], frame.shape[1]
 
 
 def _is_video(path: Path) -> bool:

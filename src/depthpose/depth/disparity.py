@@ -7,6 +7,39 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig
 
+_MISTAKES = {
+    1000.0: "is its depth in millimetres (divide by 1000), or its disparity in shares of the width "
+    "(multiply by it)?",
+    256.0: "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
+    1 / 256: "is its disparity pixels x 256, as KITTI's PNG holds it (divide by 256)?",
+}
+"""What was likely meant, by how many times farther than the truth a prediction lies."""
+_ABOUT = 1.4
+"""No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
+_NEARLY_ALL = 0.9
+
+
+def disparity_advice(
+    predicted_px: Float[Tensor, "h w"], true_px: Float[Tensor, "h w"]
+) -> str | None:
+    """Say that a prediction is of another unit or sign than pixels; None where it seems not."""
+    counts = torch.isfinite(predicted_px) & torch.isfinite(true_px)
+    if not bool(counts.any()):
+        return None
+    predicted_px, true_px = predicted_px[counts], true_px[counts]
+    negative = float((predicted_px < 0).float().mean())
+    if negative > _NEARLY_ALL:
+        return (
+            f"{negative:.0%} of the disparities are negative: left and right were exchanged, or "
+            "the sign is the other one; a left pixel at u is seen at u - disparity on the right"
+        )
+    median_px = float(predicted_px.median())
+    farther = float(true_px.median()) / median_px if median_px > 0 else 0.0
+    for factor, question in _MISTAKES.items():
+        if factor / _ABOUT < farther < factor * _ABOUT:
+            return f"it lies {farther:.4g} times as far as the truth: {question}"
+    return None
+
 
 def depth_from_disparity(
     disparity_px: Float[Tensor, "*batch h w"], rig: StereoRig

@@ -16,7 +16,12 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import read_image
-from depthpose.depth.disparity import depth_from_disparity, resize_disparity
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    disparity_advice,
+    disparity_from_depth,
+    resize_disparity,
+)
 from depthpose.depth.kitti import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.kitti import read_disparity as read_truth_disparity
 from depthpose.depth.metrics import (
@@ -196,14 +201,19 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     if rule.truth != "disparity" and not isinstance(camera, StereoRig):
         raise InputError(f"{frame.name}: no calibration, so its disparity cannot become metres.")
     height, width = truth.shape
-    predicted_px = read_disparity(predictions, frame.name, camera)
+    predicted_px = resize_disparity(read_disparity(predictions, frame.name, camera), height, width)
+    true_px = truth
+    if rule.truth != "disparity" and isinstance(camera, StereoRig):
+        true_px = disparity_from_depth(truth, camera)
+    if (advice := disparity_advice(predicted_px, true_px)) is not None:
+        raise InputError(f"{predictions / frame.name}: {advice}")
     confidence = read_confidence(predictions, frame.name)
     if confidence is not None and confidence.shape != truth.shape:
         confidence = resize_disparity(confidence, height, width) * (confidence.shape[1] / width)
     return _Prepared(
         frame=frame,
         truth=truth,
-        disparity_px=resize_disparity(predicted_px, height, width),
+        disparity_px=predicted_px,
         confidence=confidence,
         camera=camera,
         view=_measure_view(frame, predictions),

@@ -13,6 +13,9 @@ from depthpose.pose.config import CloudConfig
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
+_MOST = 0.5
+_STEEP = 1.73
+"""Tangent of 60 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,6 +105,29 @@ def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None
     return (
         f"the cloud has {len(points_m)} points, fewer than the {config.min_points} that a pose "
         "takes: is the mask empty, or the depth missing there?"
+    )
+
+
+def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
+    """Say that a cloud lies in another frame than x right, y down, z forward; None where not.
+
+    What a camera sees lies before it, less than 60 degrees off its axis.
+    """
+    behind = float((points_m[:, 2] <= 0).float().mean())
+    across_m, forward_m = points_m[:, :2].median(0).values.abs(), points_m[:, 2].median().abs()
+    if float(across_m.max()) > _STEEP * float(forward_m):
+        axis = "xy"[int(across_m.argmax())]
+        return (
+            f"the points lie along {axis}, more than 60 degrees off z: does {axis} point forward, "
+            "as x does in LiDAR and robot frames? Turn the cloud to x right, y down, z forward: of "
+            "(x forward, y left, z up) that is (-y, -z, x)"
+        )
+    if behind <= _MOST:
+        return None
+    return (
+        f"{behind:.0%} of the points lie behind the camera (z <= 0): is its z backward or in "
+        "another frame? Turn the cloud to x right, y down, z forward: of OpenGL's (x right, y up, "
+        "z backward) that is (x, -y, -z)"
     )
 
 

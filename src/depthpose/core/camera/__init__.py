@@ -9,6 +9,9 @@ from depthpose.core.camera.camera_file import write_camera as write_camera
 from depthpose.core.camera.epipolar import epipolar_distance_px as epipolar_distance_px
 from depthpose.core.camera.epipolar import essential_matrix as essential_matrix
 from depthpose.core.camera.epipolar import fundamental_matrix as fundamental_matrix
+from depthpose.core.camera.facts import refuse_other_resolution as refuse_other_resolution
+from depthpose.core.camera.facts import refuse_outside as refuse_outside
+from depthpose.core.camera.facts import suspicious_centre as suspicious_centre
 from depthpose.core.camera.model import Camera as Camera
 from depthpose.core.camera.model import StereoRig as StereoRig
 from depthpose.core.camera.pinhole import back_project as back_project

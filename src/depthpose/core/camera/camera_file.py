@@ -1,56 +1,58 @@
-"""Camera files: JSON to :class:`Camera` or :class:`StereoRig`, and back."""
+"""Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written."""
 
-from typing import Any
+from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
+from depthpose.core.camera.calibration_text import facts_from_text
+from depthpose.core.camera.camera_json import facts_from_json
+from depthpose.core.camera.facts import (
+    KNOWN_FILES,
+    CameraFacts,
+    Size,
+    camera_from_facts,
+    camera_keys,
+)
 from depthpose.core.camera.model import Camera, StereoRig
-from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import AnyPath, read_json, write_json
-
-_NEEDED = ("width", "height", "K")
-_RIG = ("baseline_m", "cx_right_minus_left_px")
-_KEYS = (*_NEEDED, *_RIG, "depth_unit_m")
-_NORMALISED_FX = 2
-_MM_FX_SHARE = 0.1
-"""A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
-_FILE_BASELINE_M = 10
-"""Millimetres of common rigs (50 to 120) pass as metres in a plane's rig, never in a file."""
+from depthpose.core.camera.storage import named, read_storage
+from depthpose.core.camera.stored_camera import facts_from_names, read_folder
+from depthpose.core.errors import InputError
+from depthpose.core.files import AnyPath, read_json, read_text, write_json
 
 
-def read_camera(path: AnyPath) -> Camera | StereoRig:
-    """Read a camera from JSON; a :class:`StereoRig` where ``baseline_m`` is given.
+def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
+    """Read a camera; a :class:`StereoRig` where the file says a baseline.
 
-    Keys: ``width``, ``height`` and ``K``; for a rig ``baseline_m`` and, where the principal points
-    differ, ``cx_right_minus_left_px``; ``depth_unit_m`` where there is a depth image.
+    The format is told by the content: JSON of ours or of BOP, KITTI, Middlebury, TUM, ROS, OpenCV,
+    ORB-SLAM (``docs/conventions.md``). A folder may hold the two files of a pair.
+
+    Args:
+        path: the file, or the folder of a pair's two files.
+        size: width and height of the image, for formats that do not say it.
 
     Raises:
-        InputError: the file is missing or damaged, a key is missing or unknown, or a value cannot
-            be that of a camera in pixels and metres.
+        InputError: the file is missing or damaged, of no known format, of a lens with distortion,
+            without a size where none is given, or a value cannot be that of a camera in pixels
+            and metres.
     """
-    keys = _check_keys(path, read_json(path))
     try:
-        camera = _camera_from_keys(keys)
-        _check_pixels(camera)
+        return camera_from_facts(_read_facts(path), size)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return camera
+        said = str(error)
+        raise InputError(said if said.startswith(f"{path}") else f"{path}: {said}") from error
 
 
-def read_rig(path: AnyPath) -> StereoRig:
-    """Read a stereo rig from JSON; see :func:`read_camera`.
+def read_rig(path: AnyPath, size: Size | None = None) -> StereoRig:
+    """Read a stereo rig; see :func:`read_camera`.
 
     Raises:
-        InputError: as there, or ``baseline_m`` is missing.
+        InputError: as there, or the file says no baseline.
     """
-    camera = read_camera(path)
+    camera = read_camera(path, size)
     if isinstance(camera, StereoRig):
         return camera
     raise InputError(
         f"{path}: no 'baseline_m', without which disparity cannot become metres; add the distance "
-        'between the two cameras in metres, such as "baseline_m": 0.54'
+        'between the two cameras in metres, such as "baseline_m": 0.54 (of ROS or OpenCV, name '
+        "the folder that holds both files of the pair)"
     )
 
 
@@ -60,14 +62,7 @@ def write_camera(path: AnyPath, camera: Camera) -> None:
     Raises:
         InputError: the disk refuses.
     """
-    keys: dict[str, Any] = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
-    if isinstance(camera, StereoRig):
-        keys["baseline_m"] = camera.baseline_m
-        if camera.cx_right_minus_left_px:
-            keys["cx_right_minus_left_px"] = camera.cx_right_minus_left_px
-    if camera.depth_unit_m is not None:
-        keys["depth_unit_m"] = camera.depth_unit_m
-    write_json(path, keys)
+    write_json(path, camera_keys(camera))
 
 
 def check_image_matches_camera(camera: Camera, width: int, height: int, name: str) -> None:
@@ -93,89 +88,26 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
     )
 
 
-def _check_keys(path: AnyPath, content: object) -> dict[str, Any]:
+def _read_facts(path: AnyPath) -> CameraFacts:
+    if Path(path).is_dir():
+        return read_folder(Path(path))
+    text = read_text(path)
+    if text.lstrip()[:1] in ("{", "["):
+        content = read_json(path)
+        return _storage_facts(content) or facts_from_json(content)
+    facts = facts_from_text(path, text)
+    if facts is None:
+        names = read_storage(path, text)
+        facts = None if names is None else facts_from_names(names)
+    if facts is None:
+        shown = " ".join(text[:200].split())[:40]
+        raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
+    return facts
+
+
+def _storage_facts(content: object) -> CameraFacts | None:
+    """Take OpenCV's JSON, whose matrices are objects with ``data``; None for other JSON."""
     if not isinstance(content, dict):
-        raise InputError(
-            f"{path}: a camera is a JSON object with the keys {', '.join(_KEYS)}, "
-            f"not a {type(content).__name__}"
-        )
-    for key in content:
-        if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key!r}; {nearest_name(key, _KEYS)}")
-    missing = [key for key in _NEEDED if key not in content]
-    if missing:
-        raise InputError(f"{path}: missing {', '.join(map(repr, missing))}; add it to the camera")
-    if "cx_right_minus_left_px" in content and "baseline_m" not in content:
-        raise InputError(f"{path}: 'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
-    return content
-
-
-def _camera_from_keys(keys: dict[str, Any]) -> Camera:
-    width, height = _whole(keys, "width"), _whole(keys, "height")
-    matrix = _matrix(keys["K"])
-    unit_m = _number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
-    if "baseline_m" not in keys:
-        return Camera(width=width, height=height, K=matrix, depth_unit_m=unit_m)
-    return StereoRig(
-        width=width,
-        height=height,
-        K=matrix,
-        depth_unit_m=unit_m,
-        baseline_m=_number(keys, "baseline_m"),
-        cx_right_minus_left_px=_number({"cx_right_minus_left_px": 0, **keys}, _RIG[1]),
-    )
-
-
-def _whole(keys: dict[str, Any], key: str) -> int:
-    value = keys[key]
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise InputError(f"{key!r} is {value!r}; give a whole number of pixels")
-    return value
-
-
-def _number(keys: dict[str, Any], key: str) -> float:
-    value = keys[key]
-    if not _is_number(value):
-        raise InputError(f"{key!r} is {value!r}; give a number")
-    return float(value)
-
-
-def _matrix(value: object) -> Float[Tensor, "3 3"]:
-    rows = value if isinstance(value, list) else []
-    is_square = len(rows) == 3 and all(isinstance(row, list) and len(row) == 3 for row in rows)
-    if not is_square or not all(_is_number(x) for row in rows for x in row):
-        shown = repr(value)[:80]
-        raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def _is_number(value: object) -> bool:
-    # A whole number beyond 1e300 has no float.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < 1e300
-
-
-def _check_pixels(camera: Camera) -> None:
-    fx, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (0, 2), (1, 2)))
-    size = f"{camera.width}x{camera.height}"
-    if fx <= _NORMALISED_FX < camera.width / 10:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, so it looks normalised; multiply its first row by "
-            "the width and its second by the height"
-        )
-    if fx < _MM_FX_SHARE * camera.width:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
-            "width of a pixel in mm"
-        )
-    if not (-0.5 <= cx <= camera.width - 0.5 and -0.5 <= cy <= camera.height - 0.5):
-        raise InputError(
-            f"the principal point ({cx:g}, {cy:g}) lies outside the image of {size}; do K and the "
-            "size belong together?"
-        )
-    if isinstance(camera, StereoRig) and camera.baseline_m >= _FILE_BASELINE_M:
-        raise InputError(
-            f"baseline_m is {camera.baseline_m:g}, which looks like millimetres; divide by 1000 "
-            "(a rig that is truly this wide is made in Python, as a StereoRig)"
-        )
+        return None
+    is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
+    return facts_from_names(named(content)) if is_storage else None

@@ -65,7 +65,7 @@ class StereoRig(Camera):
         if not 0 < self.baseline_m < math.inf:
             raise InputError(
                 f"baseline_m is {self.baseline_m}, but the right camera stands at a positive x; "
-                "give its distance from the left one in metres"
+                "are left and right exchanged? Give its distance from the left one in metres"
             )
         if self.baseline_m >= MAX_BASELINE_M:
             raise InputError(

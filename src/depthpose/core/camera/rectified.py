@@ -6,7 +6,7 @@ pair.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -56,7 +56,8 @@ def check_rectified(
 
     Offsets below 6 rows and disparities below 192 columns are found; images wider than 1280 are
     scaled down first, which widens both. Too few matches (a dark or bare scene, a larger offset)
-    give None, never an alarm.
+    give None, never an alarm; unless enough match once the right image is mirrored or turned over,
+    which is said.
 
     Raises:
         InputError: the sizes differ.
@@ -68,8 +69,29 @@ def check_rectified(
         )
     scale = min(1.0, _WORK_WIDTH / left.shape[-1])
     with torch.no_grad():
-        shift_px = match_corners(_grey(left, scale), _grey(right, scale)) / scale
+        one, other = _grey(left, scale), _grey(right, scale)
+        shift_px = match_corners(one, other) / scale
+        if len(shift_px) < _MIN_MATCHES:
+            for how, turned in _turned(other).items():
+                if len(match_corners(one, turned)) >= _MIN_MATCHES:
+                    return _turned_report(shift_px, how)
     return _report(shift_px)
+
+
+def _turned(grey: Float[Tensor, "h w"]) -> dict[str, Float[Tensor, "h w"]]:
+    return {
+        "mirrored": grey.flip(1),
+        "upside down": grey.flip(0, 1),
+        "mirrored top to bottom": grey.flip(0),
+    }
+
+
+def _turned_report(shift_px: Float[Tensor, "n 2"], how: str) -> RectificationReport:
+    return replace(
+        _report(shift_px),
+        is_rectified=False,
+        message=f"the right image is {how} beside the left one; turn it back",
+    )
 
 
 def _report(shift_px: Float[Tensor, "n 2"]) -> RectificationReport:
@@ -110,7 +132,7 @@ def _message(
     if is_swapped:
         findings.append(
             f"left and right look swapped (only {share:.0%} of disparities are positive); exchange "
-            "the two images"
+            "the two images (or both are mirrored: mirror them back)"
         )
     if not is_rectified:
         findings.append(

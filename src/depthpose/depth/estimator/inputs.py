@@ -42,7 +42,12 @@ def refuse_unrectified(pair: StereoInput) -> None:
     Raises:
         InputError: with what was measured and what to do.
     """
-    report = check_rectified(pair.left, usable_right(pair))
+    right = usable_right(pair)
+    if torch.equal(pair.left, right):
+        raise InputError(
+            f"{pair.name}: left and right are the same picture; give the view of each camera"
+        )
+    report = check_rectified(pair.left, right)
     if report.is_swapped or report.is_rectified is False:
         raise InputError(f"{pair.name}: {report.message}")
 

@@ -88,9 +88,9 @@ class FakestereoNet:
 
         Args:
             image: the image, the left one of a pair.
-            camera: camera or rig, or its JSON file. One image needs its focal length, for the
-                image is brought to the rig that the generator imitates; a baseline is not looked
-                at. A pair without camera gives disparity only.
+            camera: camera or rig, or its file of any format that is read. One image needs its
+                focal length, for the image is brought to the rig that the generator imitates; a
+                baseline is not looked at. A pair without camera gives disparity only.
             right: right image, the same size and rows.
             name: what to call the input in errors; the file's name by default.
             with_check: look whether the pair is rectified and in the right order first.
@@ -100,11 +100,14 @@ class FakestereoNet:
                 needed, a pair that is swapped or not rectified.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
+        left = as_tensor(image)
+        if isinstance(camera, str | Path):
+            camera = read_camera(Path(camera), (left.shape[2], left.shape[1]))
         pair = StereoInput(
             name=chosen,
-            left=as_tensor(image),
+            left=left,
             right=None if right is None else as_tensor(right),
-            camera=read_camera(Path(camera)) if isinstance(camera, str | Path) else camera,
+            camera=camera,
         )
         return self.estimate_pair(pair, with_check=with_check)
 

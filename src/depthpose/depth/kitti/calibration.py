@@ -6,14 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.camera.calibration_text import (
+    Matrix,
+    kitti_matrix,
+    kitti_size,
+    middlebury_facts,
+    plain_facts,
+)
+from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections, make_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_key_values, read_text
-
-Matrix = Float64[np.ndarray, "rows columns"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,15 +42,16 @@ def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibrat
     """
     cameras = folder / "calib_cam_to_cam.txt"
     keys = read_key_values(cameras)
-    left = _matrix(cameras, keys, "P_rect_02", (3, 4))
+    left = kitti_matrix(cameras, keys, "P_rect_02", (3, 4))
     _check_size(cameras, keys, width, height)
-    rig = _rig(cameras, left, _matrix(cameras, keys, "P_rect_03", (3, 4)), width, height)
+    right = kitti_matrix(cameras, keys, "P_rect_03", (3, 4))
+    rig = _projected_rig(cameras, left, right, (width, height))
     lidar = folder / "calib_velo_to_cam.txt"
     if not lidar.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = _square(_matrix(cameras, keys, "R_rect_00", (3, 3)))
+    rectify = _square(kitti_matrix(cameras, keys, "R_rect_00", (3, 3)))
     of_lidar = read_key_values(lidar)
-    R, t = _matrix(lidar, of_lidar, "R", (3, 3)), _matrix(lidar, of_lidar, "T", (3, 1))
+    R, t = kitti_matrix(lidar, of_lidar, "R", (3, 3)), kitti_matrix(lidar, of_lidar, "T", (3, 1))
     composed = _compose(lidar, left, rectify, _square(np.hstack([R, t])))
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
@@ -60,13 +66,13 @@ def read_object_calibration(path: Path, width: int, height: int) -> KittiCalibra
     """
     keys = read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
-    left, right = (_matrix(path, keys, name, (3, 4)) for name in names)
+    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
     _check_size(path, keys, width, height)
-    rig = _rig(path, left, right, width, height)
+    rig = _projected_rig(path, left, right, (width, height))
     if "Tr_velo_to_cam" not in keys:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = _square(_matrix(path, keys, "R0_rect", (3, 3)))
-    camera_from_velodyne = _square(_matrix(path, keys, "Tr_velo_to_cam", (3, 4)))
+    rectify = _square(kitti_matrix(path, keys, "R0_rect", (3, 3)))
+    camera_from_velodyne = _square(kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4)))
     composed = _compose(path, left, rectify, camera_from_velodyne)
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
@@ -77,25 +83,7 @@ def read_middlebury_calibration(path: Path) -> StereoRig:
     Raises:
         InputError: missing, or a value missing or not a number.
     """
-    text = read_text(path)
-    found = dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
-    try:
-        rows = [row.split() for row in found["cam0"].strip().strip("[]").split(";")]
-        K = torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64)
-        return StereoRig(
-            width=int(found["width"]),
-            height=int(found["height"]),
-            K=K,
-            baseline_m=float(found["baseline"]) / 1000,
-            cx_right_minus_left_px=float(found["doffs"]),
-        )
-    except KeyError as error:
-        raise InputError(
-            f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
-            "baseline, width and height."
-        ) from error
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
+    return _rig(path, middlebury_facts(path, read_text(path)), None)
 
 
 def read_plain_calibration(path: Path, name: str, width: int, height: int) -> StereoRig:
@@ -110,10 +98,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     text = read_text(path)
     if re.search(r"^\s*focal_px\s*:", text, re.MULTILINE):
         keys = read_key_values(path)
-        values = [_number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")]
-        size = [int(_number(path, keys, key)) if key in keys else side
-                for key, side in (("width", width), ("height", height))]  # fmt: skip
-        return _simple_rig(path, size, values)
+        return _rig(path, plain_facts(path, keys), (width, height))
     own = [words for line in text.splitlines() if (words := line.split()) and words[0] == name]
     if len(own) > 1:
         raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
@@ -124,26 +109,29 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         )
     try:
         numbers = [float(word) for word in own[0][1:7]]
-        return _simple_rig(path, [int(numbers[0]), int(numbers[1])], numbers[2:])
+        size = int(numbers[0]), int(numbers[1])
+        names = ("focal_px", "cx", "cy", "baseline_m")
+        values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=True)}
+        return _rig(path, plain_facts(path, values), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
 
-def _simple_rig(path: Path, size: list[int], values: list[float]) -> StereoRig:
-    focal_px, cx, cy, baseline_m = values
-    K = torch.tensor([[focal_px, 0, cx], [0, focal_px, cy], [0, 0, 1]], dtype=torch.float64)
-    return _built(path, size[0], size[1], K, baseline_m, 0.0)
+def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
+    try:
+        rig = make_camera(facts, size)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    assert isinstance(rig, StereoRig), "datasets name both cameras"
+    return rig
 
 
-def _rig(path: Path, left: Matrix, right: Matrix, width: int, height: int) -> StereoRig:
-    """Derive the rig from two projections: f = P2[0,0], B = b3 - b2 with b = -P[0,3] / P[0,0]."""
-    if not (left[0, 0] > 0 and right[0, 0] > 0):
-        raise InputError(f"{path}: the focal lengths of cameras 2 and 3 are not positive.")
-    with np.errstate(all="ignore"):  # what overflows is refused as a baseline
-        baseline_m = -right[0, 3] / right[0, 0] + left[0, 3] / left[0, 0]
-        difference_px = right[0, 2] - left[0, 2]
-    K = torch.from_numpy(left[:, :3].copy())
-    return _built(path, width, height, K, float(baseline_m), float(difference_px))
+def _projected_rig(path: Path, left: Matrix, right: Matrix, size: Size) -> StereoRig:
+    try:
+        facts = facts_from_projections("a KITTI calibration", left, right)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return _rig(path, facts, size)
 
 
 def _compose(
@@ -160,36 +148,12 @@ def _compose(
 
 
 def _check_size(path: Path, keys: Mapping[str, list[float]], width: int, height: int) -> None:
-    size = keys.get("S_rect_02", [width, height])
-    if size != [width, height]:
-        said = "x".join(f"{number:g}" for number in size)
+    size = kitti_size(keys) or (width, height)
+    if size != (width, height):
         raise InputError(
-            f"{path}: S_rect_02 says {said}, but the image is {width}x{height}. It was cropped or "
-            "scaled: give its own calibration, in a folder of pairs."
+            f"{path}: S_rect_02 says {size[0]}x{size[1]}, but the image is {width}x{height}. It "
+            "was cropped or scaled: give its own calibration, in a folder of pairs."
         )
-
-
-def _built(
-    path: Path, width: int, height: int, K: torch.Tensor, baseline_m: float, difference_px: float
-) -> StereoRig:
-    try:
-        return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m,
-                         cx_right_minus_left_px=difference_px)  # fmt: skip
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def _matrix(
-    path: Path, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
-) -> Matrix:
-    if name not in keys:
-        raise InputError(f"{path}: has no line '{name}:', which a KITTI calibration holds.")
-    if len(keys[name]) != shape[0] * shape[1]:
-        raise InputError(
-            f"{path}: {name} holds {len(keys[name])} numbers instead of {shape[0] * shape[1]}. "
-            "Copy the file anew."
-        )
-    return np.array(keys[name], dtype=np.float64).reshape(shape)
 
 
 def _square(matrix: Matrix) -> Float64[np.ndarray, "4 4"]:
@@ -197,9 +161,3 @@ def _square(matrix: Matrix) -> Float64[np.ndarray, "4 4"]:
     extended = np.eye(4)
     extended[: matrix.shape[0], : matrix.shape[1]] = matrix
     return extended
-
-
-def _number(path: Path, keys: Mapping[str, list[float]], name: str) -> float:
-    if len(keys.get(name, [])) != 1:
-        raise InputError(f"{path}: '{name}: NUMBER' is missing or holds several numbers.")
-    return keys[name][0]

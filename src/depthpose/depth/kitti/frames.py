@@ -102,9 +102,9 @@ def _read_rig(frame: Frame, path: Path) -> StereoRig:
         return kitti_calibration(frame).rig
     if frame.style == "middlebury":
         return read_middlebury_calibration(path)
-    if frame.style == "camera":
-        return read_rig(path)
     width, height = image_size(frame.left)
+    if frame.style == "camera":
+        return read_rig(path, (width, height))
     return read_plain_calibration(path, frame.left.stem, width, height)
 
 

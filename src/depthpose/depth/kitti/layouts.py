@@ -28,8 +28,8 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         f"{folder}: no layout that is known here. It holds {found}. Known: "
         "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
         "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
-        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json)."
-        f"{hint}"
+        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json, "
+        f".yaml).{hint}"
     )
 
 
@@ -121,7 +121,9 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 
 
 def _pairs(folder: Path) -> Iterable[Frame]:
-    camera, text = _existing(folder / "camera.json"), _existing(folder / "calib.txt")
+    cameras = (_existing(folder / f"camera{suffix}") for suffix in (".json", ".yaml", ".yml"))
+    camera = next((path for path in cameras if path is not None), None)
+    text = _existing(folder / "calib.txt")
     for left in _images(folder / "left"):
         yield Frame(
             name=left.stem,

@@ -4,13 +4,14 @@ from depthpose.pose.bop.check import check_bop as check_bop
 from depthpose.pose.bop.dataset import BopDataset as BopDataset
 from depthpose.pose.bop.dataset import is_bop as is_bop
 from depthpose.pose.bop.dataset import open_bop as open_bop
-from depthpose.pose.bop.dataset import read_mask as read_mask
 from depthpose.pose.bop.detections import Detection as Detection
-from depthpose.pose.bop.detections import decode_rle as decode_rle
-from depthpose.pose.bop.detections import encode_rle as encode_rle
 from depthpose.pose.bop.detections import read_detections as read_detections
 from depthpose.pose.bop.detections import write_detections as write_detections
 from depthpose.pose.bop.frames import Instance as Instance
+from depthpose.pose.bop.masks import decode_rle as decode_rle
+from depthpose.pose.bop.masks import encode_rle as encode_rle
+from depthpose.pose.bop.masks import mask_from_rle as mask_from_rle
+from depthpose.pose.bop.masks import read_mask as read_mask
 from depthpose.pose.bop.models import object_names as object_names
 from depthpose.pose.bop.results import BopResult as BopResult
 from depthpose.pose.bop.results import read_results as read_results

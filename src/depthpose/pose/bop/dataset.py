@@ -5,16 +5,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
-from depthpose.core.files.images import opened_image
 from depthpose.pose.bop.frames import Instance, bop_instances, bop_scenes, bop_splits
 from depthpose.pose.bop.linemod import is_linemod, linemod_instances
+from depthpose.pose.bop.masks import read_mask
 from depthpose.pose.bop.models import (
     models_folder,
     object_name,
@@ -193,17 +191,3 @@ def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
             "or give masks of your own"
         )
     return read_mask(instance.mask)
-
-
-def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
-    """Read a mask image of any kind: what is not black is the object.
-
-    Raises:
-        InputError: it is missing or no picture.
-    """
-    with opened_image(path) as image:
-        values = np.asarray(image.convert("RGB") if image.mode == "P" else image)
-        if values.ndim == 3 and values.shape[2] in (2, 4):
-            values = values[:, :, :-1]  # opaque black is not the object
-    is_object = values != 0
-    return torch.from_numpy(is_object if is_object.ndim == 2 else is_object.any(-1))

@@ -1,6 +1,7 @@
 """What a caller hands over, files, arrays or tensors, to the room's own inputs."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,17 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from depthpose.core.camera import Camera, check_image_matches_camera, read_camera
+from depthpose.core.camera import (
+    Camera,
+    check_image_matches_camera,
+    read_camera,
+    refuse_other_resolution,
+    refuse_outside,
+)
 from depthpose.core.camera.model import check_intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
-from depthpose.pose.bop import read_mask
+from depthpose.pose.bop import mask_from_rle, read_mask
 from depthpose.pose.config import METRES, Unit
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput
@@ -22,6 +29,8 @@ AnyArray = str | Path | np.ndarray | Tensor
 """A file, an array or a tensor."""
 AnyCamera = str | Path | Camera | np.ndarray | Tensor
 """A camera, its file, or its intrinsic matrix alone."""
+AnyMask = AnyArray | Mapping[str, Any]
+"""A mask, its file, or COCO's run lengths."""
 _SMALLEST_INSTANCE = 0.2
 """Pieces of a mask below this share of the largest are crumbs of a segmentation, not objects."""
 
@@ -42,18 +51,33 @@ def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInp
 
 
 def view_input(
-    depth: AnyArray, mask: AnyArray, camera: AnyCamera, object: str, name: str
+    depth: AnyArray,
+    mask: AnyMask,
+    camera: AnyCamera,
+    object: str,
+    name: str,
+    unit: Unit | None = None,
 ) -> ViewInput:
     """Take a depth image, a mask and a camera to a view in metres.
+
+    Args:
+        depth: a file, whole numbers, or metres.
+        mask: the object's pixels.
+        camera: of the depth image.
+        object: which one.
+        name: of the view.
+        unit: of the depth; None: what the camera says, and metres where there are floats.
 
     Raises:
         InputError: a file that cannot be read, sizes that disagree, whole numbers without a unit,
             a matrix that belongs to another image.
     """
-    known = read_camera(camera) if isinstance(camera, str | Path) else camera
-    depth_m = _depth(depth, known.depth_unit_m if isinstance(known, Camera) else None, name)
-    pixels = read_mask(Path(mask)) if isinstance(mask, str | Path) else _tensor(mask) != 0
-    height, width = depth_m.shape
+    values = _values(depth, name)
+    height, width = values.shape
+    known = read_camera(camera, (width, height)) if isinstance(camera, str | Path) else camera
+    said_m = known.depth_unit_m if isinstance(known, Camera) else None
+    depth_m = _metres(values, said_m, unit, str(depth) if isinstance(depth, str | Path) else name)
+    pixels = _mask(mask, name)
     if tuple(pixels.shape) != (height, width):
         raise InputError(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "
@@ -74,42 +98,60 @@ def split_instances(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
     return [label == k for k in order if int(pixels[k]) >= least]
 
 
-def _depth(depth: AnyArray, unit_m: float | None, name: str) -> Float[Tensor, "h w"]:
-    if isinstance(depth, str | Path):
-        if Path(depth).suffix.lower() != ".png":
-            return _refuse_no_picture(read_map(Path(depth)), name)
-        return read_depth_png(depth, _unit(unit_m, str(depth)))
-    values = _refuse_no_picture(_tensor(depth), name)
-    if not values.is_floating_point():
-        values = values.double() * _unit(unit_m, name)
-    return torch.where(values > 0, values, torch.nan).float()
+def _mask(mask: AnyMask, name: str) -> Bool[Tensor, "_ _"]:
+    if isinstance(mask, str | Path):
+        return read_mask(Path(mask))
+    return mask_from_rle(mask, name) if isinstance(mask, Mapping) else _tensor(mask) != 0
 
 
-def _unit(unit_m: float | None, name: str) -> float:
+def _values(depth: AnyArray, name: str) -> Shaped[Tensor, "h w"]:
+    """Read depth as it is stored: whole numbers of a PNG, or floats."""
+    if not isinstance(depth, str | Path):
+        return _refuse_no_picture(_tensor(depth), name)
+    if Path(depth).suffix.lower() == ".png":
+        return read_depth_png(depth, 1.0).nan_to_num(0.0).int()
+    return _refuse_no_picture(read_map(Path(depth)), name)
+
+
+def _metres(
+    values: Shaped[Tensor, "h w"], said_m: float | None, unit: Unit | None, name: str
+) -> Float[Tensor, "h w"]:
+    given_m = None if unit is None else METRES[unit]
+    if values.is_floating_point():
+        return torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
+    if given_m is not None and said_m is not None and given_m != said_m:
+        raise InputError(
+            f"{name}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m {said_m:g}; "
+            "leave one of the two away"
+        )
+    unit_m = said_m if given_m is None else given_m
     if unit_m is None:
         raise InputError(
             f"{name}: its depth is in whole numbers, and nothing says of what; give a camera with "
-            '"depth_unit_m" (0.001 where they are millimetres), or metres as floats'
+            '"depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, 0.00390625 of '
+            "KITTI), unit mm, or metres as floats"
         )
-    return unit_m
+    return torch.where(values > 0, values.double() * unit_m, torch.nan).float()
 
 
 def _intrinsics(
     camera: Camera | np.ndarray | Tensor, width: int, height: int, name: str
 ) -> Float[Tensor, "3 3"]:
+    is_bare = not isinstance(camera, Camera)
     if isinstance(camera, Camera):
         check_image_matches_camera(camera, width, height, name)
         K = camera.K
     else:
         K = _tensor(camera).double()
         check_intrinsics(K)
-    cx, cy = float(K[0, 2]), float(K[1, 2])
-    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+    try:
+        # A crop may leave the centre; its camera says the size, which was compared above.
+        (refuse_other_resolution if is_bare else refuse_outside)(K, width, height)
+    except InputError as error:
         raise InputError(
-            f"{name}: K has its principal point at ({cx:g}, {cy:g}), outside the depth image of "
-            f"{width}x{height}; it is of another image or size. Resizing an image by s makes fx, "
-            "fy, cx and cy s times as large"
-        )
+            f"{name}: K is of another image or size: {error}. Resizing an image by s makes fx, fy, "
+            "cx and cy s times as large"
+        ) from error
     return K
 
 

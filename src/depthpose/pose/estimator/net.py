@@ -16,6 +16,7 @@ from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyCamera,
+    AnyMask,
     cloud_input,
     split_instances,
     view_input,
@@ -78,9 +79,9 @@ class GeoPoseNet:
         self,
         *,
         cloud: AnyArray | None = None,
-        unit: Unit = "m",
+        unit: Unit | None = None,
         depth: AnyArray | None = None,
-        mask: AnyArray | None = None,
+        mask: AnyMask | None = None,
         camera: AnyCamera | None = None,
         object: str | None = None,
     ) -> PoseEstimate:
@@ -88,10 +89,10 @@ class GeoPoseNet:
 
         Args:
             cloud: points of the object alone, in the camera frame (x right, y down, z forward).
-            unit: of the cloud.
+            unit: of the cloud, metres by default; of a depth image, where its camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
-            mask: the object's pixels; not 0 is the object.
-            camera: of the depth image.
+            mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths.
+            camera: of the depth image, or its file of any format that is read.
             object: which one; None where the weights know one alone.
 
         Raises:
@@ -100,18 +101,19 @@ class GeoPoseNet:
         """
         which = self._object(object)
         if cloud is not None and depth is None and mask is None:
-            return self.estimate_many([cloud_input(cloud, unit, which, _NAME)])[0]
+            return self.estimate_many([cloud_input(cloud, unit or "m", which, _NAME)])[0]
         if cloud is not None or depth is None or mask is None or camera is None:
             raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
-        return self.estimate_many([view_input(depth, mask, camera, which, _NAME)])[0]
+        return self.estimate_many([view_input(depth, mask, camera, which, _NAME, unit)])[0]
 
     def estimate_instances(
         self,
         *,
         depth: AnyArray,
-        mask: AnyArray,
+        mask: AnyMask,
         camera: AnyCamera,
         object: str | None = None,
+        unit: Unit | None = None,
     ) -> list[PoseEstimate]:
         """Estimate every instance of one object in one mask, the largest piece first.
 
@@ -122,11 +124,12 @@ class GeoPoseNet:
             mask: of all instances.
             camera: of the depth image.
             object: which one; None where the weights know one alone.
+            unit: of the depth, where its camera says none.
 
         Raises:
             InputError: as for :meth:`estimate`.
         """
-        view = view_input(depth, mask, camera, self._object(object), _NAME)
+        view = view_input(depth, mask, camera, self._object(object), _NAME, unit)
         pieces = split_instances(view.mask) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)

@@ -10,6 +10,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.pose.cloud import (
     Voxels,
     cloud_from_depth,
+    frame_advice,
     is_flying,
     refusal_of,
     sample_points,
@@ -62,14 +63,12 @@ def prepare_cloud(
         return points_m
     if (few := refusal_of(points_m, cloud)) is not None:
         return Refusal(status="too few points", reason=few)
-    if (behind := float((points_m[:, 2] <= 0).float().mean())) > _MOST:
-        return Refusal(
-            status="unusable input",
-            reason=f"{behind:.0%} of the points lie behind the camera (z <= 0): is its z backward "
-            "or in another frame? Turn the cloud to x right, y down, z forward",
-        )
+    if (turned := frame_advice(points_m)) is not None:
+        return Refusal(status="unusable input", reason=turned)
     kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
-    refusal = _judge_size(points_m, kept_m, model) or _judge_shape(kept_m, model, cloud)
+    refusal = _judge_size(given, points_m, kept_m, model) or _judge_shape(
+        given, kept_m, model, cloud
+    )
     if refusal is not None:
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
@@ -103,22 +102,42 @@ def _nothing_seen(view: ViewInput) -> str:
 
 
 def _judge_size(
-    points_m: Float[Tensor, "n 3"], kept_m: Float[Tensor, "m 3"], model: ObjectModel
+    given: AnyInput,
+    points_m: Float[Tensor, "n 3"],
+    kept_m: Float[Tensor, "m 3"],
+    model: ObjectModel,
 ) -> Refusal | None:
     """Refuse what is not of this object's size; some background in the mask is none of that."""
     some_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
     advice = unit_advice(model.diameter_m, some_m)
+    if advice is None and float(points_m.median(0).values.norm()) < model.diameter_m / 2:
+        return Refusal(
+            status="unusable input",
+            reason="the cloud lies about the origin, where the camera is: it was centred, or is in "
+            "the frame of the model; give it in the camera's frame, as it was seen",
+        )
     if advice is None or (some_m is kept_m and "larger than the model" in advice):
         return None
-    return Refusal(
-        status="unusable input",
-        reason=f"{advice} (the object is {model.diameter_m:.3g} m long; a mask of more than it, "
-        "or a K of another image size, changes the size of its cloud too)",
+    hint = _view_hint(given) if isinstance(given, ViewInput) else ""
+    reason = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
+    return Refusal(status="unusable input", reason=reason)
+
+
+def _view_hint(view: ViewInput) -> str:
+    """Say what else than the object changes the size of a cloud from a depth image."""
+    edge = torch.cat([view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]])
+    if float(view.mask.float().mean()) > _MOST and float(edge.float().mean()) > _MOST:
+        share = float(view.mask.float().mean())
+        return f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
+    return (
+        "; a mask of more than it, or a K of another image size, changes the size of its cloud "
+        "too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of TUM RGB-D, "
+        "1/256 m of KITTI"
     )
 
 
 def _judge_shape(
-    points_m: Float[Tensor, "n 3"], model: ObjectModel, cloud: CloudConfig
+    given: AnyInput, points_m: Float[Tensor, "n 3"], model: ObjectModel, cloud: CloudConfig
 ) -> Refusal | None:
     if (reason := refusal_of(points_m, cloud)) is not None:
         return Refusal(status="too few points", reason=reason)
@@ -128,8 +147,10 @@ def _judge_shape(
     if flat == 0:
         return None
     shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat]
+    beside = isinstance(given, ViewInput) and flat == 1
     return Refusal(
         status="not observable",
         reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
-        "look from a side that shows more of the object",
+        "look from a side that shows more of the object"
+        f"{', or give the mask of this image: this one may lie on the background' * beside}",
     )

@@ -53,7 +53,7 @@ def read_model(
             without area, or is so large or small that the unit must be another.
     """
     scale = METRES[unit]
-    vertices, faces = _read_geometry(path)
+    vertices, faces = read_geometry(path)
     vertices_m = torch.from_numpy(vertices) * scale
     _refuse_unit(path, vertices_m, unit)
     return make_model(
@@ -121,7 +121,12 @@ def _with_keypoints(model: ObjectModel, count: int) -> ObjectModel:
     return ObjectModel(**fields)
 
 
-def _read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    """Read points and faces of a model file in the file's own unit; bare points have no faces.
+
+    Raises:
+        InputError: the file is missing, damaged or of another format, or has no surface.
+    """
     suffix = Path(path).suffix.lower()
     if suffix in CLOUDS:
         return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)

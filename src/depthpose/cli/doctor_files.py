@@ -1,0 +1,274 @@
+"""The work behind ``depthpose doctor FILE...``: what files are, and what is odd about them."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from depthpose.core.camera import (
+    Camera,
+    StereoRig,
+    check_image_matches_camera,
+    check_rectified,
+    read_camera,
+    suspicious_centre,
+)
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_cloud, read_depth_png, read_image, read_json, read_map
+from depthpose.core.files.images import opened_image
+from depthpose.pose.bop import mask_from_rle
+from depthpose.pose.cloud import frame_advice
+from depthpose.pose.mesh import exact_diameter, unit_advice
+from depthpose.pose.mesh.models import MESHES, read_geometry
+
+Size = tuple[int, int]
+
+_CAMERAS = (".json", ".yaml", ".yml", ".xml", ".txt")
+_CLOUDS = (".pcd", ".xyz")
+_MAPS = (".npy", ".pfm")
+_UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
+_NEAR_M, _FAR_M = 0.05, 100.0
+_ONLY_MM, _ONLY_M = 20.0, 2.0
+"""A part is no longer than 20 m, a scan no farther; and no part is shorter than 2 mm."""
+_EIGHT_BIT = 255
+_SQUARE = 0.05
+_MOST = 0.5
+
+
+@dataclass(kw_only=True)
+class Seen:
+    """A file, what it is, what is odd, and what the others are held against."""
+
+    path: Path
+    what: str = ""
+    odd: list[str] = field(default_factory=list)
+    size: Size | None = None
+    image: Tensor | None = None
+    depth_units: Tensor | None = None
+    camera: Camera | None = None
+    mask: Tensor | None = None
+    cloud: Tensor | None = None
+    model: Tensor | None = None
+
+
+def look_at_all(files: Sequence[Path]) -> int:
+    """Print what each file is and what is odd; give the exit code."""
+    # What has a size comes first: a camera file may need it.
+    ordered = sorted(files, key=_is_camera_like)
+    seen: list[Seen] = []
+    for path in ordered:
+        size = next((other.size for other in seen if other.size is not None), None)
+        seen.append(_look_at(path, size))
+    for one in seen:
+        one.odd += _beside(one, seen)
+    for path in files:
+        one = next(s for s in seen if s.path == path)
+        print(f"{path}: {one.what}" if one.what else f"{path}: cannot be used")
+        for said in one.odd:
+            print(f"  odd: {said}")
+    pair = _look_at_pair(seen)
+    if pair is not None:
+        print(pair[0])
+    is_odd = any(one.odd for one in seen) or (pair is not None and pair[1])
+    return 1 if is_odd else 0
+
+
+def _is_camera_like(path: Path) -> bool:
+    return path.is_dir() or path.suffix.lower() in _CAMERAS
+
+
+def _look_at(path: Path, size: Size | None) -> Seen:
+    try:
+        seen = _read(path, size)
+    except InputError as error:
+        return Seen(path=path, odd=[str(error).removeprefix(f"{path}: ")])
+    return seen
+
+
+def _read(path: Path, size: Size | None) -> Seen:
+    suffix = path.suffix.lower()
+    if _is_camera_like(path):
+        return _read_words(path, size)
+    if suffix in _MAPS:
+        return _of_map(path)
+    if suffix in _CLOUDS:
+        return _of_points(path, read_cloud(path).points.double())
+    if suffix in MESHES:
+        vertices, faces = read_geometry(path)
+        points = torch.from_numpy(vertices)
+        return _of_model(path, points, len(faces)) if len(faces) else _of_points(path, points)
+    return _of_picture(path)
+
+
+def _read_words(path: Path, size: Size | None) -> Seen:
+    """A camera; or a mask in run lengths, or points in text."""
+    if path.suffix.lower() == ".json":
+        content = read_json(path)
+        one = content[0] if isinstance(content, list) and len(content) == 1 else content
+        if isinstance(one, dict) and {"counts", "segmentation"} & one.keys():
+            return _of_mask(path, mask_from_rle(one, str(path)))
+    try:
+        return _of_camera(path, read_camera(path, size))
+    except InputError as error:
+        if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
+            raise
+    return _of_points(path, read_cloud(path).points.double())
+
+
+def _of_camera(path: Path, camera: Camera) -> Seen:
+    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
+    what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
+    if isinstance(camera, StereoRig):
+        what += f", baseline {camera.baseline_m:.4g} m"
+    if camera.depth_unit_m is not None:
+        what += f", depth in units of {camera.depth_unit_m:.4g} m"
+    odd = [said] if (said := suspicious_centre(camera)) is not None else []
+    if abs(fx / fy - 1) > _SQUARE:
+        odd.append(
+            f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
+            "that was squeezed in one direction; was K scaled as the image was?"
+        )
+    return Seen(path=path, what=what, odd=odd, camera=camera)
+
+
+def _of_picture(path: Path) -> Seen:
+    with opened_image(path) as image:
+        is_depth = image.mode == "I;16"
+    if is_depth:
+        return _of_depth(path, read_depth_png(path, 1.0))
+    picture = read_image(path)
+    size = (picture.shape[2], picture.shape[1])
+    what = f"picture of {size[0]}x{size[1]}"
+    if len(picture.unique()) <= 2:
+        return _of_mask(path, picture[0] > 0)
+    return Seen(path=path, what=what, size=size, image=picture)
+
+
+def _of_mask(path: Path, mask: Tensor) -> Seen:
+    height, width = mask.shape
+    share = float(mask.float().mean())
+    edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
+    odd = ["it is empty: no pixel is the object"] if share == 0 else []
+    if share > _MOST and float(edge) > _MOST:
+        odd.append(f"it covers {share:.0%} of the image and its border: is it inverted?")
+    what = f"mask of {width}x{height}, {share:.1%} of the image"
+    return Seen(path=path, what=what, odd=odd, size=(width, height), mask=mask)
+
+
+def _of_depth(path: Path, units: Tensor) -> Seen:
+    """16-bit depth: its unit stands nowhere in the file."""
+    height, width = units.shape
+    known = units[units.isfinite()]
+    seen = Seen(path=path, size=(width, height), depth_units=units)
+    if len(known) == 0:
+        seen.what, seen.odd = f"16-bit depth of {width}x{height}", ["every pixel is 0: no reading"]
+        return seen
+    median = float(known.median())
+    maybe = ", ".join(f"{median * unit:.3g} m ({who})" for who, unit in _UNITS_M.items())
+    share = len(known) / units.numel()
+    seen.what = (
+        f"16-bit depth of {width}x{height}, {share:.0%} known, median {median:g} units: {maybe}"
+    )
+    if float(known.max()) <= _EIGHT_BIT:
+        seen.odd.append("no value is above 255: a picture of depth, not the data?")
+    return seen
+
+
+def _of_map(path: Path) -> Seen:
+    if path.suffix.lower() == ".npy":
+        try:
+            values = read_map(path)
+        except InputError as error:
+            if "a map is (H, W)" not in str(error):
+                raise
+            return _of_points(path, read_cloud(path).points.double())
+        if values.shape[1] in (3, 4):
+            return _of_points(path, read_cloud(path).points.double())
+    else:
+        values = read_map(path)
+    known = values[values.isfinite()]
+    height, width = values.shape
+    seen = Seen(path=path, what=f"map of {width}x{height}", size=(width, height))
+    if len(known) == 0:
+        seen.odd.append("no value is known")
+        return seen
+    median = float(known.median())
+    seen.what += f", {len(known) / values.numel():.0%} known, median {median:.4g}"
+    if float((known < 0).float().mean()) > _MOST:
+        seen.odd.append("most values are negative: disparity of exchanged views, or z backward?")
+    elif median > 2 * _FAR_M:
+        seen.odd.append(
+            f"as metres the median {median:.4g} is too far; is it in millimetres? Divide by 1000"
+        )
+    return seen
+
+
+def _of_points(path: Path, points: Tensor) -> Seen:
+    away = float(points.median(0).values.norm())
+    unit = "metres" if away < _ONLY_M else "millimetres" if away > _ONLY_MM else "metres or mm"
+    what = f"{len(points)} points, {away:.4g} from the origin: {unit}"
+    odd = [said] if (said := frame_advice(points)) is not None else []
+    if away < float((points - points.median(0).values).norm(dim=-1).median()):
+        odd = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
+    return Seen(path=path, what=what, odd=odd, cloud=points)
+
+
+def _of_model(path: Path, points: Tensor, faces: int) -> Seen:
+    diameter = exact_diameter(points)
+    if diameter > _ONLY_MM:
+        unit = "millimetres (--unit mm)"
+    else:
+        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres or millimetres; measure it"
+    what = f"mesh of {len(points)} points and {faces} faces, {diameter:.4g} across: {unit}"
+    return Seen(path=path, what=what, model=points)
+
+
+def _beside(one: Seen, seen: Sequence[Seen]) -> Iterator[str]:
+    """Say what is odd about a file beside the others."""
+    for other in seen:
+        if other.camera is not None:
+            for said in _beside_camera(one, other.camera):
+                yield f"beside {other.path.name}: {said}"
+        is_depth = other.depth_units is not None
+        if one.mask is not None and is_depth and other.size != one.size:
+            yield f"it is not of the size of {other.path.name}; give the mask of this very image"
+        if one.model is not None and other.cloud is not None:
+            advice = unit_advice(exact_diameter(one.model), other.cloud)
+            if advice is not None:
+                yield f"beside {other.path.name}: {advice}"
+
+
+def _beside_camera(one: Seen, camera: Camera) -> Iterator[str]:
+    if one.size is not None:
+        try:
+            check_image_matches_camera(camera, *one.size, "it")
+        except InputError as error:
+            yield str(error)
+    if one.depth_units is None or camera.depth_unit_m is None:
+        return
+    median_m = float(one.depth_units.nanmedian()) * camera.depth_unit_m
+    if not _NEAR_M < median_m < _FAR_M:
+        yield (
+            f"its median is {median_m:.3g} m by the camera's depth_unit_m "
+            f"{camera.depth_unit_m:g}; 0.001 means millimetres"
+        )
+
+
+def _look_at_pair(seen: Sequence[Seen]) -> tuple[str, bool] | None:
+    """Hold two pictures of one size against each other: a pair, the left one first."""
+    pictures = [one for one in seen if one.image is not None]
+    if len(pictures) != 2 or pictures[0].size != pictures[1].size:
+        return None
+    left, right = (one.image for one in pictures)
+    assert left is not None
+    assert right is not None
+    names = f"{pictures[0].path.name} and {pictures[1].path.name} as a pair"
+    if torch.equal(left, right):
+        return f"{names}\n  odd: they are the same picture", True
+    report = check_rectified(left, right)
+    is_odd = bool(report.is_swapped) or report.is_rectified is False
+    return f"{names}{chr(10) + '  odd' if is_odd else ''}: {report.message}", is_odd

@@ -1,0 +1,238 @@
+"""What a camera file says, and whether it can be: from any format to one :class:`Camera`."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from depthpose.core.camera.model import Camera, StereoRig
+from depthpose.core.errors import InputError
+
+Size = tuple[int, int]
+"""Width and height [px]."""
+
+KNOWN_FILES = (
+    "our JSON (width, height, K), BOP's camera.json, KITTI's calibration (P2 or P_rect_02), "
+    "Middlebury's calib.txt, TUM's 'fx fy cx cy', a matrix of 9 numbers, focal_px lines, "
+    "camera_info of ROS (YAML), FileStorage of OpenCV (YAML, XML, JSON), settings of ORB-SLAM"
+)
+"""Formats of camera files, for errors."""
+
+_NORMALISED_FX = 2
+_MM_FX_SHARE = 0.1
+"""A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
+_FILE_BASELINE_M = 10
+"""Millimetres of common rigs (50 to 120) pass as metres in a plane's rig, never in a file."""
+_NO_DISTORTION = 1e-8
+_OFF_CENTRE = 0.1
+"""Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
+_SAME_SHARE = 0.05
+_CORNER = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFacts:
+    """What a camera file says, before it is a camera: it may lack the image's size.
+
+    Attributes:
+        kind: what the file is, for errors.
+        K: intrinsic matrix of the undistorted image [px].
+        size: of the image, where the file says it.
+        baseline_m: where there is a rig.
+        cx_right_minus_left_px: difference of the principal points of a rig.
+        depth_unit_m: metres a unit of the depth images, where the file says it.
+        distortion: coefficients of the lens; none, or zeros, for a pinhole.
+        undistort: what takes the distortion out of an image.
+    """
+
+    kind: str
+    K: Float[Tensor, "3 3"]
+    size: Size | None = None
+    baseline_m: float | None = None
+    cx_right_minus_left_px: float = 0.0
+    depth_unit_m: float | None = None
+    distortion: tuple[float, ...] = ()
+    undistort: str = "cv2.undistort(image, K, distortion)"
+
+
+def facts_from_projections(
+    kind: str,
+    left: Float64[np.ndarray, "3 4"],
+    right: Float64[np.ndarray, "3 4"] | None,
+    size: Size | None = None,
+) -> CameraFacts:
+    """Take the rectified projections of a pair, or of one camera, apart.
+
+    A rectified camera at x = b has ``P[0, 3] = -fx b``. KITTI counts both from camera 0, ROS and
+    OpenCV from the left one.
+
+    Raises:
+        InputError: a focal length is not positive, or the pair stands one above the other.
+    """
+    K = torch.from_numpy(left[:, :3].copy())
+    if right is None:
+        return CameraFacts(kind=kind, K=K, size=size)
+    if not (left[0, 0] > 0 and right[0, 0] > 0):
+        raise InputError("the focal lengths of the two projections are not positive; copy it anew")
+    with np.errstate(all="ignore"):  # what overflows is refused as a baseline
+        baseline_m = left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]
+        down_m = left[1, 3] / left[1, 1] - right[1, 3] / right[1, 1]
+        difference_px = right[0, 2] - left[0, 2]
+    if abs(down_m) > abs(baseline_m):
+        raise InputError("its cameras stand one above the other; turn the images by 90 degrees")
+    return CameraFacts(
+        kind=kind,
+        K=K,
+        size=size,
+        baseline_m=float(baseline_m),
+        cx_right_minus_left_px=float(difference_px),
+    )
+
+
+def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
+    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
+
+    Args:
+        facts: what the file says.
+        size: of the image, for files that do not say it.
+
+    Raises:
+        InputError: distortion, an unknown size, or a value in another unit or of another image.
+    """
+    if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
+        raise _distorted(facts, size)
+    camera = make_camera(facts, size)
+    _refuse_units(camera)
+    if facts.size is None:
+        refuse_other_resolution(camera.K, camera.width, camera.height)
+    return camera
+
+
+def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
+    """Make a camera, or a rig where there is a baseline, without asking whether it is likely.
+
+    Raises:
+        InputError: nobody knows the size, or a value is none of a camera.
+    """
+    known = facts.size or size
+    if known is None:
+        raise InputError(
+            f"{facts.kind} without the image's size; give it beside the image, or write a camera "
+            "of ours (width, height, K)"
+        )
+    width, height = known
+    if facts.baseline_m is None:
+        return Camera(width=width, height=height, K=facts.K, depth_unit_m=facts.depth_unit_m)
+    return StereoRig(
+        width=width,
+        height=height,
+        K=facts.K,
+        depth_unit_m=facts.depth_unit_m,
+        baseline_m=facts.baseline_m,
+        cx_right_minus_left_px=facts.cx_right_minus_left_px,
+    )
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Give what our JSON holds of a camera."""
+    keys: dict[str, Any] = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
+    if isinstance(camera, StereoRig):
+        keys["baseline_m"] = camera.baseline_m
+        if camera.cx_right_minus_left_px:
+            keys["cx_right_minus_left_px"] = camera.cx_right_minus_left_px
+    if camera.depth_unit_m is not None:
+        keys["depth_unit_m"] = camera.depth_unit_m
+    return keys
+
+
+def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    """Refuse a K whose principal point is that of the same picture at another resolution.
+
+    The point of a lens lies near the centre; scaled with another resolution it leaves the centre
+    by the same share in both directions. A crop seldom does that, and has a file that says its
+    size.
+
+    Raises:
+        InputError: that is so, or the point lies outside the image.
+    """
+    refuse_outside(K, width, height)
+    cx, cy = float(K[0, 2]), float(K[1, 2])
+    across, down = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
+    if min(abs(across), abs(down)) < _OFF_CENTRE or abs(across - down) > _SAME_SHARE:
+        return
+    scale = 1 + across + down
+    if scale < _CORNER:
+        raise InputError(
+            f"the principal point ({cx:g}, {cy:g}) lies in the corner of the image; where nobody "
+            f"measured it, take the centre, ({(width - 1) / 2:g}, {(height - 1) / 2:g})"
+        )
+    raise InputError(
+        f"the principal point ({cx:g}, {cy:g}) lies far off the centre of the image of "
+        f"{width}x{height}: K looks like that of about {width * scale:.0f}x{height * scale:.0f}. "
+        f"Multiply fx, fy, cx and cy by {1 / scale:.3g}, or take the image of that size"
+    )
+
+
+def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    """Refuse a K whose principal point lies outside the image.
+
+    Raises:
+        InputError: that is so.
+    """
+    cx, cy = float(K[0, 2]), float(K[1, 2])
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        raise InputError(
+            f"the principal point ({cx:g}, {cy:g}) lies outside the image of {width}x{height}; do "
+            "K and the size belong together?"
+        )
+
+
+def suspicious_centre(camera: Camera) -> str | None:
+    """Say that a camera which names its size looks like one of another; None where it does not."""
+    try:
+        refuse_other_resolution(camera.K, camera.width, camera.height)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def _distorted(facts: CameraFacts, size: Size | None) -> InputError:
+    shown = ", ".join(f"{k:g}" for k in facts.distortion)
+    known = facts.size or size
+    after = "and give the camera of the result"
+    if known is not None:
+        after += f": {json.dumps(camera_keys(make_camera(facts, known)))}"
+    return InputError(
+        f"{facts.kind} with lens distortion ({shown}), and only images without are understood; "
+        f"undistort them by {facts.undistort}, {after}"
+    )
+
+
+def _refuse_units(camera: Camera) -> None:
+    fx = float(camera.K[0, 0])
+    size = f"{camera.width}x{camera.height}"
+    if fx <= _NORMALISED_FX < camera.width / 10:
+        raise InputError(
+            f"K has fx {fx:g} for {size} pixels, so it looks normalised; multiply its first row by "
+            "the width and its second by the height"
+        )
+    if fx < _MM_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
+            "width of a pixel in mm"
+        )
+    refuse_outside(camera.K, camera.width, camera.height)
+    if isinstance(camera, StereoRig) and camera.baseline_m >= _FILE_BASELINE_M:
+        raise InputError(
+            f"baseline_m is {camera.baseline_m:g}, which looks like millimetres; divide by 1000 "
+            "(a rig that is truly this wide is made in Python, as a StereoRig)"
+        )
+    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
+            f"metres a unit: write {1 / camera.depth_unit_m:g}"
+        )

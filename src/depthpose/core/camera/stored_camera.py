@@ -1,0 +1,213 @@
+"""Cameras of ROS (``camera_info``), OpenCV (FileStorage) and ORB-SLAM: what their names mean."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections
+from depthpose.core.camera.storage import Names, matrix, numbers, read_storage, scalar
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_text
+from depthpose.core.files.disk import refused_as
+
+_SUFFIXES = (".yaml", ".yml", ".xml")
+_K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
+_D = ("d", "d1", "d2")
+_P = ("p", "projectionmatrix", "p1")
+_WIDTH, _HEIGHT = ("width", "imagewidth"), ("height", "imageheight")
+_ROS = ("projectionmatrix", "distortionmodel", "p")
+_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_LEVEL = 1e-3
+_UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc in ROS)"
+_UNDISTORT_FISHEYE = (
+    "cv2.fisheye.undistortImage(image, K, distortion, Knew=K), or Knew=P[:, :3] where there is a P"
+)
+_RECTIFY = (
+    "cv2.initUndistortRectifyMap and cv2.remap, each view with its own K, R and P "
+    "(stereo_image_proc in ROS)"
+)
+
+
+def facts_from_names(names: Names) -> CameraFacts | None:
+    """Take the camera that some names describe; None where they describe none.
+
+    Raises:
+        InputError: a value is no number, or there are too many or too few of them.
+    """
+    settings = next((who for who in ("camera", "camera1") if f"{who}fx" in names), None)
+    if settings is not None:
+        return _from_settings(names, settings)
+    left, right = (matrix(names, which, 12) for which in (_P, ("p2",)))
+    distortion = _distortion(names)
+    if right is not None:
+        facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, _size(names))
+        return _bent(facts, distortion, _RECTIFY)
+    Q = matrix(names, ("q",), 16)
+    if Q is not None:
+        return _bent(_from_reprojection(Q, _size(names)), distortion, _RECTIFY)
+    if left is not None and left[0, 0] != 0:
+        return _from_projection(names, left, distortion)
+    return _from_intrinsics(names, distortion)
+
+
+def is_ros(names: Names) -> bool:
+    """Whether names are those of a ``camera_info``."""
+    return any(name in names for name in _ROS)
+
+
+def read_folder(folder: Path) -> CameraFacts:
+    """Read a camera of two files: the left and right ``camera_info`` of ROS, or OpenCV's two.
+
+    Raises:
+        InputError: there are others, or they do not belong together.
+    """
+    with refused_as(folder, "folder", "check who may read it"):
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+    found = [read_storage(path, read_text(path)) for path in files]
+    if len(files) != 2 or None in found:
+        raise InputError(
+            f"a folder with {len(files)} files of {', '.join(_SUFFIXES)}; a camera of two files is "
+            "left.yaml and right.yaml of ROS, or intrinsics.yml and extrinsics.yml of OpenCV, in "
+            "a folder of their own"
+        )
+    first, second = (names for names in found if names is not None)
+    if is_ros(first) and is_ros(second) and "p2" not in first | second:
+        return _from_ros_pair(first, second)
+    facts = facts_from_names(first | second)
+    if facts is None:
+        raise InputError(f"{files[0].name} and {files[1].name} together describe no camera")
+    return facts
+
+
+def _from_settings(names: Names, who: str) -> CameraFacts:
+    """ORB-SLAM: ``Camera.fx``, ``Camera.bf`` (fx times baseline) or ``Stereo.b``, depth factor."""
+    fx, fy, cx, cy = (scalar(names, f"{who}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy"))
+    width, height = (scalar(names, f"camera{key}") for key in ("width", "height"))
+    baseline_m, product = scalar(names, "stereob"), scalar(names, "camerabf")
+    factor = scalar(names, "depthmapfactor") or scalar(names, "rgbddepthmapfactor")
+    is_rgbd = factor is not None
+    if baseline_m is None and product is not None and not is_rgbd and fx > 0:
+        baseline_m = product / fx  # of an RGB-D camera it is a made-up one
+    bent = [value for key in _BENT if (value := scalar(names, f"{who}{key}")) is not None]
+    return CameraFacts(
+        kind="settings of ORB-SLAM",
+        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        size=None if width is None or height is None else (int(width), int(height)),
+        baseline_m=None if is_rgbd else baseline_m,
+        depth_unit_m=1 / factor if factor else None,
+        distortion=tuple(bent),
+    )
+
+
+def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...]) -> CameraFacts:
+    """One ``camera_info``: of a single camera, or of the right one of a pair (``Tx = -fx B``)."""
+    kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", _size(names)
+    if P[0, 3] == 0 and P[1, 3] == 0:
+        facts = facts_from_projections(kind, P, None, size)
+        return _bent(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
+    left = P.copy()
+    left[:, 3] = 0
+    return _bent(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
+
+
+def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
+    """Take the two cameras of a pair; the left one is that without ``Tx``."""
+    P, other = (_need(matrix(names, _P, 12), "projection_matrix") for names in (first, second))
+    left, right = (P, other) if P[0, 3] == 0 else (other, P)
+    if left[0, 3] != 0 or right[0, 3] == 0:
+        raise InputError(
+            f"the projections of the two camera_info have Tx {P[0, 3]:g} and {other[0, 3]:g}, "
+            "where the left one has 0 and the right one -fx times the baseline; calibrate them as "
+            "a pair"
+        )
+    if _size(first) != _size(second):
+        raise InputError("the two camera_info are of images of two sizes; a pair has one")
+    facts = facts_from_projections("a pair of camera_info", left, right, _size(first))
+    return _bent(facts, (*_distortion(first), *_distortion(second)), _RECTIFY)
+
+
+def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
+    """OpenCV's Q: ``(x, y, z, w) = Q (u, v, disparity, 1)``, with ``Q[3, 2] = 1 / baseline``."""
+    with np.errstate(all="ignore"):
+        baseline_m = float(1 / Q[3, 2])
+    f, cx, cy = Q[2, 3], -Q[0, 3], -Q[1, 3]
+    return CameraFacts(
+        kind="a rig of OpenCV",
+        K=torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64),
+        size=size,
+        baseline_m=baseline_m,
+        cx_right_minus_left_px=float(Q[3, 3]) * baseline_m,
+    )
+
+
+def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
+    K = matrix(names, _K, 9)
+    if K is None:
+        return None
+    kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
+    facts = CameraFacts(
+        kind=kind, K=torch.from_numpy(K), size=_size(names), baseline_m=_level_baseline(names)
+    )
+    return _bent(facts, distortion, _lens_remedy(names, facts.undistort))
+
+
+def _level_baseline(names: Names) -> float | None:
+    """Take T of ``stereoCalibrate`` where it is that of a rectified pair: along x alone."""
+    T, R = numbers(names.get("t")), numbers(names.get("r"))
+    if T is None or len(T) != 3:
+        return None
+    is_turned = R is not None and len(R) == 9 and not np.allclose(R, np.eye(3).ravel(), atol=_LEVEL)
+    if is_turned or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
+        raise InputError(
+            "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "
+            "cv2.stereoRectify and write its P1 and P2 too"
+        )
+    return -T[0]
+
+
+def _bent(facts: CameraFacts, distortion: tuple[float, ...], undistort: str) -> CameraFacts:
+    return CameraFacts(**{**vars(facts), "distortion": distortion, "undistort": undistort})
+
+
+def _lens_remedy(names: Names, of_pinhole: str) -> str:
+    is_fisheye = re.search("equidistant|fisheye", str(names.get("distortionmodel")).lower())
+    return _UNDISTORT_FISHEYE if is_fisheye else of_pinhole
+
+
+def _distortion(names: Names) -> tuple[float, ...]:
+    """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1.
+
+    Raises:
+        InputError: coefficients that are no numbers, which would be passed over in silence.
+    """
+    found = [scalar(names, name) for name in _BENT]
+    for name, value in names.items():
+        is_list = name in _D or name.startswith(("distcoef", "distortioncoef"))
+        if is_list or name.startswith("distortion"):
+            is_named = isinstance(value, Mapping) and "data" not in value
+            inner = value.get("data") if isinstance(value, Mapping) and not is_named else value
+            some = numbers(list(value.values()) if is_named else value)
+            if some is None and is_list and inner:
+                raise InputError(f"its {name} are no list of numbers; write [k1, k2, p1, p2, k3]")
+            found += some or []
+    return tuple(value for value in found if value is not None)
+
+
+def _size(names: Names) -> Size | None:
+    width, height = (
+        next((v for name in which if (v := scalar(names, name)) is not None), None)
+        for which in (_WIDTH, _HEIGHT)
+    )
+    both = numbers(names.get("imagesize") or names.get("size"))
+    if width is None and both is not None and len(both) == 2:
+        width, height = both
+    return None if not width or not height else (int(width), int(height))
+
+
+def _need(matrix: np.ndarray | None, name: str) -> np.ndarray:
+    if matrix is None:
+        raise InputError(f"there is no {name} of 12 numbers; write the whole pair")
+    return matrix
