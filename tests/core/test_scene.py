@@ -5,7 +5,7 @@ import torch
 
 from depthpose.core import scene as scenes
 from depthpose.core.files import Cloud
-from depthpose.core.scene import Layer, Lines, Scene, colored_lines, frame_axes, viewer_file
+from depthpose.core.scene import Layer, Lines, Scene, colored_lines, frame_axes, page_file
 
 
 def decoded(layer: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -67,6 +67,6 @@ def test_axes_are_red_green_blue_columns() -> None:
 
 
 def test_the_viewer_asks_the_network_for_nothing() -> None:
-    script = viewer_file("viewer.js") + viewer_file("viewer.css")
+    script = page_file("viewer.js") + page_file("page.css")
     for word in ("://", "fetch(", "import ", "url(", "XMLHttpRequest", "</script"):
         assert word not in script

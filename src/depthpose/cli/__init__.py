@@ -18,6 +18,7 @@ COMMANDS = {
         "run everything on a made street and open the books: out/demo/report.html",
     ),
     "doctor": ("doctor:doctor", "versions, devices, extras, weights, and one try of each room"),
+    "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
     "data make streets": (
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",

@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from depthpose.core.files import atomic_write, write_json
-from depthpose.core.scene import Scene, viewer_file
+from depthpose.core.scene import Scene, page_file
 
 Row = Mapping[str, Any]
 
@@ -114,7 +114,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.globals.update(show_value=show_value, column_names=column_names, viewer_file=viewer_file)
+    pages.globals.update(show_value=show_value, column_names=column_names, page_file=page_file)
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )

@@ -78,8 +78,8 @@ class Scene:
                 "layers": [_encoded(layer) for layer in self.layers]}  # fmt: skip
 
 
-def viewer_file(name: Literal["viewer.js", "viewer.css"]) -> str:
-    """Read the viewer: JavaScript that defines ``showScene(element, scene)``, or its style."""
+def page_file(name: Literal["viewer.js", "page.css"]) -> str:
+    """Read the viewer, which defines ``showScene(element, scene)``, or the style of all pages."""
     return files("depthpose.core").joinpath(name).read_text(encoding="utf-8")
 
 

@@ -1,0 +1,46 @@
+"""The process that answers: a socket of this machine, and uvicorn on it."""
+
+import socket
+
+import uvicorn
+from starlette.applications import Starlette
+
+from depthpose.core.errors import InputError
+
+_CONNECTIONS = 40
+_LEAVE_S = 2
+"""Seconds that open connections have to finish after Ctrl+C."""
+
+
+def open_socket(host: str, port: int) -> socket.socket:
+    """Take a port before anything heavy is loaded; port 0 takes a free one.
+
+    Raises:
+        InputError: there is no such address here, or the port is in use.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        taken = socket.socket(family, kind, protocol)
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        taken.bind(address)
+    except OSError as error:
+        raise InputError(
+            f"{host}:{port} cannot be used: {error.strerror or error}; choose another --port (0: "
+            "any that is free) or --host (127.0.0.1: this machine alone)"
+        ) from error
+    return taken
+
+
+def run(app: Starlette, taken: socket.socket) -> None:
+    """Answer until the process is told to stop; nothing is logged but errors."""
+    config = uvicorn.Config(
+        app,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=_CONNECTIONS,
+        timeout_graceful_shutdown=_LEAVE_S,
+    )
+    uvicorn.Server(config).run(sockets=[taken])
