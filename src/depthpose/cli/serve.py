@@ -31,7 +31,8 @@ def serve(
     try:
         from depthpose.web import LOOPBACK, Limits, make_app, open_socket, run
     except ModuleNotFoundError as error:
-        raise MissingExtraError(error.name or "starlette", "serve", "the page") from error
+        package = (error.name or "starlette").partition(".")[0]
+        raise MissingExtraError(package, "serve", "the page in the browser") from error
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.pose.estimator import GeoPoseNet
 

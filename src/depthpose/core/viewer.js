@@ -149,7 +149,7 @@ const showScene = (() => {
     const clouds = layers.filter(layer => layer.shown && layer.kind === "points");
     const { middle, size } = extent(clouds.length ? clouds : layers);
     // From where the camera stood, but no farther off than all is seen.
-    const reach = 1.15 * Math.hypot(...middle);
+    const reach = 1.3 * Math.hypot(...middle);
     const start = { yaw: 0.22, pitch: 0.18, target: middle,
       distance: Math.min(reach > 0.1 * size ? reach : size, size) };
     let eye = { ...start }, waiting = false;

@@ -19,6 +19,7 @@ from depthpose.core.files import (
     write_cloud,
     write_image,
 )
+from depthpose.core.rigid import Rigid
 from depthpose.core.scene import Layer, Scene
 from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import seen_points
@@ -123,7 +124,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
 
 
 def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
-    """Whether a CAD file is an object of the weights, in the same frame: its keypoints lie on it."""
+    """Whether a CAD file is the object that the weights know, in the same frame."""
     if abs(model.diameter_m / own.diameter_m - 1) > _SAME:
         return False
     surface_m = torch.cat([model.vertices_m, sample_surface(model, _SURFACE)[0]])
@@ -205,17 +206,30 @@ def _tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
         rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
         tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
     if pose is not None and found.covariance is not None:
-        sigma = found.covariance.double().diagonal().clamp(min=0).sqrt()
-        turn, shift = (sigma[:3] * 180 / math.pi).tolist(), (sigma[3:] * 1000).tolist()
-        tables["standard deviations about and along the camera's axes"] = [
+        turn_deg, origin_mm = spreads(pose, found.covariance)
+        tables["standard deviations along the camera's axes"] = [
             ["", "x", "y", "z"],
-            ["rotation [deg]", *(f"{v:.3f}" for v in turn)],
-            ["translation [mm]", *(f"{v:.3f}" for v in shift)],
+            ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
+            ["place of the model's origin [mm]", *(f"{v:.3f}" for v in origin_mm)],
         ]
-        tables["covariance: rotation vector [rad], translation [m]"] = [
+        tables["covariance of rotation vector [rad] and translation [m], as poses.json has it"] = [
             [f"{v:.2e}" for v in row] for row in found.covariance.tolist()
         ]
     return tables
+
+
+def spreads(pose: Rigid, covariance: Float[Tensor, "6 6"]) -> tuple[list[float], list[float]]:
+    """Give the standard deviations of the rotation [deg] and of the model's origin [mm].
+
+    The perturbation is a left one: a rotation about the camera moves an origin at t by
+    ``rotation x t``, beside the translation.
+    """
+    t, spread = pose.t_m.double(), covariance.double()
+    turned = torch.linalg.cross(torch.eye(3, dtype=torch.float64), t.expand(3, 3)).mT
+    by = torch.cat([turned, torch.eye(3, dtype=torch.float64)], 1)
+    origin = (by @ spread @ by.mT).diagonal().clamp(min=0).sqrt() * 1000
+    turn = spread.diagonal()[:3].clamp(min=0).sqrt() * 180 / math.pi
+    return turn.tolist(), origin.tolist()
 
 
 def _scene(

@@ -25,6 +25,7 @@ def open_socket(host: str, port: int) -> socket.socket:
         taken = socket.socket(family, kind, protocol)
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         taken.bind(address)
+        taken.listen()  # a browser that comes while weights are loaded waits
     except OSError as error:
         raise InputError(
             f"{host}:{port} cannot be used: {error.strerror or error}; choose another --port (0: "

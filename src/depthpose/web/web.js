@@ -27,17 +27,19 @@ for (const tab of tabs) {
 }
 choose(tabs.find(tab => `#${tab.getAttribute("aria-controls")}` === location.hash) || tabs[0]);
 
-// Drop zones say which file they hold; a double click lets it go.
+// Drop zones say which file they hold, and let it go by a button.
 for (const zone of document.querySelectorAll(".drop")) {
   const input = zone.querySelector("input"), said = zone.querySelector("output");
   const show = () => {
     const file = input.files[0];
-    said.textContent = file ? `${file.name}, ${sized(file.size)} (double click lets it go)` : "";
+    said.textContent = file ? `${file.name}, ${sized(file.size)}` : "";
     zone.classList.toggle("has", Boolean(file));
     if (file && input.name === "cad") input.form.elements.object.value = "cad";
   };
   input.addEventListener("change", show);
-  zone.addEventListener("dblclick", event => { event.preventDefault(); input.value = ""; show(); });
+  const drop = made("button", { type: "button", className: "drop-it", textContent: "\u00d7", title: "take the file out" });
+  drop.addEventListener("click", event => { event.preventDefault(); input.value = ""; show(); });
+  zone.append(drop);
   for (const name of ["dragenter", "dragover"]) zone.addEventListener(name, () => zone.classList.add("over"));
   for (const name of ["dragleave", "drop"]) zone.addEventListener(name, () => zone.classList.remove("over"));
 }
