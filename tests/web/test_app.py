@@ -19,7 +19,6 @@ from httpx2 import Response
 from starlette.testclient import TestClient
 from tests.web.samples import PART, write_street, write_view
 
-from depthpose.core.camera import read_camera
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher
@@ -105,10 +104,11 @@ def test_one_image_becomes_the_depth_that_python_gives(
 
 
 def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> None:
-    rig = read_camera(samples / "camera.json")
-    fields = {name: repr(float(rig.K[at])) for name, at in
-              {"focal_px": (0, 0), "cx_px": (0, 2), "cy_px": (1, 2)}.items()}  # fmt: skip
-    by_file = ask(page, "depth", samples, {"image": "left.png", "camera": "camera.json"}).json()
+    fields = {"focal_px": "180.5", "cx_px": "150.25", "cy_px": "44.5"}
+    camera = json.loads((samples / "camera.json").read_text())
+    camera["K"] = [[180.5, 0, 150.25], [0, 180.5, 44.5], [0, 0, 1]]
+    (samples / "square.json").write_text(json.dumps(camera))
+    by_file = ask(page, "depth", samples, {"image": "left.png", "camera": "square.json"}).json()
     by_fields = ask(page, "depth", samples, {"image": "left.png"}, **fields).json()
     ways = [page.get("/" + a["folder"] + "left.ply").content for a in (by_file, by_fields)]
     assert ways[0] == ways[1]
@@ -286,6 +286,8 @@ def test_a_request_without_a_size_is_refused(page: TestClient) -> None:
 def test_strangers_are_refused(page: TestClient) -> None:
     status, text = refusal(page.get("/", headers={"host": "evil.example"}))
     assert (status, "not to 'evil.example'" in text) == (403, True)
+    assert refusal(page.get("/", headers={"host": "[::1"}))[0] == 403
+    assert refusal(page.post("/estimate/depth", headers={"origin": "null"}))[0] == 403
     status, text = refusal(page.post("/estimate/depth", headers={"origin": "http://evil.example"}))
     assert (status, "comes from another page" in text) == (403, True)
     assert page.get("/", headers={"origin": URL}).status_code == 200

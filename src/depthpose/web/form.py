@@ -107,8 +107,9 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
     if field not in KINDS:
         raise InputError(f"{field!r} is no file field of this page; known are {', '.join(KINDS)}")
     what, suffixes = KINDS[field]
-    name = re.sub(r"[^\w.-]+", "_", sent_name.replace("\\", "/").rpartition("/")[2]).lstrip(".-")
-    path = Path(name)
+    # ASCII alone: results bear the name too, and go into the header of an answer.
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", sent_name.replace("\\", "/").rpartition("/")[2])
+    path = Path(name.lstrip(".-"))
     if path.suffix.lower() not in suffixes or not path.stem:
         raise InputError(
             f"{field}: {sent_name!r} is not {what}; this field takes {', '.join(suffixes)}"

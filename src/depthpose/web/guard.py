@@ -21,16 +21,23 @@ _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 def refuse_stranger(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
     """Refuse a request under another name than ours, or sent by another web page."""
     host = request.headers.get("host", "")
-    name = urlsplit(f"//{host}").hostname
+    name = _host_name(host)
     if hosts is not None and name not in hosts:
         return _sentence(
-            403, f"this page answers to {', '.join(hosts)}, not to {name!r}; start "
+            403, f"this page answers to {', '.join(hosts)}, not to {host!r}; start "
             "'depthpose serve' with --host to name another"
         )  # fmt: skip
     origin = request.headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != host:
+    if origin is not None and origin.partition("://")[2] != host:
         return _sentence(403, f"the request comes from another page, {origin}; open this one")
     return None
+
+
+def _host_name(host: str) -> str | None:
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:  # such as half of a bracket
+        return None
 
 
 def refuse_size(request: Request, most: int) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -78,26 +79,37 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
         found = target.registration.estimate(cloud)
     folder = form.results()
-    write_predictions(folder, [Prediction(estimate=found)])
-    pictures: list[Shown] = []
-    if (pose := found.camera_from_model) is not None:
-        write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, target.model))
-    if isinstance(given, ViewInput):
-        picture = grey_depth(given.depth_m)
-        if pose is not None:
-            picture = draw_pose(picture, pose, target.model, given.K.double())
-        write_image(folder / f"{given.name}.png", picture)
-        caption = "depth image, near bright" + (", with the posed model" if pose else "")
-        pictures.append(Shown(file=f"{given.name}.png", caption=caption))
     return Answer(
         is_ok=found.is_ok,
         said=_sentence(found, target.model),
         facts=_facts(found, target),
         tables=_tables(found),
-        pictures=pictures,
+        pictures=_write(folder, given, points_m, found, target.model),
         scene=_scene(given, points_m, found, target, net),
         files=read_files(folder),
     )
+
+
+def _write(
+    folder: Path,
+    given: CloudInput | ViewInput,
+    points_m: Float[Tensor, "n 3"],
+    found: PoseEstimate,
+    model: ObjectModel,
+) -> list[Shown]:
+    """Write ``poses.json``, the posed model beside the cloud, and the picture that is shown."""
+    pose = found.camera_from_model
+    write_predictions(folder, [Prediction(estimate=found)])
+    if pose is not None:
+        write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
+    if not isinstance(given, ViewInput):
+        return []
+    picture, caption = grey_depth(given.depth_m), "depth image, near bright"
+    if pose is not None:
+        picture = draw_pose(picture, pose, model, given.K.double())
+        caption += ", with the posed model"
+    write_image(folder / f"{given.name}.png", picture)
+    return [Shown(file=f"{given.name}.png", caption=caption)]
 
 
 def _target(form: Form, net: GeoPoseNet) -> _Target:
