@@ -14,6 +14,11 @@ def test_a_port_in_use_is_said_with_a_remedy(capsys: pytest.CaptureFixture[str])
     assert "choose another --port (0: any that is free)" in said
 
 
+def test_a_port_that_cannot_be_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--port", "70000"]) == 2
+    assert "127.0.0.1:70000 cannot be used" in capsys.readouterr().err
+
+
 def test_an_address_of_nobody_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", "--host", "192.0.2.1", "--port", "0"]) == 2
     assert "192.0.2.1:0 cannot be used" in capsys.readouterr().err

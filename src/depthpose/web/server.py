@@ -18,20 +18,15 @@ def open_socket(host: str, port: int) -> socket.socket:
     Raises:
         InputError: there is no such address here, or the port is in use.
     """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        taken = socket.socket(family, kind, protocol)
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        taken.bind(address)
-        taken.listen()  # a browser that comes while weights are loaded waits
-    except OSError as error:
+        # It listens at once: a browser that comes while weights are loaded waits.
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as error:
         raise InputError(
-            f"{host}:{port} cannot be used: {error.strerror or error}; choose another --port (0: "
-            "any that is free) or --host (127.0.0.1: this machine alone)"
+            f"{host}:{port} cannot be used: {error}; choose another --port (0: any that is free) "
+            "or --host (127.0.0.1: this machine alone)"
         ) from error
-    return taken
 
 
 def run(app: Starlette, taken: socket.socket) -> None:
