@@ -16,7 +16,7 @@ def test_a_port_in_use_is_said_with_a_remedy(capsys: pytest.CaptureFixture[str])
 
 def test_a_port_that_cannot_be_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", "--port", "70000"]) == 2
-    assert "127.0.0.1:70000 cannot be used" in capsys.readouterr().err
+    assert "port 70000: there are 0 (any that is free) to 65535" in capsys.readouterr().err
 
 
 def test_an_address_of_nobody_is_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,11 +18,13 @@ def open_socket(host: str, port: int) -> socket.socket:
     Raises:
         InputError: there is no such address here, or the port is in use.
     """
+    if not 0 <= port < 2**16:
+        raise InputError(f"port {port}: there are 0 (any that is free) to 65535; 8000 is usual")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         # It listens at once: a browser that comes while weights are loaded waits.
         return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise InputError(
             f"{host}:{port} cannot be used: {error}; choose another --port (0: any that is free) "
             "or --host (127.0.0.1: this machine alone)"
