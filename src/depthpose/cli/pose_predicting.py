@@ -24,7 +24,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.run import Shard, claim_folder, find_shard, wait_for
 from depthpose.pose.bop import BopDataset, Instance
-from depthpose.pose.cloud import seen_points
+from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
@@ -194,7 +194,7 @@ def write_files(
         if pose is None:
             continue
         given, model = job.read(), _model(method, estimate.object)
-        points_m = seen_points(given, model.diameter_m)
+        points_m = object_points(given, model.diameter_m)
         write_cloud(out / f"{job.name}.ply", posed_cloud(points_m, pose, model))
         if isinstance(given, ViewInput):
             picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)

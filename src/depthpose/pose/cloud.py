@@ -59,7 +59,7 @@ def cloud_from_depth(
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
 
 
-def seen_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
+def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
     """Give the finite points of an input, those of a depth image without what flies about."""
     if isinstance(given, ViewInput):
         return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()

@@ -28,7 +28,7 @@ _SURFACE = 5000
 _BEND = math.radians(30)
 _CROSS = 0.04
 """Half of the mark of a keypoint, in diameters of the object."""
-_VOTES = 150
+_VOTES = 40
 """Points whose votes are drawn."""
 _DASH_PX = 6.0
 
@@ -95,8 +95,7 @@ def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> li
     box_m = posed(box_edges(model))
     if is_true:
         return [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
-    surface_m = pose.apply(sample_surface(model, _SURFACE)[0].double()).float()
-    surface = Cloud(points=surface_m, color=torch.tensor(FOUND).expand(len(surface_m), 3))
+    surface = posed_cloud(torch.empty(0, 3), pose, model)
     layers = [Layer(name="posed model", shape=surface)]
     if len(model.faces):
         edges = colored_lines(posed(bent_edges(model)), FOUND)

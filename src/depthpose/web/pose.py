@@ -23,7 +23,7 @@ from depthpose.core.files import (
 from depthpose.core.rigid import Rigid
 from depthpose.core.scene import Layer, Scene
 from depthpose.pose.baselines import FpfhRegistration
-from depthpose.pose.cloud import seen_points
+from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.given import cloud_input, view_input
@@ -72,7 +72,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """
     target = _target(form, net)
     given = _input(form, target.model)
-    points_m = seen_points(given, target.model.diameter_m)
+    points_m = object_points(given, target.model.diameter_m)
     if target.registration is None:
         (found,) = net.estimate_many([given])
     else:
