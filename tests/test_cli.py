@@ -86,7 +86,7 @@ def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[st
         (["depth", "evaluate", "--data", ".", "--out", "o"], "measure --weights FILE"),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o"], "match with --weights"),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
-         "c.json"),
+         "l: no .png"),
     ],
 )  # fmt: skip
 def test_wrong_words_are_refused(

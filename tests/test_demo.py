@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from depthpose.depth.disparity import warp_right_to_left
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.objects import PARTS
 from depthpose.pose.predictions import read_predictions
+
+_SCENE = r'<script type="application/json">(.*?)</script>'
 
 
 def test_the_disparity_carries_one_view_to_the_other() -> None:
@@ -46,6 +49,9 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     html = result.page.read_text()
     assert html.count("data:image/png;base64,") == 3 + 3 + 2 + 2 + 3 + 2 + 2 + 2
     assert "://" not in html, "the page loads nothing"
+    scenes = [json.loads(text) for text in re.findall(_SCENE, html, re.DOTALL)]
+    assert len(scenes) == 3 + 2 + 1
+    assert all(scene["layers"][0]["count"] > 10_000 for scene in scenes)
     rows = json.loads((tmp_path / "depths.json").read_text())
     assert [(row["scene"], row["sees"]) for row in rows] == [
         ("street", "one image"),
@@ -71,6 +77,9 @@ def test_the_demo_poses_parts_and_answers_none_wrongly(tmp_path: Path) -> None:
     assert all(row["of_diameter"] < 0.1 for row in answered)
     assert all(row["reason"] for row in rows if row not in answered)
     assert section.pictures
+    names = [layer.name for layer in section.scenes[0].layers]
+    assert names.count("true box") == len(PARTS)
+    assert names.count("posed model") == len(answered)
     found = GeoPoseNet.load("parts").estimate(
         depth=tmp_path / "part/depth.png",
         mask=tmp_path / "part/mask.png",

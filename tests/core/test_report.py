@@ -1,11 +1,12 @@
 import csv
 import io
 import json
+import re
 from pathlib import Path
 
 import torch
 
-from depthpose.core.files import write_image
+from depthpose.core.files import Cloud, write_image
 from depthpose.core.report import (
     Picture,
     Section,
@@ -15,6 +16,7 @@ from depthpose.core.report import (
     write_page,
     write_table,
 )
+from depthpose.core.scene import Layer, Scene
 
 ROWS = [{"name": "a|b", "x": 0.123456, "n": 3}, {"name": "c", "x": 80.0, "more": None}]
 
@@ -48,6 +50,24 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert "a &lt;picture&gt;" in html
     assert "http" not in html
     assert 'src="p.png' not in html
+
+
+def test_a_page_holds_its_scenes_and_the_viewer_once(tmp_path: Path) -> None:
+    cloud = Layer(name="</script><b>", shape=Cloud(points=torch.zeros(2, 3)))
+    scene = Scene(caption="a <cloud>", layers=[cloud])
+    sections = [Section(title="One", scenes=[scene, scene]), Section(title="Two", scenes=[scene])]
+    write_page(tmp_path / "page.html", "Title", sections, {})
+    html = (tmp_path / "page.html").read_text()
+    assert html.count("const showScene") == 1
+    found = re.findall(r'<script type="application/json">(.*?)</script>', html, re.DOTALL)
+    assert [json.loads(text) for text in found] == [scene.encoded()] * 3
+    assert "a &lt;cloud&gt;" in html
+    assert "://" not in html
+
+
+def test_a_page_without_scenes_brings_no_viewer(tmp_path: Path) -> None:
+    write_page(tmp_path / "page.html", "Title", [Section(title="One", rows=ROWS)], {})
+    assert "showScene" not in (tmp_path / "page.html").read_text()
 
 
 def test_the_words_and_tables_of_a_page_are_markdown_too(tmp_path: Path) -> None:

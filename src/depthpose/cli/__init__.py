@@ -21,6 +21,7 @@ COMMANDS = {
         "doctor:doctor",
         "what is installed, and a try of each room; or what files are",
     ),
+    "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
     "data make streets": (
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",

@@ -25,7 +25,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.run import Shard, claim_folder, find_shard, wait_for
 from depthpose.pose.bop import BopDataset, Instance
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
@@ -199,11 +199,8 @@ def write_files(
         if pose is None:
             continue
         given, model = job.read(), _model(method, estimate.object)
-        points_m = given.points_m if not isinstance(given, ViewInput) else cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m
-        )  # fmt: skip
-        finite_m = points_m[points_m.isfinite().all(-1)]
-        write_cloud(out / f"{job.name}.ply", posed_cloud(finite_m, pose, model))
+        points_m = object_points(given, model.diameter_m)
+        write_cloud(out / f"{job.name}.ply", posed_cloud(points_m, pose, model))
         if isinstance(given, ViewInput):
             picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
             write_image(out / f"{job.name}.png", picture)

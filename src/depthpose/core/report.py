@@ -11,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from depthpose.core.files import atomic_write, write_json
+from depthpose.core.scene import Scene, page_file
 
 Row = Mapping[str, Any]
 
@@ -31,12 +32,13 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page: words, then a table, then pictures."""
+    """A part of a page: words, then a table, then pictures, then 3D views."""
 
     title: str
     text: str = ""
     rows: Sequence[Row] = ()
     pictures: Sequence[Picture] = field(default_factory=tuple)
+    scenes: Sequence[Scene] = field(default_factory=tuple)
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
@@ -68,7 +70,7 @@ def csv_table(rows: Sequence[Row]) -> str:
 def write_markdown(
     path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
 ) -> None:
-    """Write the words and tables of :func:`write_page` as Markdown, without its pictures."""
+    """Write the words and tables of :func:`write_page` as Markdown, without what is seen."""
     parts = [f"# {title}\n"]
     for section in sections:
         parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
@@ -112,7 +114,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.globals.update(show_value=show_value, column_names=column_names)
+    pages.globals.update(show_value=show_value, column_names=column_names, page_file=page_file)
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )

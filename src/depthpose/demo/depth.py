@@ -14,12 +14,13 @@ from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.draw import draw_depth, draw_share
 from depthpose.core.files import write_image
 from depthpose.core.report import Picture, Section
+from depthpose.core.scene import Layer, Scene
 from depthpose.demo.motorcycle import read_motorcycle
 from depthpose.depth.config import SGBMConfig, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import depth_errors, disparity_errors
-from depthpose.depth.predictions import write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import estimate_cloud, write_estimate, write_estimate_cloud
 from depthpose.depth.streets import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample
 
@@ -155,7 +156,17 @@ def _show(folder: Path, title: str, sample: StereoSample, estimate: DepthEstimat
         drawn = Picture(path=folder / f"{pair.name}.right.png", caption="right view as drawn")
         pictures.append(drawn)
     caption = f"disparity error, dark 0 to bright {_WORST_PX:.0f} px"
-    return Section(title=title, pictures=[*pictures, Picture(path=error, caption=caption)])
+    far_m = _range_m(sample)[1]
+    cloud = estimate_cloud(pair, estimate, far_m)
+    space = Scene(
+        caption=f"{title}: the cloud up to {far_m:.0f} m",
+        layers=[Layer(name="points in the image's colours", shape=cloud)],
+    )
+    return Section(
+        title=title,
+        pictures=[*pictures, Picture(path=error, caption=caption)],
+        scenes=[space],
+    )
 
 
 def _draw_error(

@@ -3,16 +3,17 @@
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.camera import Camera, write_camera
-from depthpose.core.files import write_cloud, write_depth_png, write_image
+from depthpose.core.camera import Camera, back_project, write_camera
+from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.report import Picture, Section
-from depthpose.pose.bop import open_bop, write_bop_models, write_bop_scene
+from depthpose.core.scene import Layer, Scene
+from depthpose.pose.bop import BopFrame, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.bop.write import write_mask
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.objects import make_frames
-from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
+from depthpose.pose.overlay import draw_pose, grey_depth, pose_layers, posed_cloud
 from depthpose.pose.predictions import Prediction, place_of, write_predictions
 from depthpose.pose.types import ViewInput
 
@@ -66,13 +67,16 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     rows = [_row(row) for row in evaluate(dataset, predictions).per_instance]
     assert frame.rgb is not None
     picture = frame.rgb
+    layers = [Layer(name="table, as the sensor sees it", shape=_cloud(frame))]
     for view, estimate, instance in zip(views, found, dataset.instances, strict=True):
         model, K = models[instance.object_id], instance.K.double()
         if (pose := estimate.camera_from_model) is not None:
             picture = draw_pose(picture, pose, model, K)
             points_m = dataset.sample(instance).input.points_m
             write_cloud(folder / f"{view.object}.ply", posed_cloud(points_m, pose, model))
+            layers += pose_layers(pose, model)
         picture = draw_pose(picture, instance.camera_from_model, model, K, is_true=True)
+        layers += pose_layers(instance.camera_from_model, model, is_true=True)
     write_image(folder / "poses.png", picture)
     write_image(folder / "depth.png", grey_depth(frame.depth_m))
     return rows, [
@@ -84,8 +88,18 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
                 Picture(path=folder / "depth.png", caption="depth image, near bright"),
                 Picture(path=folder / "poses.png", caption="poses, estimated and true"),
             ],
+            scenes=[Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)],
         )
     ]
+
+
+def _cloud(frame: BopFrame) -> Cloud:
+    """Give the whole depth image as points in the colours of its picture."""
+    assert frame.rgb is not None
+    points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
+    is_seen = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
+    color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)
+    return Cloud(points=points_m[is_seen].float(), color=color[is_seen])
 
 
 def _write_sample(folder: Path, view: ViewInput) -> None:

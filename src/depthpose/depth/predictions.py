@@ -73,14 +73,22 @@ def write_estimate(
 def write_estimate_cloud(
     folder: Path, pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0
 ) -> None:
-    """Write ``NAME.ply``: the coloured points nearer than ``far_m`` in the left camera's frame."""
+    """Write ``NAME.ply``: what :func:`estimate_cloud` gives."""
+    write_cloud(_file(folder / pair.name, "ply"), estimate_cloud(pair, estimate, far_m))
+
+
+def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
+    """Give the coloured points nearer than ``far_m``, in the left camera's frame.
+
+    Raises:
+        InputError: there are no metres, because there was no camera, or no baseline.
+    """
     if estimate.depth_m is None or pair.camera is None:
         raise InputError(f"{pair.name}: a cloud needs metres: give a camera with a baseline.")
     points_m = back_project(estimate.depth_m, pair.camera.K).reshape(-1, 3)
     is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
     color = pair.left.permute(1, 2, 0).reshape(-1, 3)
-    cloud = Cloud(points=points_m[is_kept].float(), color=color[is_kept])
-    write_cloud(_file(folder / pair.name, "ply"), cloud)
+    return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
 
 
 def is_finished(folder: Path, name: str) -> bool:

@@ -10,6 +10,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.config import CloudConfig
+from depthpose.pose.types import CloudInput, ViewInput
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
@@ -66,6 +67,13 @@ def cloud_from_depth(
         return points_m
     config = CloudConfig() if config is None else config
     return points_m[~is_flying(points_m, diameter_m * config.max_offset_diameters)]
+
+
+def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
+    """Give the finite points of an input, those of a depth image without what flies about."""
+    if isinstance(given, ViewInput):
+        return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
+    return given.points_m[given.points_m.isfinite().all(-1)].float()
 
 
 def _lifted(

@@ -1,14 +1,18 @@
-"""A posed object over the picture that it was seen in, and beside the cloud."""
+"""A posed object over the picture that it was seen in, and beside the cloud, flat and in 3D."""
+
+import math
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import project
 from depthpose.core.draw import draw_lines, draw_outline
 from depthpose.core.files import Cloud
 from depthpose.core.raster import rasterize
 from depthpose.core.rigid import Rigid
+from depthpose.core.scene import Layer, colored_lines, frame_axes
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.objects import drawn_triangles
 from depthpose.pose.types import ObjectModel
@@ -18,7 +22,14 @@ FOUND: Color = (0.15, 0.35, 1.0)
 """Of an estimate: blue."""
 TRUE: Color = (0.1, 0.8, 0.2)
 """Of the truth: green."""
+VOTED: Color = (1.0, 0.55, 0.1)
+"""Of keypoints as voted: orange."""
 _SURFACE = 5000
+_BEND = math.radians(30)
+_CROSS = 0.04
+"""Half of the mark of a keypoint, in diameters of the object."""
+_VOTES = 40
+"""Points whose votes are drawn."""
 _DASH_PX = 6.0
 
 
@@ -57,6 +68,87 @@ def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
     pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
     return corners[torch.tensor(pairs)]
+
+
+def bent_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
+    """Give both ends of the edges where the surface ends, or bends by more than 30 degrees [m]."""
+    # By place, not by number: STL repeats the points of every face.
+    places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
+    corners = place[model.faces]
+    side = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(-1).values
+    edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
+    a, b, c = model.triangles_m.double().unbind(1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
+    # Two unit normals at an angle have a mean as long as the cosine of half of it.
+    is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
+    return places_m[edges[is_bent | (count == 1)]]
+
+
+def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> list[Layer]:
+    """Show a posed object in space: its surface, edges, box and axes; the truth as a box alone."""
+    pose = Rigid(pose.R.double(), pose.t_m.double())
+
+    def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+        return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
+
+    box_m = posed(box_edges(model))
+    if is_true:
+        return [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
+    surface = posed_cloud(torch.empty(0, 3), pose, model)
+    layers = [Layer(name="posed model", shape=surface)]
+    if len(model.faces):
+        edges = colored_lines(posed(bent_edges(model)), FOUND)
+        layers.append(Layer(name="its edges", shape=edges))
+    axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
+    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=False)
+    return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
+
+
+def keypoint_layers(
+    voted_m: Float[Tensor, "k 3"], pose: Rigid | None, model: ObjectModel
+) -> list[Layer]:
+    """Show the keypoints as voted, and as the posed model has them.
+
+    Args:
+        voted_m: in the camera frame.
+        pose: ``camera_from_model``; None where it was refused.
+        model: the object.
+    """
+    half_m = _CROSS * model.diameter_m
+    marks = colored_lines(_crosses(voted_m, half_m), VOTED)
+    layers = [Layer(name="keypoints, voted", shape=marks)]
+    if pose is not None:
+        own_m = pose.apply(model.keypoints_m.to(pose.R))
+        own = colored_lines(_crosses(own_m, half_m), FOUND)
+        layers.append(Layer(name="keypoints, of the posed model", shape=own))
+    return layers
+
+
+def vote_layer(
+    points_m: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n k 3"],
+    voted_m: Float[Tensor, "k 3"],
+) -> Layer:
+    """Show votes: from some points, along the direction, to where it passes its keypoint.
+
+    Args:
+        points_m: that vote.
+        directions: to each keypoint, of any length.
+        voted_m: what they were found to meet at.
+    """
+    from_m, toward = take_evenly(points_m, _VOTES), take_evenly(directions, _VOTES)
+    toward = torch.nn.functional.normalize(toward, dim=-1)
+    way_m = ((voted_m - from_m[:, None]) * toward).sum(-1, keepdim=True).clamp(min=0)
+    starts_m = from_m[:, None].expand_as(toward)
+    ends_m = torch.stack([starts_m, starts_m + way_m * toward], -2).flatten(0, 1)
+    return Layer(name="votes", shape=colored_lines(ends_m.float(), VOTED), is_shown=False)
+
+
+def _crosses(at_m: Float[Tensor, "k 3"], half_m: float) -> Float[Tensor, "n 2 3"]:
+    arms_m = half_m * torch.eye(3).to(at_m)
+    ends_m = torch.stack([at_m[:, None] - arms_m, at_m[:, None] + arms_m], 2)
+    return ends_m.flatten(0, 1).float()
 
 
 def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid, model: ObjectModel) -> Cloud:

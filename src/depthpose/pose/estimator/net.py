@@ -167,6 +167,24 @@ class GeoPoseNet:
                 estimates[k] = self._pose(inputs[k], number, Voted(prepared, outputs), seconds)
         return [estimates[k] for k in range(len(inputs))]
 
+    @torch.inference_mode()
+    def votes_of(self, given: AnyInput) -> Voted | None:
+        """Give the points that vote, and what the network says of each keypoint there.
+
+        Returns:
+            The cloud and the outputs in the camera frame; None where the input cannot be posed.
+
+        Raises:
+            InputError: as for :meth:`estimate_many`.
+        """
+        number = self._number(given.object)
+        model = self.weights.models[number]
+        prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
+        if isinstance(prepared, Refusal):
+            return None
+        (outputs,), _ = self._directions([prepared], [number])
+        return Voted(prepared, outputs)
+
     def _directions(
         self, clouds: list[Prepared], numbers: list[int]
     ) -> tuple[list[Float[Tensor, "n k c"]], float]:

@@ -1,0 +1,53 @@
+"""``depthpose serve``."""
+
+from depthpose.core.errors import InputError, MissingExtraError
+
+
+def serve(
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    weights: str = "default",
+    pose_weights: str = "parts",
+    max_upload_mb: int = 64,
+) -> int:
+    """A page in your browser: drop an image, a pair, a depth image or a cloud, and look.
+
+    Tab Depth: depth, the drawn right view, confidence and a cloud that turns; tab Pose: votes, the
+    posed model, its covariance, or the reason for none; all files to take away. It needs no
+    network, sends nothing anywhere, keeps nothing on the disk, and answers this machine alone
+    unless --host says otherwise. Needs the extra 'serve'. Ctrl+C stops it.
+
+        depthpose serve
+        depthpose serve --pose-weights my_part/weights.safetensors --port 8080
+
+    Args:
+        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it: there is
+            no password and no encryption.
+        port: where; 0 takes a free one.
+        weights: of the depth networks, by name or file ('depthpose weights list').
+        pose_weights: of a pose network, by name or file.
+        max_upload_mb: all files of one request together [1e6 bytes].
+    """
+    try:
+        from depthpose.web import LOOPBACK, Limits, make_app, open_socket, run
+    except ModuleNotFoundError as error:
+        package = (error.name or "starlette").partition(".")[0]
+        raise MissingExtraError(package, "serve", "the page in the browser") from error
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.pose.estimator import GeoPoseNet
+
+    if max_upload_mb < 1:
+        raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
+    taken = open_socket(host, port)
+    is_open = host in ("0.0.0.0", "::")  # noqa: S104  the user's word, compared
+    limits = Limits(
+        upload_bytes=max_upload_mb * 10**6, hosts=None if is_open else (*LOOPBACK, host)
+    )
+    app = make_app(FakestereoNet.load(weights), GeoPoseNet.load(pose_weights), limits)
+    shown = f"[{host}]" if ":" in host else host
+    print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
+    try:
+        run(app, taken)
+    except KeyboardInterrupt:
+        print("stopped")
+    return 0

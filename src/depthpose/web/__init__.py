@@ -1,0 +1,7 @@
+"""The browser page: both rooms behind a form, on this machine alone unless told otherwise."""
+
+from depthpose.web.app import Limits as Limits
+from depthpose.web.app import make_app as make_app
+from depthpose.web.guard import LOOPBACK as LOOPBACK
+from depthpose.web.server import open_socket as open_socket
+from depthpose.web.server import run as run

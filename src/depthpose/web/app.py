@@ -1,0 +1,182 @@
+"""The web application: routes, limits, one computation at a time, nothing kept on the disk."""
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import anyio
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from depthpose import __version__
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.scene import page_file
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.web.answer import Answer
+from depthpose.web.depth import answer_depth
+from depthpose.web.form import Form, without_paths
+from depthpose.web.guard import (
+    LOOPBACK,
+    read_form,
+    refuse_size,
+    refuse_stranger,
+    say_crash,
+    say_error,
+    zip_files,
+)
+from depthpose.web.pose import answer_pose, has_registration
+
+_SAFE = {
+    # Nothing is loaded from elsewhere, and nobody else may show the page in a frame.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+_RESULTS = 3
+"""Answers whose files are kept in memory for downloads."""
+_TYPES = {".png": "image/png", ".json": "application/json", ".zip": "application/zip"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What the page refuses to take."""
+
+    upload_bytes: int = 64 * 10**6
+    """All files of one request together."""
+
+    waiting: int = 4
+    """Requests that may wait for the one that is computed."""
+
+    hosts: tuple[str, ...] | None = LOOPBACK
+    """Names under which a browser may ask for the page; None: any. It keeps other web pages, which
+    a browser has open too, from reading answers by a name of their own (DNS rebinding)."""
+
+
+class Pages:
+    """Handlers of the routes, with the networks and the latest answers' files."""
+
+    def __init__(self, depth: FakestereoNet, pose: GeoPoseNet, limits: Limits) -> None:
+        self._limits = limits
+        self._rooms: dict[str, Callable[[Form], Answer]] = {
+            "depth": partial(answer_depth, net=depth),
+            "pose": partial(answer_pose, net=pose),
+        }
+        self._one = anyio.CapacityLimiter(1)
+        self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
+        loader = PackageLoader("depthpose.web", ".")
+        template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+        self._page = template.get_template("page.html").render(
+            version=__version__,
+            objects=pose.objects,
+            limit_mb=limits.upload_bytes // 10**6,
+            has_one_image=depth.synthesiser is not None,
+            has_registration=has_registration(),
+        )
+        own = Path(__file__).parent
+        self._assets = {
+            "page.css": ("text/css", page_file("page.css") + (own / "web.css").read_text()),
+            "viewer.js": ("text/javascript", page_file("viewer.js")),
+            "web.js": ("text/javascript", (own / "web.js").read_text()),
+        }
+
+    async def home(self, _: Request) -> Response:
+        """Give the page."""
+        return HTMLResponse(self._page)
+
+    async def asset(self, request: Request) -> Response:
+        """Give a script or the style."""
+        name = request.path_params["name"]
+        if name not in self._assets:
+            raise HTTPException(404, f"there is no {name!r}; the page is at /")
+        media_type, text = self._assets[name]
+        return Response(text, media_type=media_type)
+
+    async def estimate(self, request: Request) -> Response:
+        """Take a form to an answer."""
+        refuse_size(request, self._limits.upload_bytes)
+        queue = self._one.statistics()
+        if queue.borrowed_tokens and queue.tasks_waiting >= self._limits.waiting:
+            raise HTTPException(503, "too many requests wait for one computation; try again later")
+        room = self._rooms.get(request.path_params["room"])
+        if room is None:
+            raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+        with TemporaryDirectory(prefix="depthpose-") as folder:
+            try:
+                form = await read_form(request, Path(folder))
+                answer = await anyio.to_thread.run_sync(room, form, limiter=self._one)
+            except (InputError, MissingExtraError) as error:
+                raise HTTPException(400, without_paths(str(error), Path(folder))) from error
+        return JSONResponse(self._keep(answer))
+
+    async def download(self, request: Request) -> Response:
+        """Give a file of one of the latest answers, or all of them as a ZIP."""
+        key, name = request.path_params["key"], request.path_params["name"]
+        files = self._kept.get(key)
+        if files is None or name not in {*files, "all.zip"}:
+            raise HTTPException(
+                404, f"only the last {_RESULTS} answers are kept, and not {name!r}; ask again"
+            )
+        data = files[name] if name in files else zip_files(files)
+        media_type = _TYPES.get(Path(name).suffix, "application/octet-stream")
+        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+        return Response(data, media_type=media_type, headers=headers)
+
+    def _keep(self, answer: Answer) -> dict[str, Any]:
+        key = secrets.token_urlsafe(12)
+        self._kept[key] = answer.files
+        while len(self._kept) > _RESULTS:
+            self._kept.popitem(last=False)
+        sizes = [{"name": name, "bytes": len(data)} for name, data in answer.files.items()]
+        return {
+            "ok": answer.is_ok,
+            "said": answer.said,
+            "facts": list(answer.facts),
+            "tables": dict(answer.tables),
+            "pictures": [vars(picture) for picture in answer.pictures],
+            "scene": answer.scene.encoded(),
+            "files": sizes,
+            "folder": f"results/{key}/",
+        }
+
+
+def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:
+    """Build the application.
+
+    Args:
+        depth: answers the tab Depth.
+        pose: answers the tab Pose.
+        limits: what is refused.
+    """
+    limits = Limits() if limits is None else limits
+    pages = Pages(depth, pose, limits)
+
+    async def guard(request: Request, go_on: Callable[[Request], Awaitable[Response]]) -> Response:
+        response = refuse_stranger(request, limits.hosts) or await go_on(request)
+        response.headers.update(_SAFE)
+        return response
+
+    return Starlette(
+        routes=[
+            Route("/", pages.home),
+            Route("/assets/{name}", pages.asset),
+            Route("/estimate/{room}", pages.estimate, methods=["POST"]),
+            Route("/results/{key}/{name}", pages.download),
+        ],
+        middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)],
+        exception_handlers={HTTPException: say_error, Exception: say_crash},
+    )

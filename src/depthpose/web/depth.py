@@ -1,0 +1,179 @@
+"""The tab Depth: a picture or a pair, and what is known of its camera, to depth in metres."""
+
+import time
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.draw import draw_share
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, read_image, write_cloud, write_image
+from depthpose.core.scene import Layer, Scene
+from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
+from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud, write_estimate
+from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.web.answer import Answer, Shown, read_files
+from depthpose.web.form import Form
+
+MOST_PIXELS = 12_500_000
+"""Of a picture: those of a phone."""
+_MOST_WORK_PIXELS = 8_000_000
+"""Of the picture as the networks see it, at the focal length that they were trained at."""
+_PHONE = 0.75
+"""Focal length of a phone's main camera, in widths of the picture."""
+
+
+def answer_depth(form: Form, net: FakestereoNet) -> Answer:
+    """Estimate what a form asks for.
+
+    Raises:
+        InputError: a file that cannot be read, or a camera that cannot be.
+    """
+    began = time.perf_counter()
+    pair, is_guess = _input(form)
+    near_m, far_m = _range_m(form)
+    _refuse_work(pair, net)
+    found = net.estimate_pair(pair, with_check=True)
+    seconds = time.perf_counter() - began
+    assert found.depth_m is not None
+    folder = form.results()
+    write_estimate(folder, pair, found, (near_m, far_m))
+    cloud = estimate_cloud(pair, found, far_m)
+    write_cloud(folder / f"{pair.name}.ply", cloud)
+    pictures = _pictures(pair, found, (near_m, far_m))
+    if found.confidence is not None:
+        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - found.confidence))
+    scene = Scene(
+        caption=f"The cloud up to {far_m:g} m",
+        layers=[Layer(name="points", shape=cloud)],
+    )
+    return Answer(
+        is_ok=True,
+        said=_sentence(pair, found),
+        facts=_facts(pair, found, seconds, is_guess=is_guess),
+        pictures=pictures,
+        scene=scene,
+        files=read_files(folder),
+    )
+
+
+def _input(form: Form) -> tuple[StereoInput, bool]:
+    """Read the picture or pair; say whether its focal length is a guess."""
+    path = form.file("image")
+    width, height = image_size(path)
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path.name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
+            "that this page takes; scale it down, or use 'depthpose depth predict'"
+        )
+    has_right = "right" in form.files
+    focal_px, baseline_m = form.number("focal_px"), form.number("baseline_m")
+    if has_right and baseline_m is None and "camera" not in form.files:
+        raise InputError(
+            "baseline: a pair becomes metres by the distance of its two cameras; fill in the "
+            "baseline in metres (0.54 for KITTI), or choose a camera file that has it"
+        )
+    is_guess = focal_px is None and "camera" not in form.files
+    camera = form.camera(_keys(form, width, height))
+    right = read_image(form.file("right")) if has_right else None
+    pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
+    return pair, is_guess
+
+
+def _keys(form: Form, width: int, height: int) -> dict[str, object]:
+    """Give the camera file that the fields amount to."""
+    focal_px = form.number("focal_px")
+    focal_px = _PHONE * width if focal_px is None else focal_px
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    cx, cy = (
+        default if (typed := form.number(name)) is None else typed
+        for name, default in zip(("cx_px", "cy_px"), middle, strict=True)
+    )
+    K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
+    baseline_m = form.number("baseline_m")
+    doffs_px = None if baseline_m is None else form.number("cx_right_minus_left_px")
+    rig = {"baseline_m": baseline_m, "cx_right_minus_left_px": doffs_px}
+    return {"width": width, "height": height, "K": K, **rig}
+
+
+def _range_m(form: Form) -> tuple[float, float]:
+    near, far = form.number("near_m"), form.number("far_m")
+    near_m = COLOR_RANGE_M[0] if near is None else near
+    far_m = COLOR_RANGE_M[1] if far is None else far
+    if not 0 < near_m < far_m:
+        raise InputError(
+            f"the colours go from {near_m:g} m to {far_m:g} m; give a near end above 0, and a far "
+            "end beyond it"
+        )
+    return near_m, far_m
+
+
+def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
+    """A focal length that is too small makes the networks' picture as much larger."""
+    camera = pair.camera
+    assert camera is not None
+    focal_px = work_focal_px(net.matcher)
+    if pair.right is None and net.synthesiser is not None:
+        focal_px = net.synthesiser.generator.config.virtual_focal_px
+    if focal_px is None:
+        return
+    rows, columns = focal_size(camera, focal_px)
+    if rows * columns > _MOST_WORK_PIXELS:
+        raise InputError(
+            f"a focal length of {float(camera.K[0, 0]):g} px for {camera.width}x{camera.height} "
+            f"pixels would be brought to {columns}x{rows}, more than this page computes; is it in "
+            f"millimetres? A phone's is about {_PHONE} widths"
+        )
+
+
+def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, float]) -> list[Shown]:
+    name = pair.name
+    colors = "near bright and far dark, {:g} m to {:g} m by the logarithm, grey where invalid"
+    pictures = [
+        Shown(
+            file=f"{name}.color.png",
+            caption=f"depth: {colors.format(*range_m)}",
+            values=f"{name}.depth_m.npy",
+            unit="m",
+        )
+    ]
+    if found.right is not None:
+        pictures.append(Shown(file=f"{name}.right.png", caption="right view, as drawn"))
+    if found.confidence is not None:
+        pictures.append(
+            Shown(
+                file=f"{name}.confidence.png",
+                caption="confidence: bright is sure, dark a guess",
+                values=f"{name}.confidence.npy",
+            )
+        )
+    return pictures
+
+
+def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
+    assert found.depth_m is not None
+    median_m = float(found.depth_m.nanmedian())
+    sees = "one image" if pair.right is None else "both images"
+    return f"Depth from {sees}: half of the pixels are nearer than {median_m:.2f} m."
+
+
+def _facts(
+    pair: StereoInput, found: DepthEstimate, seconds: float, *, is_guess: bool
+) -> list[tuple[str, str]]:
+    camera, depth_m = pair.camera, found.depth_m
+    assert depth_m is not None
+    assert isinstance(camera, Camera)
+    known = depth_m[depth_m.isfinite()]
+    guess = " (guessed, 0.75 widths: metres are as wrong as it is)" if is_guess else ""
+    facts = [
+        ("size", f"{camera.width} x {camera.height} px"),
+        ("focal length", f"{float(camera.K[0, 0]):.1f} px{guess}"),
+    ]
+    if pair.right is not None and isinstance(camera, StereoRig):
+        facts.append(("baseline", f"{camera.baseline_m:g} m"))
+    facts.append(("pixels with depth", f"{len(known) / depth_m.numel():.1%}"))
+    if len(known):
+        facts.append(
+            ("nearest, farthest", f"{float(known.min()):.2f} m, {float(known.max()):.2f} m")
+        )
+    if found.confidence is not None:
+        facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
+    return [*facts, ("computed in", f"{seconds:.2f} s")]

@@ -1,0 +1,104 @@
+"""What comes in over HTTP: who asks, how much is sent, which files; and how errors go out."""
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from depthpose.core.errors import InputError
+from depthpose.web.form import Form, keep_file
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
+
+
+def refuse_stranger(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
+    """Refuse a request under another name than ours, or sent by another web page."""
+    host = request.headers.get("host", "")
+    name = _host_name(host)
+    if hosts is not None and name not in hosts:
+        return _sentence(
+            403, f"this page answers to {', '.join(hosts)}, not to {host!r}; start "
+            "'depthpose serve' with --host to name another"
+        )  # fmt: skip
+    origin = request.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != host:
+        return _sentence(403, f"the request comes from another page, {origin}; open this one")
+    return None
+
+
+def _host_name(host: str) -> str | None:
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:  # such as half of a bracket
+        return None
+
+
+def refuse_size(request: Request, most: int) -> None:
+    """Refuse what is too large before it is read; a server gives no more than was announced.
+
+    Raises:
+        HTTPException: no size, or too large a one.
+    """
+    text = request.headers.get("content-length", "")
+    if not text.isdecimal():
+        raise HTTPException(411, "the request does not say its size (Content-Length); add it")
+    if int(text) > most:
+        raise HTTPException(
+            413,
+            f"the files are {int(text) / 1e6:.1f} MB together, more than the {most / 1e6:.0f} MB "
+            "allowed; send smaller ones, or start 'depthpose serve' with a larger --max-upload-mb",
+        )
+
+
+async def read_form(request: Request, folder: Path) -> Form:
+    """Read the fields, and put the files into the folder.
+
+    Raises:
+        InputError: a file of a type that its field does not take.
+        HTTPException: more files or fields than the page has, or no form at all.
+    """
+    fields: dict[str, str] = {}
+    files: dict[str, Path] = {}
+    async with request.form(
+        max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
+    ) as form:
+        for name, value in form.multi_items():
+            if not isinstance(value, UploadFile):
+                fields[name] = value
+            elif name in files:
+                raise InputError(f"{name}: two files; choose one")
+            elif value.filename:
+                files[name] = keep_file(folder, name, value.filename, await value.read())
+    return Form(folder=folder, fields=fields, files=files)
+
+
+def zip_files(files: Mapping[str, bytes]) -> bytes:
+    """Put files into one ZIP, as they are: most are compressed already."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return packed.getvalue()
+
+
+async def say_error(_: Request, error: Exception) -> Response:
+    """Answer a refusal with its sentence."""
+    assert isinstance(error, HTTPException)
+    return _sentence(error.status_code, error.detail)
+
+
+async def say_crash(_: Request, error: Exception) -> Response:
+    """Answer a fault of ours; the trace is on the server's terminal."""
+    kind = type(error).__name__
+    return _sentence(500, f"depthpose failed ({kind}: {error}); the terminal says where")
+
+
+def _sentence(status: int, said: str) -> Response:
+    return JSONResponse({"error": said}, status_code=status)

@@ -1,0 +1,274 @@
+"""The tab Pose: what a depth sensor saw of a known object to its pose, or why there is none."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import back_project
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    Cloud,
+    image_size,
+    read_map,
+    write_cloud,
+    write_image,
+)
+from depthpose.core.rigid import Rigid
+from depthpose.core.scene import Layer, Scene
+from depthpose.pose.baselines import FpfhRegistration
+from depthpose.pose.cloud import object_points
+from depthpose.pose.config import Unit
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.mesh import read_model, sample_surface
+from depthpose.pose.overlay import (
+    draw_pose,
+    grey_depth,
+    keypoint_layers,
+    pose_layers,
+    posed_cloud,
+    vote_layer,
+)
+from depthpose.pose.predictions import Prediction, write_predictions
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.web.answer import Answer, Shown, read_files
+from depthpose.web.form import Form
+
+OWN_CAD = "cad"
+"""The choice of an object that stands for the CAD file."""
+_SAME = 0.02
+"""In diameters: a CAD file whose size and keypoints agree so well is the object of the weights."""
+_SURFACE = 20_000
+_SEEN = (0.55, 0.55, 0.55)
+_AROUND = (0.7, 0.66, 0.6)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Target:
+    """What is looked for, and how: by the network where ``registration`` is None."""
+
+    model: ObjectModel
+    how: str
+    registration: FpfhRegistration | None = None
+
+
+def has_registration() -> bool:
+    """Whether a CAD file that no weights know can be posed here: whether Open3D is installed."""
+    return find_spec("open3d") is not None
+
+
+def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
+    """Pose what a form asks for.
+
+    Raises:
+        InputError: a file that cannot be read, an object or a CAD file that nobody knows.
+    """
+    target = _target(form, net)
+    given = _input(form, target.model)
+    points_m = object_points(given, target.model.diameter_m)
+    if target.registration is None:
+        (found,) = net.estimate_many([given])
+    else:
+        cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
+        found = target.registration.estimate(cloud)
+    folder = form.results()
+    return Answer(
+        is_ok=found.is_ok,
+        said=_sentence(found, target.model),
+        facts=_facts(found, target),
+        tables=_tables(found),
+        pictures=_write(folder, given, points_m, found, target.model),
+        scene=_scene(given, points_m, found, target, net),
+        files=read_files(folder),
+    )
+
+
+def _write(
+    folder: Path,
+    given: CloudInput | ViewInput,
+    points_m: Float[Tensor, "n 3"],
+    found: PoseEstimate,
+    model: ObjectModel,
+) -> list[Shown]:
+    """Write ``poses.json``, the posed model beside the cloud, and the picture that is shown."""
+    pose = found.camera_from_model
+    write_predictions(folder, [Prediction(estimate=found)])
+    if pose is not None:
+        write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
+    if not isinstance(given, ViewInput):
+        return []
+    picture, caption = grey_depth(given.depth_m), "depth image, near bright"
+    if pose is not None:
+        picture = draw_pose(picture, pose, model, given.K.double())
+        caption += ", with the posed model"
+    write_image(folder / f"{given.name}.png", picture)
+    return [Shown(file=f"{given.name}.png", caption=caption)]
+
+
+def _target(form: Form, net: GeoPoseNet) -> _Target:
+    """Find the object that is meant among those of the weights, or in a CAD file."""
+    name, models = form.fields.get("object", ""), net.weights.models
+    if name != OWN_CAD:
+        known = [model for model in models if model.name == name]
+        if not known:
+            raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
+        return _Target(model=known[0], how="network, by the weights' own model")
+    model = read_model(form.file("cad"), _unit(form, "cad_unit"))
+    for own in models:
+        if _is_same(own, model):
+            return _Target(model=own, how=f"network; the CAD file is the weights' {own.name!r}")
+    if not has_registration():
+        raise InputError(
+            f"{form.file('cad').name}: the weights know {', '.join(net.objects)}, and this is none "
+            "of them (is its unit right?). A network learns a part from its CAD file alone: "
+            "depthpose pose train --cad FILE --unit mm --out my_part. Without training, "
+            "pip install 'depthpose[open3d]' poses any CAD file, less surely"
+        )
+    how = "Open3D's FPFH features, RANSAC and ICP: untrained, and it refuses nearly nothing"
+    return _Target(model=model, how=how, registration=FpfhRegistration(model))
+
+
+def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
+    """Whether a CAD file is the object that the weights know, in the same frame."""
+    if abs(model.diameter_m / own.diameter_m - 1) > _SAME:
+        return False
+    surface_m = torch.cat([model.vertices_m, sample_surface(model, _SURFACE)[0]])
+    off_m = torch.cdist(own.keypoints_m, surface_m).amin(1).max()
+    back_m = torch.cdist(sample_surface(model, 500)[0], sample_surface(own, _SURFACE)[0])
+    return max(float(off_m), float(back_m.amin(1).max())) < _SAME * own.diameter_m
+
+
+def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
+    if "cloud" in form.files:
+        if "depth" in form.files or "mask" in form.files:
+            raise InputError("a cloud and a depth image are both given; choose one of the two")
+        path = form.file("cloud")
+        return cloud_input(path, _unit(form, "cloud_unit"), model.name, path.stem)
+    depth, mask = form.file("depth"), form.file("mask")
+    camera = form.camera(_keys(form)) if "camera" not in form.files else form.camera({})
+    return view_input(depth, mask, camera, model.name, depth.stem)
+
+
+def _keys(form: Form) -> dict[str, Any]:
+    """Give the camera file that the fields amount to."""
+    focal_px = form.number("focal_px")
+    if focal_px is None:
+        raise InputError(
+            "focal length: a depth image becomes points by it, and a wrong one changes the size of "
+            "what is seen; fill in the depth sensor's (its driver says it), or choose a camera file"
+        )
+    path = form.file("depth")
+    if path.suffix.lower() == ".png":
+        width, height = image_size(path)
+    else:
+        height, width = read_map(path).shape
+    cx, cy = form.number("cx_px"), form.number("cy_px")
+    cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
+    K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
+    unit_m = form.number("depth_unit_m")
+    return {"width": width, "height": height, "K": K, "depth_unit_m": unit_m}
+
+
+def _unit(form: Form, field: str) -> Unit:
+    unit = form.fields.get(field, "")
+    if unit not in ("m", "mm"):
+        raise InputError(f"{field} is {unit!r}; choose m or mm")
+    return cast(Unit, unit)
+
+
+def _sentence(found: PoseEstimate, model: ObjectModel) -> str:
+    if found.camera_from_model is None:
+        return f"Refused ({found.status}): {found.reason}."
+    x, y, z = found.camera_from_model.t_m.tolist()
+    return f"The {model.name} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+
+
+def _facts(found: PoseEstimate, target: _Target) -> list[tuple[str, str]]:
+    facts = [
+        ("object", f"{found.object}, {target.model.diameter_m:.4f} m long"),
+        ("by", target.how),
+    ]
+    if found.risk is not None:
+        facts.append(("risk of being wrong", f"{found.risk:.3f}"))
+    if found.inlier_share is not None:
+        is_network = target.registration is None
+        what = "votes that agree" if is_network else "points near the model"
+        facts.append((what, f"{found.inlier_share:.0%}"))
+    if found.residual_m is not None and math.isfinite(found.residual_m):
+        facts.append(("distance left (RMS)", f"{1000 * found.residual_m:.2f} mm"))
+    if found.free_motions is not None and len(found.free_motions):
+        free = f"{len(found.free_motions)} (a declared symmetry; the covariance leaves them out)"
+        facts.append(("free motions", free))
+    stages = ", ".join(f"{name} {1000 * s:.0f}" for name, s in found.seconds.items())
+    return [*facts, ("ms", stages)]
+
+
+def _tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
+    """Show the pose, and how far it may be off along each axis."""
+    tables: dict[str, Sequence[Sequence[str]]] = {}
+    pose = found.camera_from_model
+    if pose is not None:
+        rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
+        tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
+    if pose is not None and found.covariance is not None:
+        turn_deg, origin_mm = spreads(pose, found.covariance)
+        tables["standard deviations along the camera's axes"] = [
+            ["", "x", "y", "z"],
+            ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
+            ["place of the model's origin [mm]", *(f"{v:.3f}" for v in origin_mm)],
+        ]
+        tables["covariance of rotation vector [rad] and translation [m], as poses.json has it"] = [
+            [f"{v:.2e}" for v in row] for row in found.covariance.tolist()
+        ]
+    return tables
+
+
+def spreads(pose: Rigid, covariance: Float[Tensor, "6 6"]) -> tuple[list[float], list[float]]:
+    """Give the standard deviations of the rotation [deg] and of the model's origin [mm].
+
+    The perturbation is a left one: a rotation about the camera moves an origin at t by
+    ``rotation x t``, beside the translation.
+    """
+    t, spread = pose.t_m.double(), covariance.double()
+    turned = torch.linalg.cross(torch.eye(3, dtype=torch.float64), t.expand(3, 3)).mT
+    by = torch.cat([turned, torch.eye(3, dtype=torch.float64)], 1)
+    origin = (by @ spread @ by.mT).diagonal().clamp(min=0).sqrt() * 1000
+    turn = spread.diagonal()[:3].clamp(min=0).sqrt() * 180 / math.pi
+    return turn.tolist(), origin.tolist()
+
+
+def _scene(
+    given: CloudInput | ViewInput,
+    points_m: Float[Tensor, "n 3"],
+    found: PoseEstimate,
+    target: _Target,
+    net: GeoPoseNet,
+) -> Scene:
+    """Show what was seen, the votes and the posed model."""
+    layers = [Layer(name="the object, as seen", shape=_colored(points_m, _SEEN))]
+    pose, model = found.camera_from_model, target.model
+    if pose is not None:
+        layers += pose_layers(pose, model)
+    if found.keypoints_m is not None:
+        layers += keypoint_layers(found.keypoints_m, pose, model)
+        voted = net.votes_of(given) if target.registration is None else None
+        if voted is not None:
+            directions = voted.outputs[..., :3]
+            layers.append(vote_layer(voted.cloud.points_m, directions, found.keypoints_m))
+    if isinstance(given, ViewInput):
+        around_m = back_project(given.depth_m, given.K)[~given.mask]
+        around_m = around_m[around_m.isfinite().all(-1)].float()
+        layers.append(Layer(name="all else", shape=_colored(around_m, _AROUND), is_shown=False))
+    caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
+    return Scene(caption=caption, layers=layers)
+
+
+def _colored(points_m: Float[Tensor, "n 3"], color: tuple[float, float, float]) -> Cloud:
+    return Cloud(points=points_m, color=torch.tensor(color).expand(len(points_m), 3))

@@ -1,0 +1,44 @@
+"""The process that answers: a socket of this machine, and uvicorn on it."""
+
+import socket
+
+import uvicorn
+from starlette.applications import Starlette
+
+from depthpose.core.errors import InputError
+
+_CONNECTIONS = 40
+_LEAVE_S = 2
+"""Seconds that open connections have to finish after Ctrl+C."""
+
+
+def open_socket(host: str, port: int) -> socket.socket:
+    """Take a port before anything heavy is loaded; port 0 takes a free one.
+
+    Raises:
+        InputError: there is no such address here, or the port is in use.
+    """
+    if not 0 <= port < 2**16:
+        raise InputError(f"port {port}: there are 0 (any that is free) to 65535; 8000 is usual")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        # It listens at once: a browser that comes while weights are loaded waits.
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise InputError(
+            f"{host}:{port} cannot be used: {error}; choose another --port (0: any that is free) "
+            "or --host (127.0.0.1: this machine alone)"
+        ) from error
+
+
+def run(app: Starlette, taken: socket.socket) -> None:
+    """Answer until the process is told to stop; nothing is logged but errors."""
+    config = uvicorn.Config(
+        app,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=_CONNECTIONS,
+        timeout_graceful_shutdown=_LEAVE_S,
+    )
+    uvicorn.Server(config).run(sockets=[taken])

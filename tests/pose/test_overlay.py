@@ -1,0 +1,85 @@
+"""What a 3D view shows of a pose."""
+
+import torch
+from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
+
+from depthpose.core.files import Cloud
+from depthpose.core.scene import Lines
+from depthpose.pose.mesh import make_model
+from depthpose.pose.overlay import bent_edges, keypoint_layers, pose_layers, vote_layer
+from depthpose.pose.types import CloudInput, ObjectModel
+
+
+def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
+    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    every = torch.tensor([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])[:faces]
+    if with_repeats:  # as STL has them
+        return make_model(corners[every].flatten(0, 1), torch.arange(36).view(12, 3), name="cube")
+    return make_model(corners, every, name="cube")
+
+
+def lengths(ends_m: torch.Tensor) -> list[float]:
+    return (ends_m[:, 0] - ends_m[:, 1]).norm(dim=-1).tolist()
+
+
+def test_the_edges_of_a_cube_are_twelve_and_no_diagonal() -> None:
+    for model in (cube(), cube(with_repeats=True)):
+        assert lengths(bent_edges(model)) == [1.0] * 12
+
+
+def test_an_open_sheet_shows_its_border() -> None:
+    assert lengths(bent_edges(cube(faces=2))) == [1.0] * 4
+
+
+def test_a_posed_model_lies_where_its_pose_says() -> None:
+    pose, model = pose_at(), bracket()
+    layers = {layer.name: layer.shape for layer in pose_layers(pose, model)}
+    surface, box = layers["posed model"], layers["its box"]
+    assert isinstance(surface, Cloud)
+    assert isinstance(box, Lines)
+    back_m = pose.inverse().apply(surface.points)
+    low_m, high_m = model.vertices_m.amin(0), model.vertices_m.amax(0)
+    assert (back_m > low_m - 1e-6).all()
+    assert (back_m < high_m + 1e-6).all()
+    corners_m = pose.inverse().apply(box.ends_m.flatten(0, 1))
+    torch.testing.assert_close(corners_m.amin(0), low_m)
+    torch.testing.assert_close(corners_m.amax(0), high_m)
+    (true,) = pose_layers(pose, model, is_true=True)
+    assert isinstance(true.shape, Lines)
+    assert torch.equal(true.shape.ends_m, box.ends_m)
+
+
+def test_a_model_of_points_has_no_edges() -> None:
+    model = make_model(torch.rand(50, 3), torch.empty(0, 3, dtype=torch.long), name="points")
+    assert "its edges" not in [layer.name for layer in pose_layers(pose_at(), model)]
+
+
+def test_true_votes_end_at_their_keypoints() -> None:
+    pose, model = pose_at(), bracket()
+    net = Oracle(tiny_weights(model), [pose])
+    given = CloudInput(name="c", points_m=cloud_of(model, pose), object=model.name)
+    voted = net.votes_of(given)
+    assert voted is not None
+    keypoints_m = pose.apply(model.keypoints_m)
+    layer = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], keypoints_m)
+    assert isinstance(layer.shape, Lines)
+    assert not layer.is_shown
+    tips_m = layer.shape.ends_m[:, 1].unflatten(0, (-1, 8))
+    torch.testing.assert_close(tips_m, keypoints_m.expand_as(tips_m), atol=1e-5, rtol=0.0)
+
+
+def test_what_cannot_be_posed_casts_no_votes() -> None:
+    model = bracket()
+    net = Oracle(tiny_weights(model), [pose_at()])
+    empty = CloudInput(name="c", points_m=torch.empty(0, 3), object=model.name)
+    assert net.votes_of(empty) is None
+
+
+def test_a_refused_pose_still_shows_what_was_voted() -> None:
+    model = bracket()
+    (voted,) = keypoint_layers(model.keypoints_m, None, model)
+    assert isinstance(voted.shape, Lines)
+    middles_m = voted.shape.ends_m.mean(1).unflatten(0, (-1, 3))
+    torch.testing.assert_close(middles_m, model.keypoints_m[:, None].expand_as(middles_m))
+    assert len(keypoint_layers(model.keypoints_m, pose_at(), model)) == 2

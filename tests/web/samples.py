@@ -1,0 +1,44 @@
+"""What the tests of the page upload: a made street and a made part, small ones of the demo's."""
+
+from pathlib import Path
+
+from depthpose.core.camera import Camera, write_camera
+from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.rigid import Rigid
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.streets import Streets
+from depthpose.pose.bop.write import write_mask
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.objects import Objects, make_part, write_part
+
+PART = "flange"
+
+
+def write_street(folder: Path, scale: float = 0.25) -> Path:
+    """Write ``left.png``, ``right.png`` and ``camera.json``."""
+    pair = Streets(StreetsConfig(seed=9, scale=scale))[1].input
+    assert pair.right is not None
+    assert pair.camera is not None
+    write_image(folder / "left.png", pair.left)
+    write_image(folder / "right.png", pair.right)
+    write_camera(folder / "camera.json", pair.camera)
+    return folder
+
+
+def write_view(folder: Path) -> Rigid:
+    """Write ``depth.png``, ``mask.png``, ``view.json``, ``cloud.ply`` and STLs; give the pose."""
+    config = ObjectsConfig(number=1, occluded_share=0.0, views=None)
+    sample = Objects((make_part(PART),), config).view(0)
+    view = sample.input
+    height, width = view.mask.shape
+    K = view.K.double()
+    camera = Camera(width=width, height=height, K=K, depth_unit_m=0.0001)
+    write_camera(folder / "view.json", camera)
+    write_depth_png(folder / "depth.png", view.depth_m, 0.0001)
+    write_mask(folder / "mask.png", view.mask)
+    points_m = cloud_from_depth(view.depth_m, view.mask, K).float()
+    write_cloud(folder / "cloud.ply", Cloud(points=1000 * points_m))
+    write_part(PART, folder)
+    write_part("mug", folder)
+    return sample.truth.camera_from_model

@@ -1,0 +1,364 @@
+"""The page without a browser: what it answers, what it refuses, what it leaves behind."""
+
+import io
+import json
+import math
+import tempfile
+import threading
+import zipfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from httpx2 import Response
+from starlette.testclient import TestClient
+from tests.web.samples import PART, write_street, write_view
+
+from depthpose.core.rigid import Rigid
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.stereo import CallableMatcher
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.metrics import adds_m
+from depthpose.pose.objects import make_part
+from depthpose.web import Limits, make_app
+from depthpose.web import pose as pose_tab
+
+URL = "http://127.0.0.1:8000"
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_street(tmp_path_factory.mktemp("samples"))
+
+
+@pytest.fixture(scope="module")
+def truth(samples: Path) -> Rigid:
+    return write_view(samples)
+
+
+@pytest.fixture(scope="module")
+def nets() -> tuple[FakestereoNet, GeoPoseNet]:
+    return FakestereoNet.load("default"), GeoPoseNet.load("parts")
+
+
+@pytest.fixture(scope="module")
+def page(nets: tuple[FakestereoNet, GeoPoseNet]) -> Iterator[TestClient]:
+    with TestClient(make_app(*nets), base_url=URL) as client:
+        yield client
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Whatever a test does, nothing may be left where temporary files go."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield folder
+    assert not list(folder.iterdir())
+
+
+def ask(
+    client: TestClient, room: str, folder: Path, names: dict[str, str], **data: str
+) -> Response:
+    files = {field: (name, (folder / name).read_bytes()) for field, name in names.items()}
+    return client.post(f"/estimate/{room}", files=files, data=data)
+
+
+def refusal(response: Response) -> tuple[int, str]:
+    return response.status_code, response.json()["error"]
+
+
+VIEW = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
+
+
+def test_the_page_loads_nothing_from_elsewhere(page: TestClient) -> None:
+    response = page.get("/")
+    texts = [response.text]
+    texts += [page.get(f"/assets/{name}").text for name in ("page.css", "viewer.js", "web.js")]
+    assert all("://" not in text for text in texts)
+    assert "default-src 'none'" in response.headers["content-security-policy"]
+    for name in GeoPoseNet.load("parts").objects:
+        assert f"<option>{name}</option>" in texts[0]
+
+
+def test_one_image_becomes_the_depth_that_python_gives(
+    page: TestClient, samples: Path, nets: tuple[FakestereoNet, GeoPoseNet]
+) -> None:
+    found = ask(page, "depth", samples, {"image": "left.png", "camera": "camera.json"}).json()
+    assert found["ok"]
+    names = [file["name"] for file in found["files"]]
+    assert {"left.depth_m.npy", "left.right.png", "left.confidence.png", "left.ply"} <= set(names)
+    assert found["scene"]["layers"][0]["count"] > 1000
+    data = page.get("/" + found["folder"] + "left.depth_m.npy").content
+    expected = nets[0].estimate(samples / "left.png", samples / "camera.json").depth_m
+    assert expected is not None
+    assert np.array_equal(np.load(io.BytesIO(data)), expected.numpy(), equal_nan=True)
+    whole = zipfile.ZipFile(io.BytesIO(page.get("/" + found["folder"] + "all.zip").content))
+    assert whole.namelist() == names
+    assert whole.read("left.depth_m.npy") == data
+
+
+def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> None:
+    fields = {"focal_px": "180.5", "cx_px": "150.25", "cy_px": "44.5"}
+    camera = json.loads((samples / "camera.json").read_text())
+    camera["K"] = [[180.5, 0, 150.25], [0, 180.5, 44.5], [0, 0, 1]]
+    (samples / "square.json").write_text(json.dumps(camera))
+    by_file = ask(page, "depth", samples, {"image": "left.png", "camera": "square.json"}).json()
+    by_fields = ask(page, "depth", samples, {"image": "left.png"}, **fields).json()
+    ways = [page.get("/" + a["folder"] + "left.ply").content for a in (by_file, by_fields)]
+    assert ways[0] == ways[1]
+
+
+def test_a_guessed_focal_length_is_called_a_guess(page: TestClient, samples: Path) -> None:
+    facts = dict(ask(page, "depth", samples, {"image": "left.png"}).json()["facts"])
+    assert "guessed" in facts["focal length"]
+
+
+PAIR = {"image": "left.png", "right": "right.png"}
+
+
+@pytest.mark.parametrize(
+    ("files", "data", "said"),
+    [
+        ({"right": "right.png"}, {}, "image: no file; choose a picture"),
+        (PAIR, {}, "fill in the baseline in metres"),
+        (PAIR, {"baseline_m": "120"}, "looks like millimetres; divide by 1000"),
+        ({"image": "camera.json"}, {}, "'camera.json' is not a picture"),
+        ({"image": "left.png", "camera": "left.png"}, {}, "is not a camera file"),
+        ({"image": "left.png"}, {"focal_px": "wide"}, "focal_px is 'wide'; write a number"),
+        ({"image": "left.png"}, {"focal_px": "4.2"}, "it looks like millimetres"),
+        ({"image": "left.png"}, {"near_m": "9", "far_m": "3"}, "the colours go from 9 m to 3 m"),
+    ],
+)
+def test_depth_refuses_with_a_remedy(
+    page: TestClient, samples: Path, files: dict[str, str], data: dict[str, str], said: str
+) -> None:
+    status, text = refusal(ask(page, "depth", samples, files, **data))
+    assert status == 400
+    assert said in text
+    assert tempfile.gettempdir() not in text
+
+
+def test_a_focal_length_that_asks_for_a_huge_picture_is_refused(
+    page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("depthpose.web.depth._MOST_WORK_PIXELS", 1000)
+    status, text = refusal(ask(page, "depth", samples, {"image": "left.png"}))
+    assert (status, "more than this page computes" in text) == (400, True)
+
+
+def test_a_picture_of_too_many_pixels_is_refused(
+    page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("depthpose.web.depth.MOST_PIXELS", 1000)
+    assert "scale it down" in refusal(ask(page, "depth", samples, {"image": "left.png"}))[1]
+
+
+def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
+    assert found["ok"], found["said"]
+    (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
+    T = torch.tensor(row["camera_from_model"])
+    model = make_part(PART)
+    off_m = adds_m(Rigid(T[:3, :3], T[:3, 3]), truth, model.vertices_m)
+    assert float(off_m) < model.diameter_m / 20
+    assert row["name"] == name
+    layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
+    assert layers["the object, as seen"]["count"] > 100
+    assert layers["posed model"]["count"] > 1000
+    assert layers["votes"]["count"] > 100
+    assert len(found["tables"]) == 3
+
+
+def test_a_depth_image_is_posed(page: TestClient, samples: Path, truth: Rigid) -> None:
+    found = ask(page, "pose", samples, VIEW, object=PART).json()
+    assert_posed(page, found, truth, "depth")
+    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
+
+
+def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(
+    page: TestClient, samples: Path, truth: Rigid
+) -> None:
+    files = {"cloud": "cloud.ply", "cad": f"{PART}.stl"}
+    data = {"cloud_unit": "mm", "object": "cad", "cad_unit": "mm"}
+    found = ask(page, "pose", samples, files, **data).json()
+    assert_posed(page, found, truth, "cloud")
+    assert dict(found["facts"])["by"] == f"network; the CAD file is the weights' '{PART}'"
+
+
+def test_a_turn_about_the_camera_moves_an_origin_that_is_far_from_it() -> None:
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+    covariance = torch.zeros(6, 6)
+    covariance[1, 1] = 0.01**2  # about y: two metres ahead, sideways by 20 mm
+    turn_deg, origin_mm = pose_tab.spreads(pose, covariance)
+    assert turn_deg == pytest.approx([0.0, math.degrees(0.01), 0.0], rel=1e-5)
+    assert origin_mm == pytest.approx([20.0, 0.0, 0.0], rel=1e-5)
+    # A translation that takes the turn back leaves the origin where it is.
+    covariance[3, 3], covariance[1, 3], covariance[3, 1] = 0.02**2, -0.0002, -0.0002
+    assert pose_tab.spreads(pose, covariance)[1] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+
+
+def test_another_object_is_refused_in_words(page: TestClient, samples: Path, truth: Rigid) -> None:
+    found = ask(page, "pose", samples, VIEW, object="spool").json()
+    assert not found["ok"]
+    assert found["said"].startswith("Refused (")
+    assert found["tables"] == {}
+    assert "posed model" not in [layer["name"] for layer in found["scene"]["layers"]]
+
+
+@pytest.mark.parametrize(
+    ("files", "data", "said"),
+    [
+        ({"depth": "depth.png"}, {"object": PART}, "mask: no file; choose a mask"),
+        ({"depth": "depth.png", "mask": "mask.png"}, {"object": PART}, "focal length: a depth"),
+        (VIEW | {"mask": "left.png"}, {"object": PART}, "give the mask of this very image"),
+        (VIEW, {"object": "teapot"}, "object 'teapot': the weights know"),
+        (VIEW | {"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "mm"}, "choose one of"),
+        ({"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "feet"}, "choose m or mm"),
+        (VIEW, {"object": "cad", "cad_unit": "mm"}, "cad: no file; choose a model file"),
+    ],
+)
+def test_pose_refuses_with_a_remedy(
+    page: TestClient,
+    samples: Path,
+    truth: Rigid,
+    files: dict[str, str],
+    data: dict[str, str],
+    said: str,
+) -> None:
+    status, text = refusal(ask(page, "pose", samples, files, **data))
+    assert status == 400
+    assert said in text
+
+
+def test_an_unknown_cad_file_is_refused_where_open3d_is_missing(
+    samples: Path, truth: Rigid, monkeypatch: pytest.MonkeyPatch, page: TestClient
+) -> None:
+    monkeypatch.setattr(pose_tab, "has_registration", lambda: False)
+    (samples / "wide.obj").write_text(
+        "v 0 0 0\nv 0.3 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    files = VIEW | {"cad": "wide.obj"}
+    status, text = refusal(ask(page, "pose", samples, files, object="cad", cad_unit="m"))
+    assert status == 400
+    assert "wide.obj: the weights know" in text
+    assert "depthpose pose train --cad" in text
+    assert "pip install 'depthpose[open3d]'" in text
+
+
+@pytest.mark.skipif(find_spec("open3d") is None, reason="Open3D is not installed")
+def test_open3d_poses_a_cad_file_that_no_weights_know(
+    nets: tuple[FakestereoNet, GeoPoseNet],
+    samples: Path,
+    truth: Rigid,
+    monkeypatch: pytest.MonkeyPatch,
+    page: TestClient,
+) -> None:
+    monkeypatch.setattr(pose_tab, "_is_same", lambda *_: False)
+    files = VIEW | {"cad": f"{PART}.stl"}
+    found = ask(page, "pose", samples, files, object="cad", cad_unit="mm").json()
+    assert dict(found["facts"])["by"].startswith("Open3D")
+    assert found["ok"], found["said"]
+    assert list(found["tables"]) == ["camera_from_model: R | t [m]"], "it has no covariance"
+
+
+def test_what_is_too_large_is_refused_before_it_is_read(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path
+) -> None:
+    client = TestClient(make_app(*nets, Limits(upload_bytes=10_000)), base_url=URL)
+    status, text = refusal(ask(client, "depth", samples, {"image": "left.png"}))
+    assert status == 413
+    assert "more than the 0 MB allowed" in text
+    assert "--max-upload-mb" in text
+
+
+def test_a_request_without_a_size_is_refused(page: TestClient) -> None:
+    response = page.post("/estimate/depth", content=iter([b"data"]))
+    assert refusal(response) == (
+        411, "the request does not say its size (Content-Length); add it"
+    )  # fmt: skip
+
+
+def test_strangers_are_refused(page: TestClient) -> None:
+    status, text = refusal(page.get("/", headers={"host": "evil.example"}))
+    assert (status, "not to 'evil.example'" in text) == (403, True)
+    assert refusal(page.get("/", headers={"host": "[::1"}))[0] == 403
+    assert refusal(page.post("/estimate/depth", headers={"origin": "null"}))[0] == 403
+    status, text = refusal(page.post("/estimate/depth", headers={"origin": "http://evil.example"}))
+    assert (status, "comes from another page" in text) == (403, True)
+    assert page.get("/", headers={"origin": URL}).status_code == 200
+
+
+def test_a_page_that_is_open_to_all_answers_to_any_name(
+    nets: tuple[FakestereoNet, GeoPoseNet],
+) -> None:
+    client = TestClient(make_app(*nets, Limits(hosts=None)), base_url="http://robot.local:8000")
+    assert client.get("/").status_code == 200
+
+
+def test_only_the_last_answers_are_kept(page: TestClient, samples: Path, truth: Rigid) -> None:
+    first, *_, last = [
+        ask(page, "pose", samples, {"cloud": "cloud.ply"}, object=PART, cloud_unit="m").json()
+        for _ in range(4)
+    ]
+    assert refusal(page.get("/" + first["folder"] + "poses.json"))[0] == 404
+    assert page.get("/" + last["folder"] + "poses.json").status_code == 200
+    assert refusal(page.get("/" + last["folder"] + "..%2Fother"))[0] == 404
+
+
+def test_unknown_rooms_and_fields_are_refused(page: TestClient, samples: Path) -> None:
+    assert refusal(ask(page, "sound", samples, {}, a="b"))[0] == 404
+    said = refusal(ask(page, "depth", samples, {"weights": "left.png"}))[1]
+    assert "'weights' is no file field of this page" in said
+
+
+class Slow:
+    """A matcher that waits for a word, and knows how many are at work."""
+
+    def __init__(self) -> None:
+        self.goes_on, self.began = threading.Event(), threading.Event()
+        self.active, self.most = 0, 0
+
+    def __call__(self, left: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        self.active += 1
+        self.most = max(self.most, self.active)
+        self.began.set()
+        assert self.goes_on.wait(60)
+        self.active -= 1
+        return torch.full(left.shape[1:], 8.0)
+
+
+@pytest.mark.parametrize(("waiting", "statuses"), [(0, [200, 503]), (1, [200, 200])])
+def test_one_computation_at_a_time(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, waiting: int, statuses: list[int]
+) -> None:
+    slow = Slow()
+    app = make_app(FakestereoNet(CallableMatcher(slow)), nets[1], Limits(waiting=waiting))
+    files = {**PAIR, "camera": "camera.json"}
+    with TestClient(app, base_url=URL) as client, ThreadPoolExecutor(2) as pool:
+        first = pool.submit(ask, client, "depth", samples, files)
+        assert slow.began.wait(60)
+        second = pool.submit(ask, client, "depth", samples, files)
+        if waiting == 0:
+            assert "try again later" in refusal(second.result(60))[1]
+        slow.goes_on.set()
+        found = [first.result(60).status_code, second.result(60).status_code]
+    assert found == statuses
+    assert slow.most == 1
+
+
+def test_a_fault_of_ours_is_said_and_leaves_nothing(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path
+) -> None:
+    def broken(*_: torch.Tensor) -> torch.Tensor:
+        raise RuntimeError("no memory")
+
+    app = make_app(FakestereoNet(CallableMatcher(broken)), nets[1])
+    client = TestClient(app, base_url=URL, raise_server_exceptions=False)
+    status, text = refusal(ask(client, "depth", samples, {**PAIR, "camera": "camera.json"}))
+    assert status == 500
+    assert "RuntimeError: no memory" in text

@@ -1,0 +1,205 @@
+"""The page and the demo's report in Debian's Chromium: upload, wait, look, take away."""
+
+import io
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from playwright.sync_api import Browser, Page, sync_playwright
+from tests.web.samples import PART, write_street, write_view
+
+from depthpose.core.files import Cloud
+from depthpose.core.report import Section, write_page
+from depthpose.core.scene import Layer, Scene, colored_lines
+
+pytestmark = pytest.mark.slow
+
+CHROMIUM = shutil.which("chromium")
+# Software rendering: a machine that tests has no graphics card.
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PATIENCE_MS = 300_000
+"""A busy machine is slow, not wrong."""
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_street(tmp_path_factory.mktemp("samples"))
+    write_view(folder)
+    (folder / "words.txt").write_text("no picture")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Where ``depthpose serve`` answers."""
+    command = [sys.executable, "-m", "depthpose", "serve", "--port", "0", "--max-upload-mb", "8"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        found = re.match(r"(http://127\.0\.0\.1:\d+/) ", server.stdout.readline())
+        assert found is not None
+        yield found[1]
+        server.terminate()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on PATH: apt-get install chromium")
+    with sync_playwright() as play:
+        found = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """A page that fails its test by any error in its scripts, or by asking another server."""
+    context = browser.new_context(accept_downloads=True)
+    made = context.new_page()
+    made.set_default_timeout(PATIENCE_MS)
+    wrong: list[str] = []
+    made.on("pageerror", lambda error: wrong.append(str(error)))
+    asked: list[str] = []
+    made.on("request", lambda request: asked.append(request.url))
+    yield made
+    context.close()
+    assert not wrong
+    assert not [url for url in asked if not url.startswith(("http://127.0.0.1:", "file:", "data:"))]
+
+
+def drawn_share(page: Page, within: str) -> float:
+    """Give the share of the 3D view's pixels that something was drawn on."""
+    return page.locator(f"{within} .scene canvas").evaluate(
+        """canvas => {
+          const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+          let drawn = 0;
+          for (let i = 3; i < data.length; i += 4) drawn += data[i] > 0;
+          return drawn / (data.length / 4);
+        }"""
+    )
+
+
+def picture_of(page: Page, within: str) -> bytes:
+    return page.locator(f"{within} .scene canvas").screenshot()
+
+
+def take(page: Page, within: str, name: str) -> bytes:
+    with page.expect_download() as waiting:
+        page.locator(f"{within} .downloads a[download='{name}']").click()
+    return Path(waiting.value.path()).read_bytes()
+
+
+def send(page: Page, room: str, files: dict[str, Path]) -> str:
+    """Choose files, press the button, and give the sentence that comes back."""
+    for field, path in files.items():
+        page.locator(f"#{room} input[name={field}]").set_input_files(path)
+    page.locator(f"#{room} .go").click()
+    page.locator(f"#{room} .answer .said").wait_for()
+    return page.locator(f"#{room} .said").text_content() or ""
+
+
+def test_depth_good(page: Page, address: str, samples: Path) -> None:
+    page.goto(address)
+    files = {"image": samples / "left.png", "camera": samples / "camera.json"}
+    assert "half of the pixels are nearer than" in send(page, "depth", files)
+    assert 0.05 < drawn_share(page, "#depth") < 1
+    pictures = page.locator("#depth .pictures img")
+    assert pictures.count() == 3
+    for k in range(3):
+        assert pictures.nth(k).evaluate("image => image.decode().then(() => image.naturalWidth)")
+    depth_m = np.load(io.BytesIO(take(page, "#depth", "left.depth_m.npy")))
+    # The number under the pointer is the one in the file.
+    box = pictures.first.bounding_box()
+    assert box is not None
+    pictures.first.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
+    page.locator("#depth .read", has_text="At (").wait_for()
+    said = page.locator("#depth .read").first.text_content() or ""
+    found = re.search(r"At \((\d+), (\d+)\): ([\d.]+) m", said)
+    assert found is not None
+    u, v, shown_m = int(found[1]), int(found[2]), float(found[3])
+    assert shown_m == pytest.approx(float(depth_m[v, u]), abs=0.006)
+    before = picture_of(page, "#depth")
+    page.locator("#depth canvas").press("ArrowLeft")
+    page.wait_for_timeout(1000)
+    assert picture_of(page, "#depth") != before, "the cloud turns"
+
+
+def test_depth_bad(page: Page, address: str, samples: Path) -> None:
+    page.goto(address)
+    said = send(page, "depth", {"image": samples / "words.txt"})
+    assert "'words.txt' is not a picture; this field takes .png" in said
+    page.reload()
+    pair = {"image": samples / "left.png", "right": samples / "right.png"}
+    assert "fill in the baseline in metres" in send(page, "depth", pair)
+    assert page.locator("#depth .scene").count() == 0
+
+
+def test_pose_good(page: Page, address: str, samples: Path) -> None:
+    page.goto(f"{address}#pose")
+    assert not page.locator("#depth").is_visible()
+    page.locator("#pose select[name=object]").select_option(PART)
+    view = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
+    said = send(page, "pose", {field: samples / name for field, name in view.items()})
+    assert said.startswith(f"The {PART} is at x ")
+    assert drawn_share(page, "#pose") > 0.02
+    votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^ votes$"))
+    before = picture_of(page, "#pose")
+    votes.locator("input").check()
+    page.wait_for_timeout(1000)
+    assert picture_of(page, "#pose") != before, "the votes are drawn"
+    assert page.locator("#pose .table").count() == 3
+    (row,) = json.loads(take(page, "#pose", "poses.json"))
+    assert row["status"] == "ok"
+    assert take(page, "#pose", "all.zip").startswith(b"PK")
+
+
+def test_pose_bad(page: Page, address: str, samples: Path) -> None:
+    page.goto(f"{address}#pose")
+    said = send(page, "pose", {"depth": samples / "depth.png"})
+    assert "mask: no file; choose a mask" in said
+    page.reload()
+    page.locator("#pose select[name=object]").select_option("spool")
+    view = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
+    said = send(page, "pose", {field: samples / name for field, name in view.items()})
+    assert said.startswith("Refused (")
+    assert page.locator("#pose .said.refused").is_visible()
+
+
+def test_a_report_turns_hides_sorts_and_needs_no_server(page: Page, tmp_path: Path) -> None:
+    cloud = Cloud(points=torch.rand(5000, 3) + torch.tensor([0.0, 0.0, 2.0]))
+    box = colored_lines(torch.tensor([[[0.0, 0, 2], [1, 1, 3]]]), (1.0, 0.0, 0.0))
+    scene = Scene(
+        caption="c", layers=[Layer(name="cloud", shape=cloud), Layer(name="box", shape=box)]
+    )
+    rows = [{"name": n, "x": x} for n, x in (("b", 10.0), ("a", 9.0), ("c", None))]
+    write_page(tmp_path / "r.html", "T", [Section(title="S", rows=rows, scenes=[scene])], {})
+    page.goto((tmp_path / "r.html").as_uri())
+    page.locator(".scene canvas").wait_for()
+    page.wait_for_timeout(1000)
+    whole = drawn_share(page, "body")
+    assert whole > 0.05
+    page.locator(".keys label", has_text="cloud").locator("input").uncheck()
+    page.wait_for_timeout(1000)
+    assert 0 < drawn_share(page, "body") < whole / 2, "the box alone"
+    for click, order in enumerate((["a", "b", "c"], ["b", "a", "c"])):
+        page.locator("th", has_text="x").click()
+        assert page.locator("td:first-child").all_text_contents() == order, click
+
+
+def test_without_webgl_there_is_a_sentence(page: Page, tmp_path: Path) -> None:
+    page.add_init_script("""const real = HTMLCanvasElement.prototype.getContext;
+      HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+        return kind === "webgl" ? null : real.call(this, kind, ...rest);
+      };""")
+    scene = Scene(caption="c", layers=[Layer(name="cloud", shape=Cloud(points=torch.zeros(2, 3)))])
+    write_page(tmp_path / "r.html", "T", [Section(title="S", scenes=[scene])], {})
+    page.goto((tmp_path / "r.html").as_uri())
+    page.locator(".lacking").wait_for()
+    assert "shows no WebGL" in (page.locator(".lacking").text_content() or "")
