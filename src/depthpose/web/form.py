@@ -17,7 +17,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "right": ("a picture", IMAGES),
     "depth": ("a depth image", (".png", ".npy", ".pfm")),
     "mask": ("a mask", (".png", ".jpg", ".jpeg", ".bmp")),
-    "camera": ("a camera file", (".json",)),
+    "camera": ("a camera file", (".json", ".yaml", ".yml", ".xml", ".txt")),
     "cloud": ("a point cloud", (".ply", ".pcd", ".npy", ".xyz", ".txt")),
     "cad": ("a model file", (".ply", ".stl", ".obj", ".glb")),
 }
