@@ -18,6 +18,8 @@ from depthpose.core.checkpoint import Checkpoint, find_weights, read_checkpoint,
 from depthpose.core.errors import InputError, MissingExtraError
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
+constants = pytest.importorskip("huggingface_hub.constants")
+errors = pytest.importorskip("huggingface_hub.errors")
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
@@ -80,10 +82,10 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Fak
         threading.Thread(target=running.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{running.server_port}"
         template = address + "/{repo_id}/resolve/{revision}/{filename}"
-        monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", address)
-        monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_IMPLICIT_TOKEN", True)
+        monkeypatch.setattr(constants, "ENDPOINT", address)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_IMPLICIT_TOKEN", True)
         hub.fetch_weights.cache_clear()
         yield FakeHub
         running.shutdown()
@@ -142,7 +144,7 @@ def test_offline_the_cache_serves_and_what_it_lacks_is_said(
     before = find_weights("hf://me/part")
     hub.fetch_weights.cache_clear()
     asked = len(server.asked)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     assert find_weights("hf://me/part") == before
     with pytest.raises(InputError, match="cannot be reached, and the cache has not got it"):
         find_weights("hf://me/other")
@@ -155,8 +157,8 @@ def test_a_hub_that_does_not_answer_is_said(
     # Port 1 of this machine: nobody listens there.
     nowhere = "http://127.0.0.1:1"
     template = nowhere + "/{repo_id}/resolve/{revision}/{filename}"
-    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", nowhere)
-    monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr(constants, "ENDPOINT", nowhere)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
     with pytest.raises(InputError, match=r"hub cannot be reached.*give its path"):
         find_weights("hf://me/part")
 
@@ -230,7 +232,7 @@ def test_without_a_login_the_remedy_is_said(
 ) -> None:
     class Stranger(FakeApi):
         def create_repo(self, *args: object, **options: object) -> str:  # noqa: ARG002
-            raise huggingface_hub.errors.LocalTokenNotFoundError("no token")
+            raise errors.LocalTokenNotFoundError("no token")
 
     monkeypatch.setattr(huggingface_hub, "HfApi", Stranger)
     path = write_weights(tmp_path / "part.safetensors")

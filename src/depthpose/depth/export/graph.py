@@ -169,8 +169,8 @@ def _resized_map(values: Value, size: Value) -> Value:
 
 def _ratio(wide: Value, narrow: Value) -> Value:
     """How many times as wide, for disparities."""
-    columns = (size.slice([1], [2], [0]).cast(np.float64) for size in (wide, narrow))
-    return next(columns).op("Div", next(columns)).cast(np.float32)
+    many, few = (size.slice([1], [2], [0]).cast(np.float64) for size in (wide, narrow))
+    return (many / few).cast(np.float32)
 
 
 def _joined(*sides: Any) -> Value:  # noqa: ANN401
