@@ -20,6 +20,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 huggingface_hub = pytest.importorskip("huggingface_hub")
 constants = pytest.importorskip("huggingface_hub.constants")
 errors = pytest.importorskip("huggingface_hub.errors")
+REAL_API = huggingface_hub.HfApi
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
@@ -187,7 +188,7 @@ class FakeApi:
     calls: list[tuple[str, dict[str, Any]]]
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401
-        signature = inspect.signature(getattr(huggingface_hub.HfApi, name))
+        signature = inspect.signature(getattr(REAL_API, name))
 
         def call(*args: object, **options: object) -> str:
             given = signature.bind(self, *args, **options).arguments

@@ -210,5 +210,5 @@ def push_weights(
 
 def _card(name: str, facts: Mapping[str, str]) -> str:
     return "\n".join(
-        [f"# {name}", "", *(f"- **{key}**: {value}" for key, value in facts.items()), ""]
+        [f"# {name}", "", *(f"- **{key}**: {value}" for key, value in sorted(facts.items())), ""]
     )
