@@ -73,7 +73,7 @@ def test_the_sizeless_network_is_the_network(align_corners: bool) -> None:
         disparity_px, confidence = SizelessPSMNet(matcher)(*pair)
         expected_px = matcher(*pair)[-1]
     assert expected_px.std() > 1
-    torch.testing.assert_close(disparity_px, expected_px, rtol=0, atol=1e-4)
+    torch.testing.assert_close(disparity_px, expected_px, rtol=0, atol=2e-3)
     assert 0 <= confidence.min() <= confidence.max() <= 1
 
 

@@ -53,7 +53,6 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
     )  # fmt: skip
 
 
-@torch.no_grad()
 def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
     for counts in _POINTS:
         coordinates = batch_coordinates(
@@ -63,7 +62,8 @@ def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
         features = torch.ones(len(coordinates), network.config.inputs)
         if network.config.inputs > 1:
             features = torch.randn(features.shape, generator=generator)
-        directions = network(Voxels.from_points(coordinates, features))
+        with torch.no_grad():
+            directions = network(Voxels.from_points(coordinates, features))
         yield Case(
             name=f"{len(coordinates)} voxels of {len(counts)} clouds",
             inputs={"coordinates": coordinates.numpy(), "features": features.numpy()},
