@@ -76,11 +76,12 @@ def pair_graph(weights: DepthWeights) -> Graph:
     if matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
     graph = Graph()
-    pair = [graph.input(name, np.float32, _IMAGES) for name in ("left", "right")]
+    left = graph.input("left", np.float32, _IMAGES)
+    right = graph.input("right", np.float32, _IMAGES)
     focal_yx = None
     if matcher.config.work_focal_px is not None:
         focal_yx = _focal_yx(graph.input("K", np.float64, (3, 3)))
-    _output_maps(graph, None, *_matched(*pair, focal_yx, matcher))
+    _output_maps(graph, None, *_matched(left, right, focal_yx, matcher))
     return graph
 
 

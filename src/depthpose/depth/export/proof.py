@@ -21,8 +21,8 @@ What = Literal["image", "pair"]
 """One image to depth, or a rectified pair to disparity."""
 
 _LIMITS = {
-    "depth_m": Limit(value=1e-3, is_relative=True),
-    "disparity_px": Limit(value=0.02),
+    "depth_m": Limit(value=0.01, is_relative=True),
+    "disparity_px": Limit(value=0.05),
     # A disparity is near the answer or not: where one lies on that border, confidence jumps.
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
@@ -31,6 +31,8 @@ _SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401
 """Rows, columns, focal length over the one that the weights want, images: a multiple of what the
 networks take; one that is stretched to it; one that is enlarged; one that is padded."""
 _SHIFT_PX = 6
+_LEAST_PX = 1.0
+"""Disparity from which depths are compared."""
 
 
 def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]) -> Export:
@@ -97,7 +99,9 @@ def _case(inputs: dict[str, np.ndarray], found: list[DepthEstimate]) -> Case:
     maps = {name: [getattr(one, name) for one in found] for name in names}
     expected = {name: torch.stack(m).numpy() for name, m in maps.items() if m[0] is not None}
     shape = next(iter(inputs.values())).shape
-    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
+    # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
+    where = {"depth_m": expected["disparity_px"] >= _LEAST_PX}
+    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected, where=where)
 
 
 def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
