@@ -1,5 +1,6 @@
 """What is exported of depth weights, and the estimates that it is held to."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any, Literal
 
@@ -8,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from depthpose.core.camera import Camera
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
@@ -27,6 +28,7 @@ _LIMITS = {
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
 }
+_PAIR_OUTPUTS = ("disparity_px", "confidence")
 _SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
 """Rows, columns, focal length over the one that the weights want, images: a multiple of what the
 networks take; one that is stretched to it; one that is enlarged; one that is padded."""
@@ -75,7 +77,10 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
         camera = _camera(size, weights.generator.config.virtual_focal_px)
         given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-        yield _case(inputs, net.estimate_many(given))
+        # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
+        case = _case(inputs, net.estimate_many(given), ("depth_m", *_PAIR_OUTPUTS, "right"))
+        where = {"depth_m": case.expected["disparity_px"] >= _LEAST_PX}
+        yield dataclasses.replace(case, where=where)
 
 
 def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
@@ -84,24 +89,27 @@ def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
     work_px = weights.matcher.config.work_focal_px
     for size in _SIZES:
         left, right = _scenes(*size)
-        camera = _camera(size, work_px or 700.0)
-        given = zip(left, right, strict=True)
-        found = [
-            net.estimate_pair(StereoInput(name="proof", left=one, right=other, camera=camera))
-            for one, other in given
-        ]
         inputs = {"left": left.numpy(), "right": right.numpy()}
-        yield _case(inputs | ({"K": camera.K.numpy()} if work_px else {}), found)
+        rig = None
+        if work_px is not None:
+            camera = _camera(size, work_px)
+            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
+            inputs["K"] = camera.K.numpy()
+        found = [
+            net.estimate_pair(StereoInput(name="proof", left=one, right=other, camera=rig))
+            for one, other in zip(left, right, strict=True)
+        ]
+        yield _case(inputs, found, _PAIR_OUTPUTS)
 
 
-def _case(inputs: dict[str, np.ndarray], found: list[DepthEstimate]) -> Case:
-    names = ("depth_m", "disparity_px", "confidence", "right")
-    maps = {name: [getattr(one, name) for one in found] for name in names}
-    expected = {name: torch.stack(m).numpy() for name, m in maps.items() if m[0] is not None}
+def _case(
+    inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
+) -> Case:
+    expected = {
+        name: torch.stack([getattr(one, name) for one in found]).numpy() for name in outputs
+    }
     shape = next(iter(inputs.values())).shape
-    # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
-    where = {"depth_m": expected["disparity_px"] >= _LEAST_PX}
-    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected, where=where)
+    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
 
 
 def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
