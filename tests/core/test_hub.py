@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -155,6 +156,7 @@ def test_offline_the_cache_serves_and_what_it_lacks_is_said(
 def test_a_hub_that_does_not_answer_is_said(
     server: type[FakeHub], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(time, "sleep", lambda _seconds: None)  # between the library's own tries
     # Port 1 of this machine: nobody listens there.
     nowhere = "http://127.0.0.1:1"
     template = nowhere + "/{repo_id}/resolve/{revision}/{filename}"
