@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Limit
-from depthpose.pose.cloud import voxelise
 from depthpose.pose.export.graph import direction_graph
 from depthpose.pose.mesh.sampling import sample_surface
 from depthpose.pose.network import ResUNet
@@ -37,8 +37,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
             "sparse network: give weights of kind 'geoposenet'."
         )
     known = {
-        "voxel_m": weights.cloud.voxel_m,
-        "with_sight_axis": weights.cloud.with_sight_axis,
+        "cloud": config_to_dict(weights.cloud),
         "objects": [model.name for model in weights.models],
         "keypoints_m": [model.keypoints_m.tolist() for model in weights.models],
     }
@@ -65,18 +64,14 @@ def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
         with torch.no_grad():
             directions = network(Voxels.from_points(coordinates, features))
         yield Case(
-            name=f"{len(coordinates)} voxels of {len(counts)} clouds",
+            name=f"voxels {len(coordinates)}, clouds {len(counts)}",
             inputs={"coordinates": coordinates.numpy(), "features": features.numpy()},
             expected={"directions": directions.numpy()},
         )
 
 
 def _cells(weights: PoseWeights, count: int, k: int) -> Tensor:
-    """Voxels of an object's surface, half a metre before the camera, in no order."""
+    """Voxels of an object's surface, in no order."""
     points_m, _ = sample_surface(weights.models[k % len(weights.models)], count)
-    points_m = points_m + torch.tensor([0.1, 0.0, 0.5])
-    voxels = voxelise(
-        points_m, weights.cloud.voxel_m, with_sight_axis=weights.cloud.with_sight_axis
-    )
-    order = torch.randperm(len(voxels.coordinates), generator=torch.Generator().manual_seed(count))
-    return voxels.coordinates[order]
+    cells = torch.floor(points_m / weights.cloud.voxel_m).long().unique(dim=0)
+    return cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(count))]
