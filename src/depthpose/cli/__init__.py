@@ -39,6 +39,10 @@ COMMANDS = {
         "weights:complete_weights",
         "put meshes into pose weights that came without",
     ),
+    "weights push": (
+        "weights:push_weights",
+        "upload weights and their card to the Hugging Face hub",
+    ),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
@@ -58,6 +62,8 @@ COMMANDS = {
     "figure 3-2": ("pose_figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
     "figure 3-4": ("pose_figures:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("pose_figures:figure_3_5", "boxes of true and estimated poses"),
+    "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
+    "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
 }
 _EXIT_CODES = """exit codes:
   0    done

@@ -1,5 +1,6 @@
 """``depthpose weights ...``."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -165,3 +166,49 @@ def complete_weights(
         meshes = read_bop_models(models, numbers)
     complete(path, meshes, out)
     return show_weights(str(out))
+
+
+def push_weights(
+    weights: tyro.conf.Positional[str],
+    repository: tyro.conf.Positional[str],
+    public: bool = False,
+    accept_terms: bool = False,
+) -> int:
+    """Upload weights to the Hugging Face hub, with their card as README.md.
+
+    Others then load them by hf://OWNER/NAME. Log in first ('hf auth login'); needs the extra hub.
+
+        depthpose weights push my_part.safetensors me/my-part
+
+    Args:
+        weights: a .safetensors file, its folder, or the name of weights that came with depthpose.
+        repository: OWNER/NAME; made where it is missing.
+        public: let everybody see a repository that is made; else it is private.
+        accept_terms: you have read the terms of weights that have some, and may pass them on.
+    """
+    from depthpose.core import hub
+    from depthpose.core.checkpoint import find_weights, read_checkpoint
+    from depthpose.core.errors import InputError
+    from depthpose.core.files import read_text
+
+    path = find_weights(weights)
+    facts = read_checkpoint(path).facts
+    if terms := facts.get("terms", ""):
+        print(f"{weights}: {terms}")
+        if not accept_terms:
+            raise InputError(
+                f"{weights}: has terms that bind whoever passes it on, and they are above. "
+                "If you may, say --accept-terms."
+            )
+    card = path.with_suffix(".md")
+    text = read_text(card) if card.is_file() else _card(path.stem, facts)
+    url = hub.push_weights(path, hub.readme_of(text, facts), repository, is_private=not public)
+    print(f"{url}: {path.name} ({path.stat().st_size / 1e6:.1f} MB) and its card; load them by "
+          f"hf://{repository}")  # fmt: skip
+    return 0
+
+
+def _card(name: str, facts: Mapping[str, str]) -> str:
+    return "\n".join(
+        [f"# {name}", "", *(f"- **{key}**: {value}" for key, value in sorted(facts.items())), ""]
+    )

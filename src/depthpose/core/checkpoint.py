@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import atomic_write
+from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
@@ -132,10 +133,14 @@ def read_published(path: Path) -> Mapping[str, Any]:
 
 
 def find_weights(name: str | Path) -> Path:
-    """Find a weights file by its path, or by the name of weights that came with the package.
+    """Find a weights file: by its path, its folder, its name in the package, or on the hub.
+
+    Args:
+        name: a file; weights that came with the package, by name; a folder with one file of
+            weights, or with ``model.safetensors``; or ``hf://OWNER/NAME`` (``core.hub``).
 
     Raises:
-        InputError: neither; the nearest name is said.
+        InputError: none of these; the nearest name is said.
     """
     path = Path(name)
     shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
@@ -143,9 +148,14 @@ def find_weights(name: str | Path) -> Path:
         return path
     if str(name) in shipped:
         return shipped[str(name)]
+    if path.is_dir():
+        return _only_weights(path)
+    if is_on_hub(name):
+        return fetch_weights(str(name))
     raise InputError(
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
-        f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones."
+        f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones, "
+        "hf://OWNER/NAME those on the hub."
     )
 
 
@@ -159,6 +169,18 @@ def file_sha256(path: Path) -> str:
     """Fingerprint a file; it stands beside every number that the file made."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _only_weights(folder: Path) -> Path:
+    files = sorted(folder.glob("*.safetensors"))
+    named = [file for file in files if file.name == WEIGHTS_FILE] or files
+    if len(named) == 1:
+        return named[0]
+    which = ", ".join(file.name for file in files) or "none"
+    raise InputError(
+        f"{folder}: a folder of weights holds one .safetensors file, or one called {WEIGHTS_FILE}; "
+        f"here: {which}. Name the file."
+    )
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -53,11 +53,12 @@ class FakestereoNet:
         matcher: str | Path | Matcher | None = None,
         config: MatcherConfig | SGBMConfig | None = None,
     ) -> "FakestereoNet":
-        """Build an estimator from weights, by file or by name.
+        """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
         Args:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed), or of PSMNet alone (then real pairs only). None: ``matcher`` alone.
+                What names weights: :func:`depthpose.core.checkpoint.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.

@@ -146,9 +146,11 @@ class PSMNet(nn.Module):
     ) -> tuple[Volume, Volume, Volume]:
         """Answer the quarter-size cost after each hourglass; each adds to the one before."""
         bins = self.config.max_disparity_px // 4
-        cost0 = self._aggregate(
-            concatenation_volume(self.features(left), self.features(right), bins)
-        )
+        return self.costs_of(concatenation_volume(self.features(left), self.features(right), bins))
+
+    def costs_of(self, volume: Volume) -> tuple[Volume, Volume, Volume]:
+        """Answer the costs of a concatenation volume, however it was made."""
+        cost0 = self._aggregate(volume)
         x, first, before, costs = cost0, None, None, []
         for hourglass, head in zip(self.hourglasses, self.heads, strict=True):
             refined, down, before = hourglass(x, first, before)

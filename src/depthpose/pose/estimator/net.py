@@ -59,7 +59,7 @@ class GeoPoseNet:
 
     @classmethod
     def load(cls, weights: str | Path, config: EstimateConfig | None = None) -> "GeoPoseNet":
-        """Build an estimator from weights, by file or by name.
+        """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
         Weights whose terms bind the user say so (:class:`LicenceNotice`).
 

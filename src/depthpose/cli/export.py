@@ -1,0 +1,84 @@
+"""``depthpose export ...``."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+Format = Literal["onnx"]
+
+
+def export_depth(
+    out: Path,
+    weights: str = "default",
+    what: Literal["image", "pair"] | None = None,
+    format: Format = "onnx",
+) -> int:
+    """Write the depth networks as one file that runs without torch, and prove that it agrees.
+
+    The graph does all that the estimator does, at any size: from one image and its K, the virtual
+    rig, the drawn right view, the match, and metres; or from a pair, disparity and confidence. Its
+    answers are compared with PyTorch's at several sizes; beyond the limit nothing is written, else
+    the differences stand in FILE.json. Needs the extra export.
+
+        depthpose export depth --out depth.onnx
+        depthpose export depth --weights psmnet.safetensors --out psmnet.onnx
+
+    Args:
+        out: the .onnx file to write.
+        weights: of a generator and a matcher, or of a matcher alone, by name or file.
+        what: image: one image to depth; pair: a rectified pair to disparity. By default the first
+            that the weights can.
+        format: of the file.
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.export import freeze
+    from depthpose.depth.export import depth_export
+    from depthpose.depth.weights import read_depth_weights
+
+    path = find_weights(weights)
+    found = read_depth_weights(path)
+    facts = _facts(weights, path, found.facts, format)
+    return _say(out, freeze(out, depth_export(found, what, facts)))
+
+
+def export_pose(out: Path, weights: str = "parts", format: Format = "onnx") -> int:
+    """Write the network of directions as one file that runs without torch, and prove it alike.
+
+    The graph takes voxels (cloud, x, y, z; each once) and their features, and answers the direction
+    from each to every keypoint of every object; coarser levels and kernel maps are made inside it.
+    Voxelising before it, and voting, ICP and the refusal after it, are not in it. Its answers are
+    compared with PyTorch's on several clouds; beyond the limit nothing is written, else the
+    differences stand in FILE.json. Needs the extra export.
+
+        depthpose export pose --out pose.onnx
+
+    Args:
+        out: the .onnx file to write.
+        weights: of a pose network, by name or file ('depthpose weights list').
+        format: of the file.
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.export import freeze
+    from depthpose.pose.export import pose_export
+    from depthpose.pose.weights import read_pose_weights
+
+    path = find_weights(weights)
+    found = read_pose_weights(path)
+    return _say(out, freeze(out, pose_export(found, _facts(weights, path, found.facts, format))))
+
+
+def _facts(weights: str, path: Path, card: Any, format: Format) -> dict[str, Any]:  # noqa: ANN401
+    from depthpose.core.checkpoint import file_sha256, say_terms
+
+    say_terms(card)
+    own = {"format": format, "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
+    return {**card, **own}
+
+
+def _say(out: Path, rows: Any) -> int:  # noqa: ANN401
+    from depthpose.core.report import markdown_table
+
+    shown = [{k: f"{v:.1e}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    print(markdown_table(shown), end="")
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences stand in "
+          f"{out.with_suffix('.json').name}")  # fmt: skip
+    return 0

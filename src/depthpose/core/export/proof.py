@@ -1,0 +1,105 @@
+"""The file's answers beside PyTorch's: largest and mean difference, and the limit that holds."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from depthpose.core.errors import InputError
+
+Row = dict[str, str | float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Case:
+    """One input and what PyTorch answers.
+
+    Attributes:
+        name: its size, for the table.
+        inputs: by the names of the graph's inputs.
+        expected: by the names of its outputs; what is not named is not compared.
+        where: the part of an output that is compared, where it is not all of it.
+    """
+
+    name: str
+    inputs: Mapping[str, np.ndarray]
+    expected: Mapping[str, np.ndarray]
+    where: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """How far an output may be off.
+
+    Attributes:
+        value: the limit, in the output's unit.
+        of: the largest difference, or the mean one where the answer itself jumps.
+        is_relative: differences are shares of what PyTorch answers.
+    """
+
+    value: float
+    of: Literal["largest", "mean"] = "largest"
+    is_relative: bool = False
+
+
+def measure_differences(
+    path: Path, cases: Iterable[Case], limits: Mapping[str, Limit]
+) -> list[Row]:
+    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
+
+    Raises:
+        InputError: an output is NaN where PyTorch's is not, or the other way round.
+    """
+    session = import_module("onnxruntime").InferenceSession(
+        str(path), providers=["CPUExecutionProvider"]
+    )
+    rows: list[Row] = []
+    for case in cases:
+        answers = session.run(list(case.expected), dict(case.inputs))
+        for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
+            if name in case.where and answer.shape == expected.shape:
+                answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
+            rows.append(_row(case.name, name, (answer, expected), limits[name]))
+    return rows
+
+
+def refuse_beyond(rows: Iterable[Row]) -> None:
+    """Raise where a difference is beyond its limit.
+
+    Raises:
+        InputError: the first such row.
+    """
+    for row in rows:
+        found, limit = row[f"{row['judged']} difference"], row["limit"]
+        if not found <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
+            raise InputError(
+                f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
+                f"{found:.3g} ({row['judged']}), the limit is {limit:.3g}; nothing is written. "
+                "Install other versions of onnxscript and onnxruntime, and report this."
+            )
+
+
+def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> Row:
+    answer, expected = (np.asarray(values, np.float64) for values in pair)
+    if answer.shape != expected.shape or (np.isnan(answer) != np.isnan(expected)).any():
+        raise InputError(
+            f"{output} of {case}: onnxruntime answers {answer.shape} with "
+            f"{np.isnan(answer).sum()} NaN, PyTorch {expected.shape} with "
+            f"{np.isnan(expected).sum()}; nothing is written."
+        )
+    difference = np.abs(answer - expected)
+    if limit.is_relative:
+        difference /= np.abs(expected)
+    difference = difference[~np.isnan(difference)]
+    return {
+        "input": case,
+        "output": output,
+        "largest difference": float(difference.max(initial=0.0)),
+        "mean difference": float(difference.mean()) if difference.size else 0.0,
+        "judged": limit.of,
+        "limit": limit.value,
+        "unit": "share" if limit.is_relative else "as the output",
+    }

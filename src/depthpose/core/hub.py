@@ -1,0 +1,141 @@
+"""Weights from and to the Hugging Face hub; nothing is fetched but what a name asks for.
+
+A name is ``hf://OWNER/NAME``, ``hf://OWNER/NAME@REVISION`` or ``hf://OWNER/NAME/FILE.safetensors``,
+as huggingface_hub's own file system writes it. Files lie in that library's cache, and its settings
+hold: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, the token of ``hf auth login``.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from depthpose.core.errors import InputError, MissingExtraError
+
+WEIGHTS_FILE = "model.safetensors"
+"""Name of the weights in a repository, as others on the hub call theirs."""
+
+_NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
+# One slash is left of the two where the name was made a path.
+_REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
+_LICENCES = ("mit", "apache-2.0", "cc-by-4.0", "cc-by-nc-4.0", "cc-by-nc-sa-3.0", "cc-by-nc-sa-4.0")
+"""As the hub writes them; others are ``other``."""
+
+
+def is_on_hub(name: str | Path) -> bool:
+    """Say whether a name is one of the hub."""
+    return str(name).startswith("hf:/")
+
+
+@cache
+def fetch_weights(name: str) -> Path:
+    """Give the local file of weights on the hub, downloaded if the cache has not got them.
+
+    Asked again, one process gets the same file: what is fingerprinted is what is loaded.
+
+    Raises:
+        InputError: no such name, repository, revision or file; no access; no connection.
+        MissingExtraError: the extra ``hub`` is not installed.
+    """
+    found = _REFERENCE.fullmatch(name)
+    if found is None:
+        raise InputError(
+            f"{name!r}: weights on the hub are hf://OWNER/NAME, hf://OWNER/NAME@REVISION or "
+            "hf://OWNER/NAME/FILE.safetensors."
+        )
+    file = found["file"] or WEIGHTS_FILE
+    if not file.endswith(".safetensors"):
+        raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
+    hub = _import_hub()
+    with _explained(name):
+        path = hub.hf_hub_download(found["repository"], file, revision=found["revision"])
+    return Path(path)
+
+
+def push_weights(path: Path, readme: str, repository: str, *, is_private: bool) -> str:
+    """Upload weights and their card as one commit; the repository is made where it is missing.
+
+    Args:
+        path: the ``.safetensors`` file, which becomes ``model.safetensors``.
+        readme: text of ``README.md``.
+        repository: ``OWNER/NAME``.
+        is_private: of a repository that is made; one that is there stays as it is.
+
+    Returns:
+        The address of the repository.
+
+    Raises:
+        InputError: no such name, no access, no connection.
+        MissingExtraError: the extra ``hub`` is not installed.
+    """
+    if not re.fullmatch(_NAME, repository):
+        raise InputError(f"{repository!r}: a repository on the hub is OWNER/NAME.")
+    hub = _import_hub()
+    files = {WEIGHTS_FILE: path, "README.md": readme.encode()}
+    operations = [
+        hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=content)
+        for name, content in files.items()
+    ]
+    api = hub.HfApi()
+    with _explained(repository):
+        url = api.create_repo(repository, private=is_private, exist_ok=True)
+        api.create_commit(repository, operations, commit_message=f"Weights {path.stem}")
+    return str(url)
+
+
+def readme_of(card: str, facts: Mapping[str, str]) -> str:
+    """Put before a card what the hub reads of it: library, licence."""
+    slug = facts.get("licence", "").lower().replace(" ", "-")
+    lines = ["---", "library_name: depthpose"]
+    lines.append(f"license: {slug if slug in _LICENCES else 'other'}")
+    return "\n".join([*lines, "---", "", card])
+
+
+def _import_hub() -> Any:  # noqa: ANN401  imported where it is used
+    try:
+        return import_module("huggingface_hub")
+    except ImportError as error:
+        raise MissingExtraError("huggingface_hub", "hub", "weights on the hub") from error
+
+
+@contextmanager
+def _explained(name: str) -> Iterator[None]:
+    """Turn what the library raises into one error with a remedy."""
+    errors = import_module("huggingface_hub.errors")
+    try:
+        yield
+    except errors.HFValidationError as error:
+        raise InputError(f"{name}: no name that the hub allows: {_short(error)}") from error
+    except errors.GatedRepoError as error:
+        raise InputError(
+            f"{name}: its owner asks for consent; give it on the repository's page, then "
+            "'hf auth login'."
+        ) from error
+    except errors.RepositoryNotFoundError as error:
+        raise InputError(
+            f"{name}: there is no such repository, or it is private: check the name, or "
+            "'hf auth login' as one who may see it."
+        ) from error
+    except errors.RevisionNotFoundError as error:
+        raise InputError(f"{name}: the repository has no such revision.") from error
+    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
+        raise InputError(
+            f"{name}: the hub cannot be reached, and the cache has not got it. Connect once, unset "
+            "HF_HUB_OFFLINE, or copy the repository's folder here and give its path."
+        ) from error
+    except errors.EntryNotFoundError as error:
+        raise InputError(
+            f"{name}: the repository has no such file ({WEIGHTS_FILE} by default); name it: "
+            "hf://OWNER/NAME/FILE.safetensors."
+        ) from error
+    except OSError as error:  # of the connection, of access, of a full disk
+        raise InputError(
+            f"{name}: the hub did not do it: {_short(error)}. To upload, 'hf auth login' first."
+        ) from error
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,129 @@
+"""What is exported of depth weights, and the estimates that it is held to."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.export import Case, Export, Limit
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.export.graph import image_graph, pair_graph
+from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.synthesis import Synthesiser
+from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.weights import DepthWeights
+
+What = Literal["image", "pair"]
+"""One image to depth, or a rectified pair to disparity."""
+
+_LIMITS = {
+    "depth_m": Limit(value=0.01, is_relative=True),
+    "disparity_px": Limit(value=0.05),
+    # A disparity is near the answer or not: where one lies on that border, confidence jumps.
+    "confidence": Limit(value=1e-3, of="mean"),
+    "right": Limit(value=1e-3),
+}
+_PAIR_OUTPUTS = ("disparity_px", "confidence")
+_SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
+"""Rows, columns, focal length over the one that the weights want, images: a multiple of what the
+networks take; one that is stretched to it; one that is enlarged; one that is padded."""
+_SHIFT_PX = 6
+_LEAST_PX = 1.0
+"""Disparity from which depths are compared."""
+
+
+def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]) -> Export:
+    """Say what becomes of weights in a file.
+
+    Args:
+        weights: of a generator and a matcher, or of a matcher alone.
+        what: one image to depth, or a pair to disparity; None: the first that the weights can.
+        facts: what else a user of the file must know.
+    """
+    if what is None:
+        what = "pair" if weights.generator is None else "image"
+    if what == "pair":
+        return Export(
+            graph=lambda: pair_graph(weights),
+            cases=lambda: _pair_cases(weights),
+            limits=_LIMITS,
+            facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
+        )
+    rig = {} if weights.generator is None else _rig_facts(weights)
+    return Export(
+        graph=lambda: image_graph(weights),
+        cases=lambda: _image_cases(weights),
+        limits=_LIMITS,
+        facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
+    )
+
+
+def _rig_facts(weights: DepthWeights) -> dict[str, float]:
+    assert weights.generator is not None
+    rig = weights.generator.config
+    return {"virtual_focal_px": rig.virtual_focal_px, "virtual_baseline_m": rig.virtual_baseline_m}
+
+
+def _image_cases(weights: DepthWeights) -> Iterator[Case]:
+    assert weights.generator is not None and weights.matcher is not None  # noqa: PT018
+    net = FakestereoNet(PSMNetMatcher(weights.matcher), Synthesiser(weights.generator))
+    for size in _SIZES:
+        images, _ = _scenes(*size)
+        camera = _camera(size, weights.generator.config.virtual_focal_px)
+        given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
+        inputs = {"image": images.numpy(), "K": camera.K.numpy()}
+        # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
+        case = _case(inputs, net.estimate_many(given), ("depth_m", *_PAIR_OUTPUTS, "right"))
+        where = {"depth_m": case.expected["disparity_px"] >= _LEAST_PX}
+        yield dataclasses.replace(case, where=where)
+
+
+def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
+    assert weights.matcher is not None
+    net = FakestereoNet(PSMNetMatcher(weights.matcher))
+    work_px = weights.matcher.config.work_focal_px
+    for size in _SIZES:
+        left, right = _scenes(*size)
+        inputs = {"left": left.numpy(), "right": right.numpy()}
+        rig = None
+        if work_px is not None:
+            camera = _camera(size, work_px)
+            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
+            inputs["K"] = camera.K.numpy()
+        found = [
+            net.estimate_pair(StereoInput(name="proof", left=one, right=other, camera=rig))
+            for one, other in zip(left, right, strict=True)
+        ]
+        yield _case(inputs, found, _PAIR_OUTPUTS)
+
+
+def _case(
+    inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
+) -> Case:
+    expected = {
+        name: torch.stack([getattr(one, name) for one in found]).numpy() for name in outputs
+    }
+    shape = next(iter(inputs.values())).shape
+    return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
+
+
+def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
+    rows, columns, share, _ = size
+    f = share * focal_px
+    K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(width=columns, height=rows, K=K)
+
+
+def _scenes(rows: int, columns: int, share: float, count: int) -> tuple[Tensor, Tensor]:
+    """Make images of smooth noise, and the same moved to the left: pairs that match everywhere."""
+    shift = round(_SHIFT_PX * share)
+    noise = torch.rand(
+        count, 3, rows // 6, columns // 6, generator=torch.Generator().manual_seed(0)
+    )
+    scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
+    return scene[..., :columns].contiguous(), scene[..., shift:].contiguous()

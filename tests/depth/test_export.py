@@ -1,0 +1,171 @@
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from depthpose.cli import main
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_image
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.export import depth_export
+from depthpose.depth.export.network import SizelessPSMNet, gathered_volume
+from depthpose.depth.stereo import PSMNet
+from depthpose.depth.stereo.psmnet import concatenation_volume
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.weights import DepthWeights, write_depth_weights
+
+pytest.importorskip("onnxruntime")
+DOCS = (Path(__file__).parents[2] / "docs/export.md").read_text()
+TERMS = {"licence": "MIT", "trained_on": "nothing"}
+
+
+def tiny_matcher(**knobs: object) -> PSMNet:
+    torch.manual_seed(1)
+    size = {"width": 2, "max_disparity_px": 32, "blocks": (1, 1, 1, 1), "pools": (8, 4)}
+    return PSMNet(PSMNetConfig(**size | knobs)).eval()  # pyright: ignore[reportArgumentType]
+
+
+def tiny_weights(**knobs: object) -> DepthWeights:
+    torch.manual_seed(0)
+    rig = {"width": 2, "levels": 4, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
+    generator = UNetGenerator(GeneratorConfig(**rig | knobs)).eval()  # pyright: ignore[reportArgumentType]
+    matcher = tiny_matcher(work_focal_px=70.0)
+    return DepthWeights(generator=generator, matcher=matcher, facts=TERMS)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with ``w.safetensors``, and ``depth.onnx`` made of it by the command."""
+    folder = tmp_path_factory.mktemp("export")
+    weights = tiny_weights()
+    write_depth_weights(
+        folder / "w.safetensors",
+        generator=weights.generator, matcher=weights.matcher, facts=TERMS,
+    )  # fmt: skip
+    words = ["--weights", str(folder / "w.safetensors"), "--out", str(folder / "depth.onnx")]
+    assert main(["export", "depth", *words]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("width", [3, 8, 20])
+def test_the_gathered_volume_is_the_concatenation_volume(width: int) -> None:
+    left, right = torch.rand(2, 2, 3, 5, width).unbind()
+    assert torch.equal(gathered_volume(left, right, 8), concatenation_volume(left, right, 8))
+
+
+@pytest.mark.parametrize("align_corners", [True, False])
+def test_the_sizeless_network_is_the_network(align_corners: bool) -> None:
+    matcher = tiny_matcher(align_corners=align_corners)
+    pair = torch.randn(2, 2, 3, 48, 64).unbind()
+    with torch.no_grad():
+        disparity_px, confidence = SizelessPSMNet(matcher)(*pair)
+        expected_px = matcher(*pair)[-1]
+    assert expected_px.std() > 1
+    torch.testing.assert_close(disparity_px, expected_px, rtol=0, atol=2e-3)
+    assert 0 <= confidence.min() <= confidence.max() <= 1
+
+
+def test_depth_from_one_image_is_the_estimators_at_every_size(exported: Path) -> None:
+    record = json.loads((exported / "depth.json").read_text())
+    found = {(row["input"], row["output"]): row for row in record["differences"]}
+    assert len(found) == 16
+    largest = {name: 0.0 for _, name in found}
+    for (_, name), row in found.items():
+        largest[name] = max(largest[name], row["largest difference"])
+    assert largest["right"] < 1e-4
+    assert largest["disparity_px"] < 0.03
+    assert largest["depth_m"] < 5e-3
+    assert record["facts"]["virtual_baseline_m"] == 0.5
+    assert record["facts"]["licence"] == "MIT"
+
+
+@pytest.mark.slow
+def test_a_pair_needs_no_focal_length_where_the_weights_know_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_depth_weights(tmp_path / "m.safetensors", matcher=tiny_matcher(), facts=TERMS)
+    words = ["--weights", str(tmp_path / "m.safetensors"), "--out", str(tmp_path / "m.onnx")]
+    assert main(["export", "depth", *words]) == 0
+    assert "| disparity_px |" in capsys.readouterr().out
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"))
+    assert [given.name for given in session.get_inputs()] == ["left", "right"]
+
+
+@pytest.mark.slow
+def test_a_pair_at_the_focal_length_of_the_weights(exported: Path) -> None:
+    words = ["--weights", str(exported / "w.safetensors"), "--out", str(exported / "pair.onnx")]
+    assert main(["export", "depth", *words, "--what", "pair"]) == 0
+    rows = json.loads((exported / "pair.json").read_text())["differences"]
+    assert {row["output"] for row in rows} == {"disparity_px", "confidence"}
+
+
+def test_inference_without_torch_as_the_documentation_says(exported: Path) -> None:
+    torch.manual_seed(2)
+    image = torch.nn.functional.interpolate(torch.rand(1, 3, 9, 20), (70, 150), mode="bicubic")[0]
+    write_image(exported / "street.png", image.clamp(0, 1))
+    K = [[100.0, 0, 75], [0, 101.0, 35], [0, 0, 1]]
+    camera = {"width": 150, "height": 70, "K": K}
+    (exported / "camera.json").write_text(json.dumps(camera))
+    (code,) = re.findall(r"```python\n(import json\n.*?)```", DOCS, re.DOTALL)
+    blocked = "import sys\nsys.modules['torch'] = None\nsys.modules['depthpose'] = None\n"
+    subprocess.run(
+        [sys.executable, "-c", blocked + code], cwd=exported, check=True, capture_output=True
+    )
+    net = FakestereoNet.load(exported / "w.safetensors")
+    expected = net.estimate(exported / "street.png", exported / "camera.json")
+    assert expected.depth_m is not None
+    depth_m = np.load(exported / "street.depth_m.npy")
+    assert depth_m.shape == (70, 150)
+    is_near = expected.disparity_px.numpy() >= 1
+    assert is_near.sum() > 1000
+    np.testing.assert_allclose(depth_m[is_near], expected.depth_m.numpy()[is_near], rtol=0.01)
+
+
+def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:
+    whole = tiny_weights()
+    no_matcher = dataclasses.replace(whole, matcher=None)
+    no_generator = dataclasses.replace(whole, generator=None)
+    by_chance = tiny_weights(test_mode="batch")
+    with pytest.raises(InputError, match=r"lack the matcher; 'depthpose weights pack'"):
+        depth_export(no_matcher, "image", {}).graph()
+    with pytest.raises(InputError, match=r"lack the generator; 'depthpose weights pack'"):
+        depth_export(no_generator, "image", {}).graph()
+    with pytest.raises(InputError, match="hold no matcher, only a generator"):
+        depth_export(no_matcher, "pair", {}).graph()
+    with pytest.raises(InputError, match="test_mode is 'batch'"):
+        depth_export(by_chance, None, {}).graph()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["depth", "--weights", "parts", "--out", "d.onnx"], "kind 'geoposenet'; depth takes"),
+        (
+            ["pose", "--weights", "default", "--out", "p.onnx"],
+            "kind 'fakestereo', but a pose takes",
+        ),
+        (["depth", "--weights", "nowhere", "--out", "d.onnx"], "neither a file nor the name"),
+        (["depth", "--out", "d.engine"], "end the name in .onnx"),
+        (["depth", "--out", "d.onnx", "--format", "engine"], "onnx"),
+    ],
+)
+def test_wrong_words_are_refused(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
