@@ -425,6 +425,23 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
     assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
 
+def test_a_network_that_is_never_right_is_not_looked_at_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked_at: list[int] = []
+
+    def wrong(_: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+        looked_at.append(len(objects))
+        estimates, errors = _as_known(weights, objects)
+        return estimates, [0.5 for _ in errors]
+
+    monkeypatch.setattr("depthpose.pose.train.judge._posed", wrong)
+    weights = tiny_weights(*_models())
+    refusal = calibrated(weights, _MADE, CalibrationConfig(number=600)).refusal
+    assert looked_at == [2 * 50]
+    assert refusal.max_risk == 0
+
+
 def test_models_come_from_one_source(tmp_path: Path) -> None:
     file = str(write_part("flange", tmp_path))
     with pytest.raises(InputError, match="there is no object to learn; name its CAD file"):

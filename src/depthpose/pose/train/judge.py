@@ -16,6 +16,7 @@ from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.pose.weights import PoseWeights
 
 _CALIBRATION_SEED = 0xCA11B
+_FIRST = 50
 _TOGETHER = 32
 
 Table = Mapping[str, Mapping[str, float | None]]
@@ -27,22 +28,28 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     """Choose when answers are withheld, on made views from easy to hard.
 
     Where not one view is answered there is nothing to choose by, and the weights stay as they are.
+    Where none of the first 50 of each object is right, no more are looked at.
     """
     if config.number == 0:
         return weights
     open_weights = dataclasses.replace(weights, refusal=RefusalConfig(max_risk=1.0))
     views = dataclasses.replace(
         made,
-        number=config.number * len(weights.models),
         seed=made.seed + _CALIBRATION_SEED,
         views=None,
         resolution=(1.0, 1.0),
         occluded_share=1.0,
         occlusion=config.occlusion,
     )
-    estimates, errors = _posed(open_weights, Objects(weights.models, views, weights.cloud))
-    try:
+    estimates: list[PoseEstimate] = []
+    is_right: list[bool] = []
+    for number in dict.fromkeys((min(_FIRST, config.number), config.number)):
+        some = dataclasses.replace(views, number=number * len(weights.models))
+        estimates, errors = _posed(open_weights, Objects(weights.models, some, weights.cloud))
         is_right = is_within_diameter(torch.tensor(errors)).tolist()
+        if not any(is_right):
+            break
+    try:
         refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
     except InputError:
         return weights
