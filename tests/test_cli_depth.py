@@ -163,6 +163,10 @@ def test_packing_writes_the_card_and_halves_the_file(home: Path, tmp_path: Path)
     assert main(["weights", "pack", str(home / "w.safetensors"), "--out", str(out), "--half",
                  *words]) == 0  # fmt: skip
     assert read_checkpoint(out).facts["terms"] == "research only"
+    again = ["weights", "pack", str(out), "--out", str(tmp_path / "again.safetensors")]
+    with pytest.warns(UserWarning, match="research only"):
+        assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 0
+    assert read_checkpoint(tmp_path / "again.safetensors").facts["terms"] == "research only"
     assert out.stat().st_size < (home / "w.safetensors").stat().st_size
     image = str(home / "images" / "0.png")
     with warnings.catch_warnings():

@@ -243,6 +243,21 @@ def test_without_a_login_the_remedy_is_said(
         hub.push_weights(path, "", "me/part", is_private=True)
 
 
+def test_a_connection_that_breaks_under_a_push_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    broken = next(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")
+
+    class Dead(FakeApi):
+        def create_repo(self, *args: object, **options: object) -> str:  # noqa: ARG002
+            raise broken("connection refused")
+
+    monkeypatch.setattr(huggingface_hub, "HfApi", Dead)
+    path = write_weights(tmp_path / "part.safetensors")
+    with pytest.raises(InputError, match=r"the hub did not do it: connection refused"):
+        hub.push_weights(path, "", "me/part", is_private=True)
+
+
 @pytest.mark.parametrize(
     ("licence", "written"),
     [("MIT", "mit"), ("CC BY-NC-SA 3.0", "cc-by-nc-sa-3.0"), ("research only", "other")],

@@ -110,8 +110,31 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
     (samples / "square.json").write_text(json.dumps(camera))
     by_file = ask(page, "depth", samples, {"image": "left.png", "camera": "square.json"}).json()
     by_fields = ask(page, "depth", samples, {"image": "left.png"}, **fields).json()
-    ways = [page.get("/" + a["folder"] + "left.ply").content for a in (by_file, by_fields)]
-    assert ways[0] == ways[1]
+    # A file that says no size, as many do, gets that of the image.
+    (samples / "bare.txt").write_text("180.5 180.5 150.25 44.5")
+    bare = ask(page, "depth", samples, {"image": "left.png", "camera": "bare.txt"}).json()
+    answers = (by_file, by_fields, bare)
+    ways = [page.get("/" + a["folder"] + "left.ply").content for a in answers]
+    assert ways[0] == ways[1] == ways[2]
+
+
+def test_the_field_says_the_unit_where_the_camera_file_has_no_word_for_it(
+    page: TestClient, samples: Path, truth: Rigid
+) -> None:
+    camera = json.loads((samples / "view.json").read_text())
+    K, unit_m = camera["K"], str(camera["depth_unit_m"])
+    (samples / "bare.txt").write_text(f"{K[0][0]} {K[1][1]} {K[0][2]} {K[1][2]}")
+    files = {**VIEW, "camera": "bare.txt"}
+    found = ask(page, "pose", samples, files, object=PART, depth_unit_m=unit_m).json()
+    assert_posed(page, found, truth, "depth")
+
+
+def test_what_is_sent_in_chunks_has_no_size(page: TestClient) -> None:
+    headers = {"content-length": "5", "transfer-encoding": "chunked"}
+    response = page.post("/estimate/depth", headers=headers, content=b"x" * 5)
+    status, said = refusal(response)
+    assert status == 411
+    assert "send no chunks" in said
 
 
 def test_a_guessed_focal_length_is_called_a_guess(page: TestClient, samples: Path) -> None:
@@ -155,7 +178,7 @@ def test_a_focal_length_that_asks_for_a_huge_picture_is_refused(
 def test_a_picture_of_too_many_pixels_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.web.depth.MOST_PIXELS", 1000)
+    monkeypatch.setattr("depthpose.web.form.MOST_PIXELS", 1000)
     assert "scale it down" in refusal(ask(page, "depth", samples, {"image": "left.png"}))[1]
 
 
@@ -279,7 +302,7 @@ def test_what_is_too_large_is_refused_before_it_is_read(
 def test_a_request_without_a_size_is_refused(page: TestClient) -> None:
     response = page.post("/estimate/depth", content=iter([b"data"]))
     assert refusal(response) == (
-        411, "the request does not say its size (Content-Length); add it"
+        411, "the request does not say its size (Content-Length alone); add it, and send no chunks"
     )  # fmt: skip
 
 

@@ -108,7 +108,7 @@ def send(page: Page, room: str, files: dict[str, Path]) -> str:
 def test_depth_good(page: Page, address: str, samples: Path) -> None:
     page.goto(address)
     files = {"image": samples / "left.png", "camera": samples / "camera.json"}
-    assert "half of the pixels are nearer than" in send(page, "depth", files)
+    assert "half of these are nearer than" in send(page, "depth", files)
     assert 0.05 < drawn_share(page, "#depth") < 1
     pictures = page.locator("#depth .pictures img")
     assert pictures.count() == 3

@@ -163,7 +163,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        with open_viewer(view) as viewer:
+        with open_viewer(None if shard.rank else view) as viewer:
             shown = method if viewer is None else viewer.watching(method)
             names = predict(_safely(shown), left, home, {**method.settings, **settings}, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):

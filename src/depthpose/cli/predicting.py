@@ -102,7 +102,7 @@ def predict_all(
     claim_names(out, {source.stem: source for source in sources})
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
-    with open_viewer(view) as viewer:
+    with open_viewer(None if find_shard().rank else view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
         done = predictor.predict_images([path for path in mine if not _is_video(path)])
         for path in filter(_is_video, mine):

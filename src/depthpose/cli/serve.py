@@ -18,7 +18,7 @@ def serve(
     unless --host says otherwise. Needs the extra 'serve'. Ctrl+C stops it.
 
         depthpose serve
-        depthpose serve --pose-weights my_part/weights.safetensors --port 8080
+        depthpose serve --pose-weights my_part/pose.safetensors --port 8080
 
     Args:
         host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it: there is
@@ -41,7 +41,7 @@ def serve(
     taken = open_socket(host, port)
     is_open = host in ("0.0.0.0", "::")  # noqa: S104  the user's word, compared
     limits = Limits(
-        upload_bytes=max_upload_mb * 10**6, hosts=None if is_open else (*LOOPBACK, host)
+        upload_bytes=max_upload_mb * 10**6, hosts=None if is_open else (*LOOPBACK, host.lower())
     )
     app = make_app(FakestereoNet.load(weights), GeoPoseNet.load(pose_weights), limits)
     shown = f"[{host}]" if ":" in host else host

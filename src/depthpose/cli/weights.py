@@ -121,12 +121,19 @@ def pack_weights(
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
         matcher: take the matcher from this file.
-        terms: said whenever the weights are loaded; for licences that bind the user.
+        terms: said whenever the weights are loaded; for licences that bind the user. Those of the
+            weights that are packed stay beside them.
         half: store 16-bit floats: half the size.
     """
+    from depthpose.core.checkpoint import read_checkpoint, say_terms
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
     found = read_depth_weights(weights)
+    for source in filter(None, (weights, matcher)):
+        bound = read_checkpoint(source).facts
+        say_terms(bound)
+        if bound.get("terms", "") not in terms:
+            terms = f"{terms} {bound['terms']}".strip()
     write_depth_weights(
         out,
         generator=found.generator,

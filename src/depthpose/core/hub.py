@@ -131,10 +131,18 @@ def _explained(name: str) -> Iterator[None]:
             f"{name}: the repository has no such file ({WEIGHTS_FILE} by default); name it: "
             "hf://OWNER/NAME/FILE.safetensors."
         ) from error
-    except OSError as error:  # of the connection, of access, of a full disk
+    except (OSError, *_http_errors()) as error:  # of the connection, of access, of a full disk
         raise InputError(
             f"{name}: the hub did not do it: {_short(error)}. To upload, 'hf auth login' first."
         ) from error
+
+
+def _http_errors() -> tuple[type[Exception], ...]:
+    """Give what the library's own errors are kinds of: requests', httpx's or its heir's."""
+    own = import_module("huggingface_hub.errors").HfHubHTTPError
+    return tuple(
+        kind for kind in own.__mro__[1:] if kind.__module__.partition(".")[0] != "builtins"
+    )
 
 
 def _short(error: Exception) -> str:

@@ -77,6 +77,7 @@ class Pages:
             "pose": partial(answer_pose, net=pose),
         }
         self._one = anyio.CapacityLimiter(1)
+        self._inside = 0
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
         template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
@@ -109,12 +110,18 @@ class Pages:
     async def estimate(self, request: Request) -> Response:
         """Take a form to an answer."""
         refuse_size(request, self._limits.upload_bytes)
-        queue = self._one.statistics()
-        if queue.borrowed_tokens and queue.tasks_waiting >= self._limits.waiting:
-            raise HTTPException(503, "too many requests wait for one computation; try again later")
         room = self._rooms.get(request.path_params["room"])
         if room is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+        if self._inside > self._limits.waiting:  # one is at work
+            raise HTTPException(503, "too many requests wait for one computation; try again later")
+        self._inside += 1
+        try:
+            return await self._answer(request, room)
+        finally:
+            self._inside -= 1
+
+    async def _answer(self, request: Request, room: Callable[[Form], Answer]) -> Response:
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
                 form = await read_form(request, Path(folder))

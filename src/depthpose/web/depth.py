@@ -5,16 +5,14 @@ import time
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size, read_image, write_cloud, write_image
+from depthpose.core.files import read_image, write_cloud, write_image
 from depthpose.core.scene import Layer, Scene
 from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
 from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud, write_estimate
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.web.answer import Answer, Shown, read_files
-from depthpose.web.form import Form
+from depthpose.web.form import Form, small_size
 
-MOST_PIXELS = 12_500_000
-"""Of a picture: those of a phone."""
 _MOST_WORK_PIXELS = 8_000_000
 """Of the picture as the networks see it, at the focal length that they were trained at."""
 _PHONE = 0.75
@@ -58,12 +56,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
 def _input(form: Form) -> tuple[StereoInput, bool]:
     """Read the picture or pair; say whether its focal length is a guess."""
     path = form.file("image")
-    width, height = image_size(path)
-    if width * height > MOST_PIXELS:
-        raise InputError(
-            f"{path.name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
-            "that this page takes; scale it down, or use 'depthpose depth predict'"
-        )
+    width, height = small_size(path)
     has_right = "right" in form.files
     focal_px, baseline_m = form.number("focal_px"), form.number("baseline_m")
     if has_right and baseline_m is None and "camera" not in form.files:
@@ -72,7 +65,9 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
             "baseline in metres (0.54 for KITTI), or choose a camera file that has it"
         )
     is_guess = focal_px is None and "camera" not in form.files
-    camera = form.camera(_keys(form, width, height))
+    camera = form.camera(_keys(form, width, height), (width, height))
+    if has_right:
+        small_size(form.file("right"))
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, is_guess
@@ -150,9 +145,17 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
 
 def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     assert found.depth_m is not None
-    median_m = float(found.depth_m.nanmedian())
+    known_m = found.depth_m[found.depth_m.isfinite()]
     sees = "one image" if pair.right is None else "both images"
-    return f"Depth from {sees}: half of the pixels are nearer than {median_m:.2f} m."
+    if len(known_m) == 0:
+        return (
+            f"No pixel got a depth from {sees}: is the pair rectified, and left where it belongs?"
+        )
+    share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
+    return (
+        f"Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
+        f"{middle_m:.2f} m."
+    )
 
 
 def _facts(

@@ -10,8 +10,11 @@ from typing import Any
 
 from depthpose.core.camera import Camera, read_camera
 from depthpose.core.errors import InputError
+from depthpose.core.files import image_size
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+MOST_PIXELS = 12_500_000
+"""Of a picture: those of a phone."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", IMAGES),
     "right": ("a picture", IMAGES),
@@ -69,17 +72,18 @@ class Form:
             raise InputError(f"{field} is {text!r}; write a number such as 0.54")
         return value
 
-    def camera(self, keys: Mapping[str, Any]) -> Camera:
+    def camera(self, keys: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
         """Read the camera file that was sent, or make a camera of the fields.
 
         Args:
             keys: of a camera file, from the fields; taken where no file was sent.
+            size: of the image (width, height), for files that do not say it.
 
         Raises:
             InputError: as :func:`depthpose.core.camera.read_camera`.
         """
         if "camera" in self.files:
-            return read_camera(self.files["camera"])
+            return read_camera(self.files["camera"], size)
         path = self.folder / _FIELDS
         # The same way as a file, so that the same mistakes are found.
         path.write_text(json.dumps({k: v for k, v in keys.items() if v is not None}))
@@ -96,6 +100,21 @@ def without_paths(text: str, folder: Path) -> str:
     """Take this machine's folders out of a message: a user knows the names of the files."""
     fields = "|".join(KINDS)
     return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)
+
+
+def small_size(path: Path) -> tuple[int, int]:
+    """Give a picture's width and height before it is read.
+
+    Raises:
+        InputError: it has more pixels than this page takes.
+    """
+    width, height = image_size(path)
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path.name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
+            "that this page takes; scale it down, or use the command line"
+        )
+    return width, height
 
 
 def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:

@@ -43,12 +43,17 @@ def _host_name(host: str) -> str | None:
 def refuse_size(request: Request, most: int) -> None:
     """Refuse what is too large before it is read; a server gives no more than was announced.
 
+    But what is sent in chunks, it gives as it comes, whatever size was announced beside.
+
     Raises:
         HTTPException: no size, or too large a one.
     """
     text = request.headers.get("content-length", "")
-    if not text.isdecimal():
-        raise HTTPException(411, "the request does not say its size (Content-Length); add it")
+    if not text.isdecimal() or "transfer-encoding" in request.headers:
+        raise HTTPException(
+            411,
+            "the request does not say its size (Content-Length alone); add it, and send no chunks",
+        )
     if int(text) > most:
         raise HTTPException(
             413,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +15,6 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     Cloud,
-    image_size,
     read_map,
     write_cloud,
     write_image,
@@ -39,7 +38,7 @@ from depthpose.pose.overlay import (
 from depthpose.pose.predictions import Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.web.answer import Answer, Shown, read_files
-from depthpose.web.form import Form
+from depthpose.web.form import Form, small_size
 
 OWN_CAD = "cad"
 """The choice of an object that stands for the CAD file."""
@@ -152,11 +151,24 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
         path = form.file("cloud")
         return cloud_input(path, _unit(form, "cloud_unit"), model.name, path.stem)
     depth, mask = form.file("depth"), form.file("mask")
-    camera = form.camera(_keys(form)) if "camera" not in form.files else form.camera({})
+    is_picture = depth.suffix.lower() == ".png"
+    small_size(mask)
+    size = _size(depth)
+    camera = form.camera({} if "camera" in form.files else _keys(form, size), size)
+    if camera.depth_unit_m is None and is_picture:
+        # ROS, OpenCV and KITTI have no word for it; the field has.
+        camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
 
 
-def _keys(form: Form) -> dict[str, Any]:
+def _size(depth: Path) -> tuple[int, int]:
+    if depth.suffix.lower() == ".png":
+        return small_size(depth)
+    height, width = read_map(depth).shape
+    return width, height
+
+
+def _keys(form: Form, size: tuple[int, int]) -> dict[str, Any]:
     """Give the camera file that the fields amount to."""
     focal_px = form.number("focal_px")
     if focal_px is None:
@@ -164,11 +176,7 @@ def _keys(form: Form) -> dict[str, Any]:
             "focal length: a depth image becomes points by it, and a wrong one changes the size of "
             "what is seen; fill in the depth sensor's (its driver says it), or choose a camera file"
         )
-    path = form.file("depth")
-    if path.suffix.lower() == ".png":
-        width, height = image_size(path)
-    else:
-        height, width = read_map(path).shape
+    width, height = size
     cx, cy = form.number("cx_px"), form.number("cy_px")
     cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
     K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]

@@ -51,14 +51,14 @@ def freeze(path: Path, export: Export) -> list[Row]:
         onnx.save(export.graph().model(facts), str(part))
         rows = measure_differences(part, export.cases(), export.limits)
         refuse_beyond(rows)
-    runtimes = {name: version(name) for name in ("onnx", "onnxscript", "onnxruntime")}
-    record = {
-        "file": path.name,
-        "sha256": file_sha256(path),
-        "opset": OPSET,
-        "environment": environment() | runtimes,
-        "facts": facts,
-        "differences": rows,
-    }
-    write_json(path.with_suffix(".json"), record)
+        runtimes = {name: version(name) for name in ("onnx", "onnxscript", "onnxruntime")}
+        record = {
+            "file": path.name,
+            "sha256": file_sha256(part),
+            "opset": OPSET,
+            "environment": environment() | runtimes,
+            "facts": facts,
+            "differences": rows,
+        }
+        write_json(path.with_suffix(".json"), record)
     return rows
