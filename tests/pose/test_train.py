@@ -295,6 +295,23 @@ def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> Non
         )
 
 
+def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
+    bound = dataclasses.replace(_training().models, terms="For research alone.")
+    first = train_pose(_training(models=bound), Run(folder=tmp_path / "first"))
+    for terms, expected in (
+        ("", "For research alone."),
+        ("Cite us.", "Cite us. For research alone."),
+    ):
+        models = dataclasses.replace(bound, terms=terms)
+        config = _training(models=models, start=str(first))
+        with pytest.warns(UserWarning, match="For research alone"):
+            then = train_pose(config, Run(folder=tmp_path / f"then{len(terms)}"))
+        facts = read_pose_weights(then).facts
+        assert facts["terms"] == expected
+        assert facts["began_with"] == "pose"
+        assert expected in then.with_suffix(".md").read_text()
+
+
 @pytest.mark.parametrize("norm", ["batch", "none"])
 def test_a_start_that_was_told_less_of_a_voxel_does_not_listen_to_more(
     tmp_path: Path, norm: Literal["batch", "none"]

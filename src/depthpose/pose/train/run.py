@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.loop import Progress
 from depthpose.core.run import claim_folder, find_shard
@@ -55,6 +55,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     settings["sha256"] = [file_sha256(Path(path)) for path in files]
     if config.start is not None:
         settings["start_sha256"] = file_sha256(find_weights(config.start))
+        say_terms(read_checkpoint(find_weights(config.start)).facts)
     claim_folder(run.folder, settings)
     write_config(run.folder / "config.yaml", config)
 
@@ -64,7 +65,10 @@ def packed(
     models: tuple[ObjectModel, ...],
     config: Any,  # noqa: ANN401
 ) -> PoseWeights:
-    """Put a trained network and its objects together, with what the card says of them."""
+    """Put a trained network and its objects together, with what the card says of them.
+
+    Terms of the weights that it began with bind it too.
+    """
     frames: FramesConfig | None = config.frames
     cloud: CloudConfig = config.cloud
     names = ", ".join(model.name for model in models)
@@ -74,12 +78,17 @@ def packed(
         "stage": type(config).__name__,
         "licence": config.models.licence,
     }
+    terms = config.models.terms
+    if config.start is not None:
+        facts["began_with"] = Path(config.start).stem
+        theirs = read_checkpoint(find_weights(config.start)).facts.get("terms", "")
+        terms = terms if theirs in terms else f"{terms} {theirs}".strip()
     return PoseWeights(
         network=network.cpu().eval(),
         models=models,
         cloud=cloud,
         refusal=RefusalConfig(),
-        facts=facts | ({"terms": config.models.terms} if config.models.terms else {}),
+        facts=facts | ({"terms": terms} if terms else {}),
     )
 
 
