@@ -14,9 +14,9 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.cloud import object_points
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import ObjectModel, PoseEstimate
 
 LIVE = "live"
 _RECORDING = ".rrd"
@@ -75,9 +75,9 @@ class Viewer:
         """Show the cloud, the posed model and its keypoints; or why there is no pose."""
         rr = self._rerun
         self._next(given.name)
-        self._stream.log("seen", rr.Clear(recursive=True))
-        self._stream.log("posed", rr.Clear(recursive=True))
-        self._log("seen", self._points(_cloud_of(given, model), _SEEN))
+        self._log("seen", rr.Clear(recursive=True))
+        self._log("posed", rr.Clear(recursive=True))
+        self._log("seen", self._points(object_points(given, model.diameter_m), _SEEN))
         pose = estimate.camera_from_model
         if pose is None:
             self._log("reason", rr.TextLog(f"{given.name}: {estimate.status}: {estimate.reason}"))
@@ -147,12 +147,3 @@ def open_viewer(where: str | None) -> Iterator[Viewer | None]:
 
 def _bytes(image: Float[Tensor, "3 h w"]) -> Any:  # noqa: ANN401 - an array
     return (255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
-
-
-def _cloud_of(given: AnyInput, model: ObjectModel) -> Float[Tensor, "n 3"]:
-    points_m = (
-        cloud_from_depth(given.depth_m, given.mask, given.K, model.diameter_m)
-        if isinstance(given, ViewInput)
-        else given.points_m
-    )
-    return points_m[points_m.isfinite().all(-1)]

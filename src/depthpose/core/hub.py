@@ -140,9 +140,7 @@ def _explained(name: str) -> Iterator[None]:
 def _http_errors() -> tuple[type[Exception], ...]:
     """Give what the library's own errors are kinds of: requests', httpx's or its heir's."""
     own = import_module("huggingface_hub.errors").HfHubHTTPError
-    return tuple(
-        kind for kind in own.__mro__[1:] if kind.__module__.partition(".")[0] != "builtins"
-    )
+    return tuple(kind for kind in own.__mro__[1:] if kind.__module__ != "builtins")
 
 
 def _short(error: Exception) -> str:
