@@ -87,6 +87,14 @@ def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[st
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o"], "match with --weights"),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
          "l: no .png"),
+        (["export", "depth", "--weights", "parts", "--out", "d.onnx"],
+         "kind 'geoposenet'; depth takes"),
+        (["export", "pose", "--weights", "default", "--out", "p.onnx"],
+         "kind 'fakestereo', but a pose takes"),
+        (["export", "depth", "--weights", "nowhere", "--out", "d.onnx"],
+         "neither a file nor the name"),
+        (["export", "depth", "--out", "d.engine"], "end the name in .onnx"),
+        (["export", "depth", "--out", "d.onnx", "--format", "engine"], "onnx"),
     ],
 )  # fmt: skip
 def test_wrong_words_are_refused(

@@ -143,29 +143,3 @@ def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:
         depth_export(no_matcher, "pair", {}).graph()
     with pytest.raises(InputError, match="test_mode is 'batch'"):
         depth_export(by_chance, None, {}).graph()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["depth", "--weights", "parts", "--out", "d.onnx"], "kind 'geoposenet'; depth takes"),
-        (
-            ["pose", "--weights", "default", "--out", "p.onnx"],
-            "kind 'fakestereo', but a pose takes",
-        ),
-        (["depth", "--weights", "nowhere", "--out", "d.onnx"], "neither a file nor the name"),
-        (["depth", "--out", "d.engine"], "end the name in .onnx"),
-        (["depth", "--out", "d.onnx", "--format", "engine"], "onnx"),
-    ],
-)
-def test_wrong_words_are_refused(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["export", *words]) == 2
-    assert message in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
