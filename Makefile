@@ -6,6 +6,9 @@ READY := .venv/.ready
 # Real samples for the tests that need them; those tests skip, and say so, where there are none.
 export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
 
+# Test files side by side, one thread each: threads of torch in every worker would fight for cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+
 .PHONY: all setup demo test test-slow check docs bench clean
 all: check test
 
@@ -22,10 +25,10 @@ demo: $(READY)
 	$(BIN)/depthpose demo --out $(OUT)/demo
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 check: $(READY)
 	$(BIN)/ruff format --check .

@@ -19,7 +19,7 @@ FILES = sorted(FOLDER.glob("*.yaml"))
 
 
 def stage_of(path: Path) -> str:
-    return path.stem.removeprefix("compact-")
+    return path.stem.rpartition("-")[2]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
