@@ -300,6 +300,11 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
     assert not found["ok"]
     assert found["said"].startswith("Refused (")
     assert found["tables"] == {}
+    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
+    seen = page.get("/" + found["folder"] + "depth.ply").content
+    layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
+    count = layers["the object, as seen"]["count"]
+    assert f"element vertex {count}\n".encode() in seen
     assert "posed model" not in [layer["name"] for layer in found["scene"]["layers"]]
 
 

@@ -21,8 +21,8 @@ def serve(
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
 
     Args:
-        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it: there is
-            no password and no encryption, and any page that a browser has open may ask too.
+        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it, under any
+            name: there is no password and no encryption.
         port: where; 0 takes a free one.
         weights: of the depth networks, by name or file ('depthpose weights list').
         pose_weights: of a pose network, by name or file.

@@ -88,7 +88,8 @@ def train(
 def say_trained(path: Path) -> None:
     """Print where the weights of a training are, and their card."""
     print(f"trained weights: {path}")
-    print(path.with_suffix(".md").read_text(), end="")
+    card = path.with_suffix(".md")
+    print(card.read_text() if card.is_file() else "", end="")
 
 
 def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config

@@ -206,7 +206,7 @@ def push_weights(
                 "If you may, say --accept-terms."
             )
     card = path.with_suffix(".md")
-    text = read_text(card) if card.is_file() else card_text(path.stem, facts)
+    text = read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))
     url = hub.push_weights(path, hub.readme_of(text, facts), repository, is_private=not public)
     print(f"{url}: {path.name} ({path.stat().st_size / 1e6:.1f} MB) and its card; load them by "
           f"hf://{repository}")  # fmt: skip

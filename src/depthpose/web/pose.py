@@ -97,11 +97,11 @@ def _write(
     found: PoseEstimate,
     model: ObjectModel,
 ) -> list[Shown]:
-    """Write ``poses.json``, the posed model beside the cloud, and the picture that is shown."""
+    """Write ``poses.json``, the cloud with the posed model, and the picture that is shown."""
     pose = found.camera_from_model
     write_predictions(folder, [Prediction(estimate=found)])
-    if pose is not None:
-        write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
+    seen = _colored(points_m, _SEEN) if pose is None else posed_cloud(points_m, pose, model)
+    write_cloud(folder / f"{given.name}.ply", seen)
     if not isinstance(given, ViewInput):
         return []
     picture, caption = grey_depth(given.depth_m), "depth image, near bright"
