@@ -27,11 +27,11 @@ _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_e
 _BEGINS_WITH = ("start", "generator", "matcher")
 """Knobs that may name weights."""
 _MEASURED = {
-    ViewTraining: "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
+    "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
-    StereoTraining: "Disparity of pairs that were held out: mean error (px), and the share of "
+    "stereo": "Disparity of pairs that were held out: mean error (px), and the share of "
     "pixels off by more than 3 px and 5 % (d1).",
-    FinetuneTraining: "Disparity from left images that were held out, by the drawn right view: "
+    "finetune": "Disparity from left images that were held out, by the drawn right view: "
     "mean error (px), and the share of pixels off by more than 3 px and 5 % (d1).",
 }
 """What the numbers of each stage's validation are."""
@@ -157,7 +157,7 @@ def _leave(
     if find_shard().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
-    measured = held_out_text(run.folder, _MEASURED[STAGES[stage][0]])
+    measured = held_out_text(run.folder, _MEASURED[stage])
     leave_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 
