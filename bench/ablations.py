@@ -20,6 +20,7 @@ from curves import draw_curves
 from view_quality import measure
 
 from depthpose.cli import main as depthpose
+from depthpose.core.checkpoint import bound_facts
 from depthpose.core.files import write_json
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.report import markdown_table, write_table
@@ -176,7 +177,8 @@ class Bench:
             network.config = replace(network.config, test_mode=mode)
             both = home / f"apart-{mode}.safetensors"
             matcher = read_matcher(self.matcher())
-            write_depth_weights(both, generator=network, matcher=matcher, facts={})
+            facts = bound_facts({}, [generator, self.matcher()])
+            write_depth_weights(both, generator=network, matcher=matcher, facts=facts)
             rows.append(self.measure(arm, f"apart, {mode}" if mode == "batch" else "apart", both))
         return [*rows, self.measure(arm, "fine-tuned", self.tuned(arm, generator))]
 

@@ -13,7 +13,7 @@ import torch
 from tests.made_street import make_street
 
 from depthpose.cli import main
-from depthpose.core.checkpoint import read_checkpoint
+from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
 from depthpose.core.files import (
     read_image,
@@ -157,7 +157,9 @@ def test_a_baseline_is_said_to_be_left_alone(
     assert "baseline is not looked at" in capsys.readouterr().err
 
 
-def test_packing_writes_the_card_and_halves_the_file(home: Path, tmp_path: Path) -> None:
+def test_packing_writes_the_card_and_halves_the_file(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "packed-nc.safetensors"
     words = ["--trained-on", "drives", "--licence", "CC BY-NC-SA 3.0", "--terms", "research only"]
     assert main(["weights", "pack", str(home / "w.safetensors"), "--out", str(out), "--half",
@@ -167,6 +169,14 @@ def test_packing_writes_the_card_and_halves_the_file(home: Path, tmp_path: Path)
     with pytest.warns(UserWarning, match="research only"):
         assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 0
     assert read_checkpoint(tmp_path / "again.safetensors").facts["terms"] == "research only"
+    named = tmp_path / "named.safetensors"
+    with pytest.warns(UserWarning, match="research"):
+        assert main(["weights", "pack", "kitti-nc", "--matcher", "default", "--out", str(named),
+                     *words]) == 0  # fmt: skip
+    theirs = read_checkpoint(find_weights("kitti-nc")).facts["terms"]
+    assert read_checkpoint(named).facts["terms"] == f"research only {theirs}"
+    assert main(["weights", "pack", "kiti-nc", "--out", str(named), *words]) == 2
+    assert "neither a file nor the name of weights" in capsys.readouterr().err
     assert out.stat().st_size < (home / "w.safetensors").stat().st_size
     image = str(home / "images" / "0.png")
     with warnings.catch_warnings():
@@ -206,7 +216,9 @@ def test_training_by_config_and_words(
     words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
     words += ["--data", str(pairs), "--held-out", str(pairs), "--out", str(tmp_path / "run")]
     assert main([*words, "--steps", "2"]) == 0
-    assert "generator.safetensors" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "generator.safetensors" in said
+    assert "- **Time**: 2 steps in " in said
     assert "held_out/l1" in read_metrics(tmp_path / "run")[-1]
     assert list((tmp_path / "run" / "pictures").glob("*.png"))
     assert (tmp_path / "run" / "generator.safetensors").is_file()

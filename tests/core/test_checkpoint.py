@@ -13,8 +13,10 @@ from torch import nn
 
 from depthpose.core.checkpoint import (
     Checkpoint,
+    bound_facts,
     file_sha256,
     find_weights,
+    join_terms,
     load_weights,
     read_checkpoint,
     read_torch_file,
@@ -41,6 +43,36 @@ def test_a_checkpoint_survives_the_file(tmp_path: Path) -> None:
     other = nn.Linear(3, 2)
     load_weights(other, read, "w")
     torch.testing.assert_close(other.weight, network.weight, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("every", "joined"),
+    [
+        ([], ""),
+        (["", ""], ""),
+        (["", "For research.", "For research."], "For research."),
+        (["Cite us.", "", "For research."], "Cite us. For research."),
+        (["Cite us.", "Cite us. For research."], "Cite us. For research."),
+        (["Cite us. For research.", "Cite us."], "Cite us. For research."),
+        (["commercial", "non-commercial"], "commercial non-commercial"),
+    ],
+)
+def test_terms_of_all_parts_bind_the_whole_and_none_comes_twice(
+    every: list[str], joined: str
+) -> None:
+    assert join_terms(*({"terms": terms} if terms else {} for terms in every)) == joined
+
+
+def test_a_card_is_bound_by_what_the_weights_are_made_of(tmp_path: Path) -> None:
+    state = nn.Linear(3, 2).state_dict()
+    for name, terms in (("free", {}), ("bound", {"terms": "For research."})):
+        made = Checkpoint(kind="toy", config={}, state=state, facts=terms)
+        save_checkpoint(tmp_path / f"{name}.safetensors", made)
+    free, bound = (tmp_path / f"{name}.safetensors" for name in ("free", "bound"))
+    assert bound_facts({"licence": "MIT"}, [free]) == {"licence": "MIT"}
+    assert bound_facts({"terms": "Cite us."}, [free, bound]) == {"terms": "Cite us. For research."}
+    with pytest.raises(InputError, match="neither a file nor the name"):
+        bound_facts({}, ["nowhere"])
 
 
 def _truncate(path: Path) -> None:

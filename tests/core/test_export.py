@@ -46,7 +46,7 @@ def test_a_proven_file_runs_and_says_what_it_is(tmp_path: Path) -> None:
     facts = session.get_modelmeta().custom_metadata_map
     assert facts["licence"] == "MIT"
     assert json.loads(facts["objects"]) == ["cup"]
-    record = json.loads(path.with_suffix(".json").read_text())
+    record = json.loads(path.with_suffix(".proof.json").read_text())
     assert record["sha256"] == file_sha256(path)
     assert record["differences"] == rows
     assert {"torch", "onnx", "onnxruntime", "onnxscript"} <= record["environment"].keys()
@@ -143,6 +143,38 @@ def test_a_network_keeps_its_sizes_free_and_its_maker_to_itself() -> None:
         with torch.no_grad():
             expected = network(network(image))
         torch.testing.assert_close(torch.from_numpy(answer), expected, rtol=0, atol=1e-6)
+
+
+def test_a_camera_of_the_same_name_stays(tmp_path: Path) -> None:
+    (tmp_path / "line.json").write_text("my camera")
+    freeze(tmp_path / "line.onnx", line_export())
+    assert (tmp_path / "line.json").read_text() == "my camera"
+    assert (tmp_path / "line.proof.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("cases", "message"),
+    [
+        ([], r"no output is compared with PyTorch's; nothing is written\. Name a case\."),
+        (
+            [Case(name="2x3", inputs={"x": X}, expected={"y": 2 * X + 1}, where={"y": X > 9})],
+            r"y of 2x3: PyTorch gives not one number that could be compared, .* nothing is written",
+        ),
+        (
+            [Case(name="2x3", inputs={"x": np.full_like(X, np.nan)},
+                  expected={"y": np.full_like(X, np.nan)})],
+            r"y of 2x3: PyTorch gives not one number",
+        ),
+    ],
+)  # fmt: skip
+def test_what_nothing_is_compared_with_is_not_proven(
+    cases: list[Case], message: str, tmp_path: Path
+) -> None:
+    limits = {"y": Limit(value=0.0)}
+    export = Export(graph=line_graph, cases=lambda: cases, limits=limits, facts={})
+    with pytest.raises(InputError, match=message):
+        freeze(tmp_path / "line.onnx", export)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_only_the_part_that_is_named_is_compared(tmp_path: Path) -> None:

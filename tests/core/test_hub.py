@@ -279,7 +279,7 @@ def test_the_command_pushes_a_card_and_keeps_to_itself_what_is_new(
     path = write_weights(tmp_path / "part.safetensors", licence="MIT", trained_on="cups")
     assert main(["weights", "push", str(path), "me/part"]) == 0
     assert "load them by hf://me/part" in capsys.readouterr().out
-    assert "# part\n\n- **licence**: MIT\n- **trained_on**: cups\n" in readme_sent(api)
+    assert "# part\n\n- **Licence**: MIT\n- **Trained on**: cups\n" in readme_sent(api)
     assert api.calls[0][1]["private"]
     (tmp_path / "part.md").write_text("# The card\n")
     assert main(["weights", "push", str(path), "me/part", "--public"]) == 0

@@ -20,6 +20,9 @@ from depthpose.core.loop import (
     Interrupted,
     LoopConfig,
     Progress,
+    card_text,
+    held_out_text,
+    leave_card,
     read_metrics,
     shuffled_index,
     ticket_generator,
@@ -78,6 +81,43 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
         for name in ("whole", "parts")
     )
     assert one == other
+
+
+def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) -> None:
+    interrupted(tmp_path, loop(), after=5)
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert 0 < state["seconds"] < 1000
+    torch.save({**state, "seconds": 1000.0}, tmp_path / "state.pt")
+    assert train(ToyTask(), ToySamples(), loop(), tmp_path, resume=True) > 1000
+    del state["seconds"]  # as older versions left it
+    torch.save(state, tmp_path / "state.pt")
+    assert 0 < train(ToyTask(), ToySamples(), loop(), tmp_path, resume=True) < 1000
+
+
+def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
+    folder = tmp_path / "my part"
+    assert held_out_text(folder, "Errors.") == ("Nothing was held out, so nothing was measured.")
+    folder.mkdir()
+    rows = [{"step": 4, "held_out/error": 0.5}, {"step": 8, "held_out/error": 1 / 3},
+            {"step": 12, "net/loss": 0.1}]  # fmt: skip
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    measured = held_out_text(folder, "Errors (m).")
+    assert measured == "Errors (m).\n\n| held out | |\n| --- | --- |\n| error | 0.3333 |"
+    facts = {"trained_on": "kitti", "terms": "For research."}
+    leave_card(folder / "net.safetensors", "depth train view", 7300.0, facts, measured)
+    title, empty, *lines = (folder / "net.md").read_text().splitlines()
+    assert (title, empty) == ("# net", "")
+    assert lines[:3] == [
+        "- **Trained on**: kitti",
+        "- **Terms**: For research.",
+        "- **Command**: `depthpose depth train view --config config.yaml --out 'my part'`",
+    ]
+    assert lines[3].startswith("- **Time**: 12 steps in 2.0 h on Linux ")
+    assert "\n".join(lines[5:]) == measured
+    for seconds, said in ((3.4, "3 s"), (119.0, "119 s"), (300.0, "5 min")):
+        leave_card(folder / "net.safetensors", "", seconds, {}, "")
+        assert f" steps in {said} on " in (folder / "net.md").read_text()
+    assert card_text("net", {"licence": "MIT"}) == "# net\n\n- **Licence**: MIT\n"
 
 
 def test_training_learns_and_says_so(tmp_path: Path) -> None:

@@ -166,7 +166,19 @@ def test_terms_of_the_weights_are_said(generator: UNetGenerator, tmp_path: Path)
     facts = {"terms": "for research alone"}
     write_depth_weights(path, generator=generator, matcher=small_matcher(), facts=facts)
     with pytest.warns(LicenceNotice, match="for research alone"):
-        FakestereoNet.load(path)
+        assert FakestereoNet.load(path).terms == "for research alone"
+
+
+def test_terms_of_a_matcher_from_another_file_are_said(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    free, bound = tmp_path / "g.safetensors", tmp_path / "s-nc.safetensors"
+    write_depth_weights(free, generator=generator, facts={})
+    write_depth_weights(bound, matcher=small_matcher(), facts={"terms": "for research alone"})
+    with pytest.warns(LicenceNotice, match="for research alone"):
+        net = FakestereoNet.load(free, matcher=bound)
+    assert net.terms == "for research alone"
+    assert FakestereoNet.load(free, matcher="sgbm").terms == ""
 
 
 def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_the_sizeless_network_is_the_network(align_corners: bool) -> None:
 
 
 def test_depth_from_one_image_is_the_estimators_at_every_size(exported: Path) -> None:
-    record = json.loads((exported / "depth.json").read_text())
+    record = json.loads((exported / "depth.proof.json").read_text())
     found = {(row["input"], row["output"]): row for row in record["differences"]}
     assert len(found) == 16
     largest = {name: 0.0 for _, name in found}
@@ -104,7 +104,7 @@ def test_a_pair_needs_no_focal_length_where_the_weights_know_none(
 def test_a_pair_at_the_focal_length_of_the_weights(exported: Path) -> None:
     words = ["--weights", str(exported / "w.safetensors"), "--out", str(exported / "pair.onnx")]
     assert main(["export", "depth", *words, "--what", "pair"]) == 0
-    rows = json.loads((exported / "pair.json").read_text())["differences"]
+    rows = json.loads((exported / "pair.proof.json").read_text())["differences"]
     assert {row["output"] for row in rows} == {"disparity_px", "confidence"}
 
 

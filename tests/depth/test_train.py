@@ -9,6 +9,7 @@ from tests.made_street import make_street
 from torch import Tensor, nn
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_disparity_png, write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
@@ -34,7 +35,7 @@ from depthpose.depth.train import (
     train_view,
 )
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.depth.weights import read_depth_weights
+from depthpose.depth.weights import read_depth_weights, write_depth_weights
 
 GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
 MATCHER = PSMNetConfig(width=4, max_disparity_px=32, blocks=(1, 1, 1, 1), pools=(4, 2))
@@ -172,6 +173,12 @@ def test_the_three_stages_run_and_their_weights_estimate(folder: Path, tmp_path:
         assert last["step"] == 3
         assert last[f"held_out/{number}"] > 0
         assert list((tmp_path / stage / "pictures").glob("*.png"))
+    for path, word in ((generator, "view"), (matcher, "stereo"), (both, "finetune")):
+        card = path.with_suffix(".md").read_text()
+        assert f"- **Trained on**: {folder.name}\n" in card
+        assert f"`depthpose depth train {word} --config config.yaml --out " in card
+        assert "- **Time**: 3 steps in " in card
+        assert ("| l1 | " if word == "view" else "| epe_px | ") in card
     assert "FinetuneTraining" in (tmp_path / "tune" / "run.json").read_text()
 
 
@@ -297,6 +304,43 @@ def test_a_warm_start_begins_with_the_given_weights(pairs: PairsConfig, tmp_path
     assert other is not None
     for name, parameter in one.named_parameters():
         torch.testing.assert_close(parameter, dict(other.named_parameters())[name])
+
+
+def terms_and_card(weights: Path) -> tuple[str | None, str]:
+    return read_depth_weights(weights).facts.get("terms"), weights.with_suffix(".md").read_text()
+
+
+def test_terms_of_what_a_training_begins_with_bind_what_comes_of_it(
+    pairs: PairsConfig, tmp_path: Path
+) -> None:
+    generator, matcher = tmp_path / "g.safetensors", tmp_path / "s.safetensors"
+    write_depth_weights(generator, generator=UNetGenerator(GENERATOR), facts={"terms": "Cite us."})
+    write_depth_weights(matcher, matcher=PSMNet(MATCHER), facts={"terms": "For research alone."})
+    loop = dataclasses.replace(LOOP, steps=1)
+    view = ViewTraining(
+        generator=GENERATOR, discriminator="none", pairs=pairs, loop=loop, start=str(generator)
+    )
+    with pytest.warns(LicenceNotice, match="Cite us"):
+        drawn = train_view(view, Run(folder=tmp_path / "view"))
+    stereo = StereoTraining(matcher=MATCHER, pairs=pairs, loop=loop, start=str(matcher))
+    with pytest.warns(LicenceNotice, match="For research alone"):
+        matched = train_stereo(stereo, Run(folder=tmp_path / "stereo"))
+    tune = FinetuneTraining(generator=str(drawn), matcher=str(matched), pairs=pairs, loop=loop)
+    with pytest.warns(LicenceNotice, match="Cite us. For research alone"):
+        both = train_finetune(tune, Run(folder=tmp_path / "tune"))
+    for path, terms in (
+        (drawn, "Cite us."),
+        (matched, "For research alone."),
+        (both, "Cite us. For research alone."),
+    ):
+        found, card = terms_and_card(path)
+        assert found == terms
+        assert f"- **Terms**: {terms}\n" in card
+    assert read_depth_weights(both).facts["began_with"] == "generator, matcher"
+    free = train_view(dataclasses.replace(view, start=None), Run(folder=tmp_path / "free"))
+    found, card = terms_and_card(free)
+    assert found is None
+    assert "Terms" not in card
 
 
 def test_streets_are_made_while_training() -> None:

@@ -297,6 +297,7 @@ def test_terms_are_said_and_names_are_found(part: ObjectModel, tmp_path: Path) -
     with pytest.warns(LicenceNotice, match="for research alone"):
         net = depthpose.GeoPoseNet.load(tmp_path / "part-nc.safetensors")
     assert net.objects == ("bracket",)
+    assert net.terms == "for research alone"
     with pytest.raises(InputError, match="neither a file nor the name of weights"):
         GeoPoseNet.load("no-such")
 

@@ -85,7 +85,7 @@ def test_the_command_writes_what_a_user_of_the_file_must_know(
     words = ["--weights", str(tmp_path / "w.safetensors"), "--out", str(tmp_path / "p.onnx")]
     assert main(["export", "pose", *words]) == 0
     assert "clouds 3 | directions |" in capsys.readouterr().out
-    record = json.loads((tmp_path / "p.json").read_text())
+    record = json.loads((tmp_path / "p.proof.json").read_text())
     assert record["facts"]["cloud"]["voxel_m"] == weights.cloud.voxel_m
     assert record["facts"]["objects"] == [model.name for model in weights.models]
     assert len(record["differences"]) == 4

@@ -59,7 +59,13 @@ def test_true_votes_end_at_their_keypoints() -> None:
     pose, model = pose_at(), bracket()
     net = Oracle(tiny_weights(model), [pose])
     given = CloudInput(name="c", points_m=cloud_of(model, pose), object=model.name)
-    voted = net.votes_of(given)
+    found, voted = net.estimate_with_votes(given)
+    assert net.calls == [1], "the network runs once for both"
+    assert found.is_ok
+    (alone,) = net.estimate_many([given])
+    assert found.camera_from_model is not None
+    assert alone.camera_from_model is not None
+    assert torch.equal(found.camera_from_model.t_m, alone.camera_from_model.t_m)
     assert voted is not None
     keypoints_m = pose.apply(model.keypoints_m)
     layer = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], keypoints_m)
@@ -73,7 +79,8 @@ def test_what_cannot_be_posed_casts_no_votes() -> None:
     model = bracket()
     net = Oracle(tiny_weights(model), [pose_at()])
     empty = CloudInput(name="c", points_m=torch.empty(0, 3), object=model.name)
-    assert net.votes_of(empty) is None
+    found, voted = net.estimate_with_votes(empty)
+    assert (found.is_ok, voted, net.calls) == (False, None, [])
 
 
 def test_a_refused_pose_still_shows_what_was_voted() -> None:

@@ -45,7 +45,7 @@ from depthpose.pose.train import (
 )
 from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objects
-from depthpose.pose.train.judge import calibrated, card_text, judged
+from depthpose.pose.train.judge import calibrated, judged, table_text
 from depthpose.pose.train.run import packed
 from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
@@ -264,7 +264,10 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
     assert weights.cloud == _CLOUD
     assert "made views of bracket" in weights.facts["trained_on"]
     card = path.with_suffix(".md").read_text()
-    assert "Objects: bracket (160 mm)." in card
+    assert "- **Objects**: bracket (160 mm)\n" in card
+    assert "`depthpose pose train --what pose --config config.yaml --out run`" in card
+    assert "- **Time**: " in card
+    assert "| hidden % | right % |" in card
     rows = json.loads(path.with_suffix(".json").read_text())["held_out"]
     assert set(rows) == {"0"}
     shares = [rows["0"][name] for name in ("right", "wrong", "refused")]
@@ -421,9 +424,8 @@ def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatc
     opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
     without = judged(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
     assert without["wrong"] == pytest.approx(0.4)
-    text = card_text(weights.models, {"licence": "MIT"}, table)
-    assert "| hidden % | right % | wrong % | refused %" in text
-    assert "Licence: MIT." in text
+    assert "| hidden % | right % | wrong % | refused %" in table_text(table)
+    assert table_text(table).splitlines()[-1].startswith("| 0 | ")
 
 
 def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,12 @@ import torch.nn.functional as F
 from tests.pose.made_object import bottle, bracket
 from tests.pose.stopping import StoppedError, stop_after
 
-from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    LicenceNotice,
+    read_checkpoint,
+    save_checkpoint,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
@@ -86,10 +91,25 @@ def test_the_pointnet_trains_and_its_file_is_an_estimators(
 def test_the_depth_image_trains_and_its_file_is_a_regressors(
     models_folder: Path, tmp_path: Path
 ) -> None:
-    path = STAGES["depth-image"][1](depth_image_config(models_folder), Run(folder=tmp_path))
+    config = depth_image_config(models_folder)
+    models = dataclasses.replace(config.models, licence="MIT", terms="For research alone.")
+    config = dataclasses.replace(config, models=models)
+    path = STAGES["depth-image"][1](config, Run(folder=tmp_path))
     assert path == tmp_path / "depth-image.safetensors"
     assert "held_out/occluded_0/regressed_median" in read_metrics(tmp_path)[-1]
-    regressor = DepthImageRegressor.load(path)
+    card = path.with_suffix(".md").read_text()
+    for said in (
+        "- **Objects**: bracket (268 mm)\n",
+        "- **Trained on**: made views of bracket\n",
+        "- **Licence**: MIT\n",
+        "- **Terms**: For research alone.\n",
+        "`depthpose pose train --what depth-image --config config.yaml --out ",
+        "- **Time**: 2 steps in ",
+        "| occluded_0/regressed_median | ",
+    ):
+        assert said in card
+    with pytest.warns(LicenceNotice, match="For research alone"):
+        regressor = DepthImageRegressor.load(path)
     view = Objects([bracket()], MADE).view(0).input
     found, refused = regressor.estimate_many(
         [view, dataclasses.replace(view, mask=view.mask & False)]
@@ -259,6 +279,17 @@ def test_segmentation_learns_colored_boxes_and_says_where(colored: Path, tmp_pat
     found = Segmenter.load(path).segment(image)
     assert set(found.masks) <= {"bottle", "bracket"}
     assert (tmp_path / "whole/pictures/0000060_found_truth.png").is_file()
+    card = path.with_suffix(".md").read_text()
+    for said in (
+        "- **Objects**: bottle, bracket\n",
+        f"- **Trained on**: {colored.name}\n",
+        "- **Licence**: not stated; that of the training data binds\n",
+        "`depthpose pose train --what segmentation --config config.yaml --out whole`",
+        "- **Time**: 60 steps in ",
+        f"| iou_objects | {last['held_out/iou_objects']:.4g} |",
+    ):
+        assert said in card
+    assert "Terms" not in card
     settings = json.loads((tmp_path / "whole/run.json").read_text())
     assert settings["settings"]["stage"] == "SegmentationTraining"
 
@@ -267,12 +298,19 @@ def test_segmentation_starts_from_an_encoder(colored: Path, tmp_path: Path) -> N
     torch.manual_seed(1)
     encoder = ResNet18(widths=(8, 8, 16, 16))
     path = tmp_path / "encoder.safetensors"
-    save_checkpoint(path, Checkpoint(kind="resnet18", config={}, state=encoder.state_dict()))
+    facts = {"terms": "For research alone."}
+    state = encoder.state_dict()
+    save_checkpoint(path, Checkpoint(kind="resnet18", config={}, state=state, facts=facts))
     config = dataclasses.replace(
         segmentation_config(colored, 1), start=str(path), adam=AdamConfig(learning_rate=1e-9)
     )
-    trained = STAGES["segmentation"][1](config, Run(folder=tmp_path / "run"))
-    kept = Segmenter.load(trained).weights.network.encoder.state_dict()
+    with pytest.warns(LicenceNotice, match="For research alone"):
+        trained = STAGES["segmentation"][1](config, Run(folder=tmp_path / "run"))
+    assert "- **Began with**: encoder\n- **Terms**: For research alone.\n" in (
+        trained.with_suffix(".md").read_text()
+    )
+    with pytest.warns(LicenceNotice, match="For research alone"):
+        kept = Segmenter.load(trained).weights.network.encoder.state_dict()
     name = "layer3.0.conv1.weight"
     torch.testing.assert_close(kept[name], encoder.state_dict()[name])
 

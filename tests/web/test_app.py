@@ -8,6 +8,7 @@ import threading
 import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -175,6 +176,75 @@ def test_a_focal_length_that_asks_for_a_huge_picture_is_refused(
     assert (status, "more than this page computes" in text) == (400, True)
 
 
+def test_weights_that_match_pairs_as_they_are_have_a_limit_too(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: torch.Tensor) -> torch.Tensor:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("depthpose.web.depth._MOST_WORK_PIXELS", 20_000)
+    app = make_app(FakestereoNet(CallableMatcher(never)), nets[1])
+    files = {**PAIR, "camera": "camera.json"}
+    status, text = refusal(ask(TestClient(app, base_url=URL), "depth", samples, files))
+    assert status == 400
+    camera = json.loads((samples / "camera.json").read_text())
+    assert text == (
+        f"left has {camera['width']}x{camera['height']} pixels; these weights match pairs as they "
+        "are, and this page computes 0.02 million at most; scale both images down, and the focal "
+        "length with them, or use the command line"
+    )
+
+
+def test_the_matcher_may_want_a_larger_picture_than_the_generator(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthesiser = nets[0].synthesiser
+    assert synthesiser is not None
+    focal_px = synthesiser.generator.config.virtual_focal_px
+    monkeypatch.setattr("depthpose.web.depth.work_focal_px", lambda _: 100 * focal_px)
+    app = make_app(FakestereoNet(nets[0].matcher, synthesiser), nets[1])
+    files = {"image": "left.png", "camera": "camera.json"}
+    status, text = refusal(ask(TestClient(app, base_url=URL), "depth", samples, files))
+    assert (status, "more than this page computes" in text) == (400, True)
+
+
+def test_terms_of_the_weights_stand_beside_the_answer(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, truth: Rigid, page: TestClient
+) -> None:
+    depth, pose = nets
+    facts = {**pose.weights.facts, "terms": "For tests alone."}
+    bound = make_app(
+        FakestereoNet(depth.matcher, depth.synthesiser, terms="For research alone."),
+        GeoPoseNet(replace(pose.weights, facts=facts)),
+    )
+    client = TestClient(bound, base_url=URL)
+    image = {"image": "left.png", "camera": "camera.json"}
+    assert ask(client, "depth", samples, image).json()["terms"] == "For research alone."
+    assert ask(client, "pose", samples, VIEW, object=PART).json()["terms"] == "For tests alone."
+    assert ask(page, "depth", samples, image).json()["terms"] == ""
+    assert ask(page, "pose", samples, VIEW, object=PART).json()["terms"] == ""
+
+
+def test_the_network_is_asked_once(
+    nets: tuple[FakestereoNet, GeoPoseNet],
+    samples: Path,
+    truth: Rigid,
+    page: TestClient,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+    directions = nets[1]._directions
+
+    def counted(*words: Any) -> Any:  # noqa: ANN401
+        asked.append(1)
+        return directions(*words)
+
+    monkeypatch.setattr(nets[1], "_directions", counted)
+    found = ask(page, "pose", samples, VIEW, object=PART).json()
+    assert "votes" in [layer["name"] for layer in found["scene"]["layers"]]
+    assert asked == [1]
+
+
 def test_a_picture_of_too_many_pixels_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,6 +300,11 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
     assert not found["ok"]
     assert found["said"].startswith("Refused (")
     assert found["tables"] == {}
+    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
+    seen = page.get("/" + found["folder"] + "depth.ply").content
+    layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
+    count = layers["the object, as seen"]["count"]
+    assert f"element vertex {count}\n".encode() in seen
     assert "posed model" not in [layer["name"] for layer in found["scene"]["layers"]]
 
 
@@ -287,6 +362,7 @@ def test_open3d_poses_a_cad_file_that_no_weights_know(
     assert dict(found["facts"])["by"].startswith("Open3D")
     assert found["ok"], found["said"]
     assert list(found["tables"]) == ["camera_from_model: R | t [m]"], "it has no covariance"
+    assert found["terms"] == ""
 
 
 def test_what_is_too_large_is_refused_before_it_is_read(

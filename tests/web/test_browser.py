@@ -109,6 +109,7 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     page.goto(address)
     files = {"image": samples / "left.png", "camera": samples / "camera.json"}
     assert "half of these are nearer than" in send(page, "depth", files)
+    assert page.locator("#depth .terms").count() == 0, "the weights have none"
     assert 0.05 < drawn_share(page, "#depth") < 1
     pictures = page.locator("#depth .pictures img")
     assert pictures.count() == 3
@@ -131,6 +132,29 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     assert picture_of(page, "#depth") != before, "the cloud turns"
 
 
+def test_terms_of_the_weights_are_read_with_the_answer(
+    page: Page, address: str, samples: Path
+) -> None:
+    page.add_init_script("""const real = window.fetch;
+      window.fetch = async (...words) => {
+        const answer = await real(...words);
+        if (!answer.url.includes("/estimate/")) return answer;
+        const terms = "For <b>research</b> alone";
+        return new Response(JSON.stringify({ ...await answer.json(), terms }));
+      };""")
+    rooms = {
+        "depth": {"image": "left.png", "camera": "camera.json"},
+        "pose": {"cloud": "cloud.ply"},
+    }
+    for room, names in rooms.items():
+        page.goto(f"{address}#{room}")
+        page.reload()
+        page.locator("#pose details.box").evaluate("box => { box.open = true; }")
+        send(page, room, {field: samples / name for field, name in names.items()})
+        said = page.locator(f"#{room} [aria-live] .terms").text_content(timeout=5000)
+        assert said == "Terms of the weights: For <b>research</b> alone"
+
+
 def test_depth_bad(page: Page, address: str, samples: Path) -> None:
     page.goto(address)
     said = send(page, "depth", {"image": samples / "words.txt"})
@@ -148,6 +172,7 @@ def test_pose_good(page: Page, address: str, samples: Path) -> None:
     view = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
     said = send(page, "pose", {field: samples / name for field, name in view.items()})
     assert said.startswith(f"The {PART} is at x ")
+    assert page.locator("#pose .terms").count() == 0, "the weights have none"
     assert drawn_share(page, "#pose") > 0.02
     votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^ votes$"))
     before = picture_of(page, "#pose")

@@ -17,7 +17,7 @@ def export_depth(
     The graph does all that the estimator does, at any size: from one image and its K, the virtual
     rig, the drawn right view, the match, and metres; or from a pair, disparity and confidence. Its
     answers are compared with PyTorch's at several sizes; beyond the limit nothing is written, else
-    the differences stand in FILE.json. Needs the extra export.
+    the differences stand in NAME.proof.json. Needs the extra export.
 
         depthpose export depth --out depth.onnx
         depthpose export depth --weights psmnet.safetensors --out psmnet.onnx
@@ -47,7 +47,7 @@ def export_pose(out: Path, weights: str = "parts", format: Format = "onnx") -> i
     from each to every keypoint of every object; coarser levels and kernel maps are made inside it.
     Voxelising before it, and voting, ICP and the refusal after it, are not in it. Its answers are
     compared with PyTorch's on several clouds; beyond the limit nothing is written, else the
-    differences stand in FILE.json. Needs the extra export.
+    differences stand in NAME.proof.json. Needs the extra export.
 
         depthpose export pose --out pose.onnx
 
@@ -75,10 +75,11 @@ def _facts(weights: str, path: Path, card: Any, format: Format) -> dict[str, Any
 
 
 def _say(out: Path, rows: Any) -> int:  # noqa: ANN401
+    from depthpose.core.export import proof_path
     from depthpose.core.report import markdown_table
 
     shown = [{k: f"{v:.1e}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     print(markdown_table(shown), end="")
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences stand in "
-          f"{out.with_suffix('.json').name}")  # fmt: skip
+          f"{proof_path(out).name}")  # fmt: skip
     return 0

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from depthpose.cli.training import changed, progress_bar
+from depthpose.cli.training import changed, progress_bar, say_trained
 from depthpose.core.errors import InputError
 
 _START = "parts"
@@ -85,9 +85,7 @@ def train(
         run = Run(folder=out, resume=resume, on_step=on_step, tell=print if is_first else None)
         path = run_stage(chosen, run)
     if is_first:
-        print(f"trained weights: {path}")
-        card = path.with_suffix(".md")
-        print(card.read_text() if card.is_file() else "", end="")
+        say_trained(path)
     return 0
 
 

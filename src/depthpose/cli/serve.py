@@ -21,15 +21,15 @@ def serve(
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
 
     Args:
-        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it: there is
-            no password and no encryption.
+        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it, under any
+            name: there is no password and no encryption.
         port: where; 0 takes a free one.
         weights: of the depth networks, by name or file ('depthpose weights list').
         pose_weights: of a pose network, by name or file.
         max_upload_mb: all files of one request together [1e6 bytes].
     """
     try:
-        from depthpose.web import LOOPBACK, Limits, make_app, open_socket, run
+        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
@@ -39,13 +39,14 @@ def serve(
     if max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
     taken = open_socket(host, port)
-    is_open = host in ("0.0.0.0", "::")  # noqa: S104  the user's word, compared
-    limits = Limits(
-        upload_bytes=max_upload_mb * 10**6, hosts=None if is_open else (*LOOPBACK, host.lower())
-    )
+    address = taken_address(taken)
+    limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=known_names(host, address))
     app = make_app(FakestereoNet.load(weights), GeoPoseNet.load(pose_weights), limits)
-    shown = f"[{host}]" if ":" in host else host
+    shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
+    if not address.is_loopback:
+        print("whoever can reach this address may use the page: no password, no encryption",
+              flush=True)  # fmt: skip
     try:
         run(app, taken)
     except KeyboardInterrupt:

@@ -81,8 +81,15 @@ def train(
     with progress_bar(view) as on_step:
         path = run_stage(chosen, Run(folder=out, resume=resume, on_step=on_step))
     if find_shard().rank == 0:
-        print(f"trained weights: {path}")
+        say_trained(path)
     return 0
+
+
+def say_trained(path: Path) -> None:
+    """Print where the weights of a training are, and their card."""
+    print(f"trained weights: {path}")
+    card = path.with_suffix(".md")
+    print(card.read_text() if card.is_file() else "", end="")
 
 
 def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config

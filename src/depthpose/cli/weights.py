@@ -1,6 +1,5 @@
 """``depthpose weights ...``."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -102,11 +101,11 @@ def import_weights(
 
 
 def pack_weights(
-    weights: tyro.conf.Positional[Path],
+    weights: tyro.conf.Positional[str],
     out: Path,
     trained_on: str,
     licence: str,
-    matcher: Path | None = None,
+    matcher: str | None = None,
     terms: str = "",
     half: bool = False,
 ) -> int:
@@ -116,29 +115,27 @@ def pack_weights(
             --trained-on 'my drives of 2026' --licence MIT --half
 
     Args:
-        weights: weights of the generator, of the matcher, or of both.
+        weights: weights of the generator, of the matcher, or of both, by name or file.
         out: the .safetensors file to write.
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
-        matcher: take the matcher from this file.
+        matcher: take the matcher from these weights.
         terms: said whenever the weights are loaded; for licences that bind the user. Those of the
             weights that are packed stay beside them.
         half: store 16-bit floats: half the size.
     """
-    from depthpose.core.checkpoint import read_checkpoint, say_terms
+    from depthpose.core.checkpoint import bound_facts, find_weights, say_terms
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
-    found = read_depth_weights(weights)
-    for source in filter(None, (weights, matcher)):
-        bound = read_checkpoint(source).facts
-        say_terms(bound)
-        if bound.get("terms", "") not in terms:
-            terms = f"{terms} {bound['terms']}".strip()
+    found = read_depth_weights(find_weights(weights))
+    made_of = [weights] if matcher is None else [weights, matcher]
+    say_terms(bound_facts({}, made_of))
+    facts = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
     write_depth_weights(
         out,
         generator=found.generator,
-        matcher=found.matcher if matcher is None else read_matcher(matcher),
-        facts={"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {}),
+        matcher=found.matcher if matcher is None else read_matcher(find_weights(matcher)),
+        facts=bound_facts(facts, made_of),
         with_half=half,
     )
     return show_weights(str(out))
@@ -197,6 +194,7 @@ def push_weights(
     from depthpose.core.checkpoint import find_weights, read_checkpoint
     from depthpose.core.errors import InputError
     from depthpose.core.files import read_text
+    from depthpose.core.loop import card_text
 
     path = find_weights(weights)
     facts = read_checkpoint(path).facts
@@ -208,14 +206,8 @@ def push_weights(
                 "If you may, say --accept-terms."
             )
     card = path.with_suffix(".md")
-    text = read_text(card) if card.is_file() else _card(path.stem, facts)
+    text = read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))
     url = hub.push_weights(path, hub.readme_of(text, facts), repository, is_private=not public)
     print(f"{url}: {path.name} ({path.stat().st_size / 1e6:.1f} MB) and its card; load them by "
           f"hf://{repository}")  # fmt: skip
     return 0
-
-
-def _card(name: str, facts: Mapping[str, str]) -> str:
-    return "\n".join(
-        [f"# {name}", "", *(f"- **{key}**: {value}" for key, value in sorted(facts.items())), ""]
-    )

@@ -4,7 +4,7 @@ import hashlib
 import json
 import pickle
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -163,6 +163,32 @@ def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
     """Warn of terms that bind whoever uses the weights, where their card has any."""
     if terms := facts.get("terms", ""):
         warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
+
+
+def join_terms(*cards: Mapping[str, str]) -> str:
+    """Give the terms of all cards together: those of the parts bind the whole; none comes twice."""
+    joined = ""
+    for terms in filter(None, (card.get("terms", "") for card in cards)):
+        if f" {joined} " in f" {terms} ":  # whole words: "commercial" is not "non-commercial"
+            joined = terms
+        elif f" {terms} " not in f" {joined} ":
+            joined = f"{joined} {terms}".strip()
+    return joined
+
+
+def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
+    """Add to a card the terms of the weights that something is made of.
+
+    Args:
+        facts: the card, with terms of its own if it has any.
+        made_of: what names weights, as for :func:`find_weights`.
+
+    Raises:
+        InputError: there are no such weights.
+    """
+    cards = [read_checkpoint(find_weights(name)).facts for name in made_of]
+    terms = join_terms(facts, *cards)
+    return {**facts, "terms": terms} if terms else dict(facts)
 
 
 def file_sha256(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from depthpose.web.app import Limits as Limits
 from depthpose.web.app import make_app as make_app
-from depthpose.web.guard import LOOPBACK as LOOPBACK
+from depthpose.web.server import known_names as known_names
 from depthpose.web.server import open_socket as open_socket
 from depthpose.web.server import run as run
+from depthpose.web.server import taken_address as taken_address

@@ -35,6 +35,7 @@ class Answer:
         tables: by title, rows of equal length.
         pictures: some of the files.
         scene: the 3D view.
+        terms: of the weights that were used, where they bind whoever uses them.
         files: to be taken away, by name.
     """
 
@@ -42,6 +43,7 @@ class Answer:
     said: str
     facts: Sequence[tuple[str, str]]
     scene: Scene
+    terms: str = ""
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
     pictures: Sequence[Shown] = ()
     files: Mapping[str, bytes] = field(default_factory=dict)

@@ -152,6 +152,7 @@ class Pages:
         return {
             "ok": answer.is_ok,
             "said": answer.said,
+            "terms": answer.terms,
             "facts": list(answer.facts),
             "tables": dict(answer.tables),
             "pictures": [vars(picture) for picture in answer.pictures],

@@ -1,5 +1,6 @@
 """The tab Depth: a picture or a pair, and what is known of its camera, to depth in metres."""
 
+import math
 import time
 
 from depthpose.core.camera import Camera, StereoRig
@@ -49,6 +50,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         facts=_facts(pair, found, seconds, is_guess=is_guess),
         pictures=pictures,
         scene=scene,
+        terms=net.terms,
         files=read_files(folder),
     )
 
@@ -102,15 +104,21 @@ def _range_m(form: Form) -> tuple[float, float]:
 
 
 def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
-    """A focal length that is too small makes the networks' picture as much larger."""
+    """Refuse what the networks would see too large: a small focal length enlarges the picture."""
     camera = pair.camera
     assert camera is not None
-    focal_px = work_focal_px(net.matcher)
+    wanted_px = [work_focal_px(net.matcher)]
     if pair.right is None and net.synthesiser is not None:
-        focal_px = net.synthesiser.generator.config.virtual_focal_px
-    if focal_px is None:
-        return
-    rows, columns = focal_size(camera, focal_px)
+        wanted_px.append(net.synthesiser.generator.config.virtual_focal_px)
+    sizes = [focal_size(camera, focal_px) for focal_px in wanted_px if focal_px is not None]
+    height, width = pair.left.shape[1:]
+    if not sizes and height * width > _MOST_WORK_PIXELS:
+        raise InputError(
+            f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
+            f"they are, and this page computes {_MOST_WORK_PIXELS / 1e6:g} million at most; scale "
+            "both images down, and the focal length with them, or use the command line"
+        )
+    rows, columns = max(sizes, key=math.prod, default=(0, 0))
     if rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
             f"a focal length of {float(camera.K[0, 0]):g} px for {camera.width}x{camera.height} "

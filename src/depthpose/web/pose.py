@@ -24,7 +24,7 @@ from depthpose.core.scene import Layer, Scene
 from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator import GeoPoseNet, Voted
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface
 from depthpose.pose.overlay import (
@@ -73,10 +73,10 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     given = _input(form, target.model)
     points_m = object_points(given, target.model.diameter_m)
     if target.registration is None:
-        (found,) = net.estimate_many([given])
+        (found, voted), terms = net.estimate_with_votes(given), net.terms
     else:
         cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-        found = target.registration.estimate(cloud)
+        found, voted, terms = target.registration.estimate(cloud), None, ""
     folder = form.results()
     return Answer(
         is_ok=found.is_ok,
@@ -84,7 +84,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         facts=_facts(found, target),
         tables=_tables(found),
         pictures=_write(folder, given, points_m, found, target.model),
-        scene=_scene(given, points_m, found, target, net),
+        scene=_scene(given, points_m, found, target.model, voted),
+        terms=terms,
         files=read_files(folder),
     )
 
@@ -96,11 +97,11 @@ def _write(
     found: PoseEstimate,
     model: ObjectModel,
 ) -> list[Shown]:
-    """Write ``poses.json``, the posed model beside the cloud, and the picture that is shown."""
+    """Write ``poses.json``, the cloud with the posed model, and the picture that is shown."""
     pose = found.camera_from_model
     write_predictions(folder, [Prediction(estimate=found)])
-    if pose is not None:
-        write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
+    seen = _colored(points_m, _SEEN) if pose is None else posed_cloud(points_m, pose, model)
+    write_cloud(folder / f"{given.name}.ply", seen)
     if not isinstance(given, ViewInput):
         return []
     picture, caption = grey_depth(given.depth_m), "depth image, near bright"
@@ -256,17 +257,16 @@ def _scene(
     given: CloudInput | ViewInput,
     points_m: Float[Tensor, "n 3"],
     found: PoseEstimate,
-    target: _Target,
-    net: GeoPoseNet,
+    model: ObjectModel,
+    voted: Voted | None,
 ) -> Scene:
     """Show what was seen, the votes and the posed model."""
     layers = [Layer(name="the object, as seen", shape=_colored(points_m, _SEEN))]
-    pose, model = found.camera_from_model, target.model
+    pose = found.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model)
     if found.keypoints_m is not None:
         layers += keypoint_layers(found.keypoints_m, pose, model)
-        voted = net.votes_of(given) if target.registration is None else None
         if voted is not None:
             directions = voted.outputs[..., :3]
             layers.append(vote_layer(voted.cloud.points_m, directions, found.keypoints_m))

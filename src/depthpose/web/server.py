@@ -1,11 +1,13 @@
 """The process that answers: a socket of this machine, and uvicorn on it."""
 
 import socket
+from ipaddress import IPv4Address, IPv6Address, ip_address
 
 import uvicorn
 from starlette.applications import Starlette
 
 from depthpose.core.errors import InputError
+from depthpose.web.guard import LOOPBACK
 
 _CONNECTIONS = 40
 _LEAVE_S = 2
@@ -29,6 +31,23 @@ def open_socket(host: str, port: int) -> socket.socket:
             f"{host}:{port} cannot be used: {error}; choose another --port (0: any that is free) "
             "or --host (127.0.0.1: this machine alone)"
         ) from error
+
+
+def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
+    """Give the address that was taken, however it was written."""
+    found = ip_address(taken.getsockname()[0])
+    return found.ipv4_mapped or found if isinstance(found, IPv6Address) else found
+
+
+def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:
+    """Give the names under which a page may be asked for; None: any, as it is open to everyone.
+
+    Args:
+        host: the address as the user wrote it. '', '0', '0x0' and '::0' mean all addresses too, so
+            it does not say whether the page is open.
+        address: what was taken for it.
+    """
+    return None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
 
 
 def run(app: Starlette, taken: socket.socket) -> None:

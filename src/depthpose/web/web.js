@@ -83,6 +83,8 @@ function show(answer, found) {
   const note = found.scene.note ? ` (${found.scene.note})` : "";
   answer.append(
     made("p", { className: `said ${found.ok ? "" : "refused"}`, textContent: found.said }),
+    ...(found.terms ? [made("p", { className: "terms" },
+      made("b", { textContent: "Terms of the weights: " }), found.terms)] : []),
     made("dl", { className: "facts" }, ...found.facts.flatMap(([name, value]) =>
       [made("dt", { textContent: name }), made("dd", { textContent: value })])),
     made("figure", { className: "space" }, scene,

@@ -33,7 +33,7 @@ class Export:
 
 
 def freeze(path: Path, export: Export) -> list[Row]:
-    """Write ``path``, once its answers agree with PyTorch's, and the proof beside it as JSON.
+    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it.
 
     Returns:
         The differences, a row for each input and output.
@@ -60,5 +60,10 @@ def freeze(path: Path, export: Export) -> list[Row]:
             "facts": facts,
             "differences": rows,
         }
-        write_json(path.with_suffix(".json"), record)
+        write_json(proof_path(path), record)
     return rows
+
+
+def proof_path(path: Path) -> Path:
+    """Give the place of a graph's proof; NAME.json may be somebody's camera."""
+    return path.with_suffix(".proof.json")

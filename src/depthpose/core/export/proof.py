@@ -51,7 +51,8 @@ def measure_differences(
     """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
 
     Raises:
-        InputError: an output is NaN where PyTorch's is not, or the other way round.
+        InputError: an output is NaN where PyTorch's is not, or the other way round; or there is no
+            number to compare.
     """
     session = import_module("onnxruntime").InferenceSession(
         str(path), providers=["CPUExecutionProvider"]
@@ -63,6 +64,8 @@ def measure_differences(
             if name in case.where and answer.shape == expected.shape:
                 answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
             rows.append(_row(case.name, name, (answer, expected), limits[name]))
+    if not rows:
+        raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
     return rows
 
 
@@ -94,11 +97,17 @@ def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> 
     if limit.is_relative:
         difference /= np.abs(expected)
     difference = difference[~np.isnan(difference)]
+    if not difference.size:
+        raise InputError(
+            f"{output} of {case}: PyTorch gives not one number that could be compared, and what is "
+            "not compared is not proven; nothing is written. Are these the weights of a training "
+            "that went well?"
+        )
     return {
         "input": case,
         "output": output,
-        "largest difference": float(difference.max(initial=0.0)),
-        "mean difference": float(difference.mean()) if difference.size else 0.0,
+        "largest difference": float(difference.max()),
+        "mean difference": float(difference.mean()),
         "judged": limit.of,
         "limit": limit.value,
         "unit": "share" if limit.is_relative else "as the output",

@@ -1,5 +1,6 @@
 """The one training loop: a task in, trained weights and a run folder out."""
 
+from depthpose.core.loop.card import card_text, held_out_text, leave_card
 from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam
 from depthpose.core.loop.journal import Journal, read_metrics
 from depthpose.core.loop.loop import Interrupted, Progress, train
@@ -15,6 +16,9 @@ __all__ = [
     "Samples",
     "Task",
     "Turn",
+    "card_text",
+    "held_out_text",
+    "leave_card",
     "make_adam",
     "read_metrics",
     "shuffled_index",

@@ -6,6 +6,7 @@ fake pair), and N processes equal one that accumulates N micro-batches.
 """
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +50,7 @@ def train(
     *,
     resume: bool = False,
     on_step: Callable[[Progress], None] | None = None,
-) -> None:
+) -> float:
     """Train ``task`` until its last step; its modules hold the result.
 
     Under ``accelerate launch`` every process calls this; batch norm statistics are rank 0's.
@@ -62,6 +63,9 @@ def train(
         resume: go on from the folder's last state; the result is that of an uninterrupted run.
         on_step: told after each step, in the main process.
 
+    Returns:
+        What it took, in seconds, together with the runs that it resumed.
+
     Raises:
         InputError: nothing to train on, a folder with a state and no ``resume``, a precision that
             this machine lacks, or a loss that is no longer finite.
@@ -73,6 +77,7 @@ def train(
     run.start(resume=resume)
     with polite_stop() as is_asked_to_stop:
         run.walk(on_step, is_asked_to_stop)
+    return run.seconds
 
 
 class _Run:
@@ -83,6 +88,7 @@ class _Run:
         self.steps = config.total_steps(len(samples), self.world)
         self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
         self.step = 0
+        self._began = time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}
         self.average: dict[str, dict[str, Tensor]] = {}
 
@@ -104,6 +110,11 @@ class _Run:
         if resume and has_state(folder):
             self._restore(read_state(folder))
         self.journal.open(self.step)
+
+    @property
+    def seconds(self) -> float:
+        """What it took until now, with the runs before this one."""
+        return time.monotonic() - self._began
 
     def walk(
         self, on_step: Callable[[Progress], None] | None, is_asked_to_stop: Callable[[], bool]
@@ -138,6 +149,7 @@ class _Run:
         self.journal.save(
             {
                 "step": self.step,
+                "seconds": self.seconds,
                 "modules": {name: m.state_dict() for name, m in self.task.modules.items()},
                 "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
                 "scaler": {} if scaler is None else scaler.state_dict(),
@@ -275,6 +287,7 @@ class _Run:
 
     def _restore(self, state: Any) -> None:  # noqa: ANN401
         self.step = int(state["step"])
+        self._began -= float(state.get("seconds", 0.0))  # older states do not know it
         for name, module in self.task.modules.items():
             module.load_state_dict(state["modules"][name])
         for name, optimizer in self.optimizers.items():

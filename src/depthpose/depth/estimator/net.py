@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
-from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
@@ -39,11 +39,15 @@ class FakestereoNet:
     Args:
         matcher: pair to disparity.
         synthesiser: left view to right view; None matches real pairs only.
+        terms: of the weights, where they bind whoever uses them.
     """
 
-    def __init__(self, matcher: Matcher, synthesiser: Synthesiser | None = None) -> None:
+    def __init__(
+        self, matcher: Matcher, synthesiser: Synthesiser | None = None, *, terms: str = ""
+    ) -> None:
         self.matcher = matcher
         self.synthesiser = synthesiser
+        self.terms = terms
 
     @classmethod
     def load(
@@ -54,6 +58,8 @@ class FakestereoNet:
         config: MatcherConfig | SGBMConfig | None = None,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
+
+        Weights whose terms bind the user say so (:class:`LicenceNotice`).
 
         Args:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
@@ -66,15 +72,18 @@ class FakestereoNet:
         Raises:
             InputError: no such weights, or no matcher in what was given.
         """
-        found = None
-        if weights is not None:
-            found = read_depth_weights(find_weights(weights))
-            say_terms(found.facts)
+        found = None if weights is None else read_depth_weights(find_weights(weights))
+        own = None
+        # Paths first: a Path has a method 'match' too, and would pass for a matcher.
+        if isinstance(matcher, str | Path) and matcher not in ("psmnet", "sgbm"):
+            own = read_depth_weights(find_weights(matcher))
+        terms = join_terms(*(held.facts for held in (found, own) if held is not None))
+        say_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        chosen = _choose_matcher(weights, found, matcher, config)
+        chosen = _choose_matcher(weights, found, matcher, own, config)
         if found is None or found.generator is None:
-            return cls(chosen)
-        return cls(chosen, Synthesiser(found.generator, run.device))
+            return cls(chosen, terms=terms)
+        return cls(chosen, Synthesiser(found.generator, run.device), terms=terms)
 
     def estimate(
         self,
@@ -202,6 +211,7 @@ def _choose_matcher(
     weights: str | Path | None,
     found: DepthWeights | None,
     matcher: str | Path | Matcher | None,
+    own: DepthWeights | None,
     config: MatcherConfig | SGBMConfig | None,
 ) -> Matcher:
     run = config if isinstance(config, MatcherConfig) else MatcherConfig()
@@ -216,11 +226,9 @@ def _choose_matcher(
                 "matcher. Leave one of the two away."
             )
         return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-    # Paths first: a Path has a method 'match' too, and would pass for a matcher.
-    if isinstance(matcher, str | Path) and matcher != "psmnet":
-        found = read_depth_weights(find_weights(matcher))
-    elif matcher is not None and not isinstance(matcher, str | Path):
+    if matcher is not None and not isinstance(matcher, str | Path):
         return matcher
+    found = found if own is None else own
     if found is None or found.matcher is None:
         raise InputError(
             f"weights is {None if weights is None else str(weights)!r} and matcher is "

@@ -1,16 +1,16 @@
 """A config to a trained weights file: the three stages as commands run them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig, Progress, Task, train
+from depthpose.core.loop import LoopConfig, Progress, Task, held_out_text, leave_card, train
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.depth.config import GeneratorConfig, PairsConfig
 from depthpose.depth.stereo import PSMNet
@@ -24,6 +24,17 @@ from depthpose.depth.weights import read_generator, read_matcher, write_depth_we
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Knobs of the loop that change no weight: a resumed run may have others."""
+_BEGINS_WITH = ("start", "generator", "matcher")
+"""Knobs that may name weights."""
+_MEASURED = {
+    "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
+    "(dB) to the real ones.",
+    "stereo": "Disparity of pairs that were held out: mean error (px), and the share of "
+    "pixels off by more than 3 px and 5 % (d1).",
+    "finetune": "Disparity from left images that were held out, by the drawn right view: "
+    "mean error (px), and the share of pixels off by more than 3 px and 5 % (d1).",
+}
+"""What the numbers of each stage's validation are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +42,8 @@ class Run:
     """Where a training lives, and who watches.
 
     Attributes:
-        folder: the run folder; the weights are ``generator.safetensors`` or
-            ``matcher.safetensors`` in it.
+        folder: the run folder; the weights are ``generator.safetensors``,
+            ``matcher.safetensors`` or ``fakestereo.safetensors`` in it, and their card beside them.
         resume: go on from its last state.
         on_step: told after each step.
     """
@@ -52,8 +63,8 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         _start_from(generator, read_generator(find_weights(config.start)), config.start)
-    _walk(ViewTask(generator, config, held_out), pairs, config, run)
-    return _export(run, config, generator=generator)
+    facts, seconds = _walk(ViewTask(generator, config, held_out), pairs, config, run)
+    return _leave(run, "view", facts, seconds, generator=generator)
 
 
 def train_stereo(config: StereoTraining, run: Run) -> Path:
@@ -65,8 +76,8 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     matcher = PSMNet(config.matcher)
     if config.start is not None:
         _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
-    _walk(StereoTask(matcher, config, held_out), pairs, config, run)
-    return _export(run, config, matcher=matcher)
+    facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
+    return _leave(run, "stereo", facts, seconds, matcher=matcher)
 
 
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
@@ -84,8 +95,9 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=True)
-    _walk(FinetuneTask(generator, matcher, config, held_out), pairs, config, run)
-    return _export(run, config, generator=generator, matcher=matcher)
+    task = FinetuneTask(generator, matcher, config, held_out)
+    facts, seconds = _walk(task, pairs, config, run)
+    return _leave(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
 
 STAGES = {
@@ -96,36 +108,57 @@ STAGES = {
 """Config and function of each stage, by its word on the command line."""
 
 
-def _walk(task: Task, pairs: TrainingPairs, config: Any, run: Run) -> None:  # noqa: ANN401
-    """Claim the folder for this config, then train."""
+def _walk(
+    task: Task,
+    pairs: TrainingPairs,
+    config: Any,  # noqa: ANN401
+    run: Run,
+) -> tuple[dict[str, str], float]:
+    """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
     settings = {"stage": type(config).__name__, **config_to_dict(config)}
     decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
     settings["loop"] = decisive | {"processes": find_shard().world}
-    for knob in ("start", "generator", "matcher"):
-        if isinstance(name := settings.get(knob), str):
-            settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
+    named = {knob: name for knob in _BEGINS_WITH if isinstance(name := settings.get(knob), str)}
+    for knob, name in named.items():
+        settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
+    facts = _facts(config, tuple(named.values()))
+    say_terms(facts)
     claim_folder(run.folder, settings)
     write_config(run.folder / "config.yaml", config)
-    train(task, pairs, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    seconds = train(task, pairs, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    return facts, seconds
 
 
-def _export(
+def _facts(config: Any, began_with: Sequence[str]) -> dict[str, str]:  # noqa: ANN401
+    """Say what the card says before anything is measured; terms of what it begins with bind it."""
+    data = [Path(folder).name for folder in config.pairs.folders]
+    facts = {
+        "trained_on": ", ".join([*data, *(["made streets"] if config.pairs.streets else [])]),
+        "stage": type(config).__name__,
+        "licence": "not stated; that of the training data binds",
+    }
+    if began_with:
+        facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
+    return bound_facts(facts, began_with)
+
+
+def _leave(
     run: Run,
-    config: Any,  # noqa: ANN401
+    stage: str,
+    facts: Mapping[str, str],
+    seconds: float,
     *,
     generator: UNetGenerator | None = None,
     matcher: PSMNet | None = None,
 ) -> Path:
+    """Write the weights and their card."""
     names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]
     path = run.folder / f"{names[0] if len(names) == 1 else 'fakestereo'}.safetensors"
     if find_shard().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
-    facts = {
-        "trained_on": ", ".join(Path(folder).name for folder in config.pairs.folders),
-        "stage": type(config).__name__,
-        "licence": "not stated; that of the training data binds",
-    }
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
+    measured = held_out_text(run.folder, _MEASURED[stage])
+    leave_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 
 

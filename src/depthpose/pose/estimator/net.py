@@ -71,6 +71,11 @@ class GeoPoseNet:
         return cls(found, config)
 
     @property
+    def terms(self) -> str:
+        """Terms of the weights, where they bind whoever uses them; else nothing."""
+        return self.weights.facts.get("terms", "")
+
+    @property
     def objects(self) -> tuple[str, ...]:
         """Names of the objects that the weights know."""
         return tuple(self._numbers)
@@ -144,7 +149,25 @@ class GeoPoseNet:
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        estimates: dict[int, PoseEstimate] = {}
+        estimates = {k: found for k, found, _ in self._each(inputs)}
+        return [estimates[k] for k in range(len(inputs))]
+
+    @torch.inference_mode()
+    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
+        """Estimate one pose, and give what the network said of each keypoint at each point.
+
+        Returns:
+            The estimate, and the cloud with the outputs in the camera frame; None for them where
+            the network was not asked, as there is too little to pose.
+
+        Raises:
+            InputError: as for :meth:`estimate_many`.
+        """
+        ((_, found, voted),) = self._each([given])
+        return found, voted
+
+    def _each(self, inputs: Sequence[AnyInput]) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
+        """Give each input's number, estimate and votes: first what is refused, then by batches."""
         ready: list[tuple[int, Prepared, float]] = []
         for k, given in enumerate(inputs):
             start = time.perf_counter()
@@ -152,7 +175,7 @@ class GeoPoseNet:
             prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
             spent_s = time.perf_counter() - start
             if isinstance(prepared, Refusal):
-                estimates[k] = _refused(given, prepared, {"cloud": spent_s})
+                yield k, _refused(given, prepared, {"cloud": spent_s}), None
             else:
                 ready.append((k, prepared, spent_s))
         for some in _batches(ready, self.config.batch_voxels):
@@ -164,26 +187,8 @@ class GeoPoseNet:
             ):
                 share_s = network_s * len(outputs) / total
                 seconds = {"cloud": spent_s, "network": share_s}
-                estimates[k] = self._pose(inputs[k], number, Voted(prepared, outputs), seconds)
-        return [estimates[k] for k in range(len(inputs))]
-
-    @torch.inference_mode()
-    def votes_of(self, given: AnyInput) -> Voted | None:
-        """Give the points that vote, and what the network says of each keypoint there.
-
-        Returns:
-            The cloud and the outputs in the camera frame; None where the input cannot be posed.
-
-        Raises:
-            InputError: as for :meth:`estimate_many`.
-        """
-        number = self._number(given.object)
-        model = self.weights.models[number]
-        prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
-        if isinstance(prepared, Refusal):
-            return None
-        (outputs,), _ = self._directions([prepared], [number])
-        return Voted(prepared, outputs)
+                voted = Voted(prepared, outputs)
+                yield k, self._pose(inputs[k], number, voted, seconds), voted
 
     def _directions(
         self, clouds: list[Prepared], numbers: list[int]

@@ -1,7 +1,7 @@
 """What a trained network is worth: its refusal calibrated, its success on views that nobody saw."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 
@@ -12,7 +12,7 @@ from depthpose.pose.metrics import is_within_diameter
 from depthpose.pose.objects import Objects
 from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig
 from depthpose.pose.train.held_out import held_out_objects, pose_error
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import PoseWeights
 
 _CALIBRATION_SEED = 0xCA11B
@@ -73,29 +73,20 @@ def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> 
     return table
 
 
-def card_text(
-    models: Sequence[ObjectModel],
-    facts: Mapping[str, str],
-    table: Table,
-) -> str:
-    """Say what the weights know, and what was measured, for people."""
-    names = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in models)
-    lines = ["# Pose weights", "", f"Objects: {names}."]
-    lines += [f"{name.replace('_', ' ').capitalize()}: {fact}." for name, fact in facts.items()]
-    if table:
-        lines += [
-            "",
-            "Made views that no training saw, posed with voting, ICP and refusal; right is an "
-            "ADD(-S) below a tenth of the diameter.",
-            "",
-            "| hidden % | right % | wrong % | refused % | median error, % of diameter |",
-            "| --- | --- | --- | --- | --- |",
-        ]
+def table_text(table: Table) -> str:
+    """Show what was counted, for people."""
+    lines = [
+        "Made views that no training saw, posed with voting, ICP and refusal; right is an "
+        "ADD(-S) below a tenth of the diameter.",
+        "",
+        "| hidden % | right % | wrong % | refused % | median error, % of diameter |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for hidden, row in table.items():
         given = [row[k] for k in ("right", "wrong", "refused", "median")]
         values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
         lines.append(f"| {hidden} | {values} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:

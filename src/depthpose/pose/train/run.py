@@ -1,12 +1,12 @@
 """Where a training lives: its folder, claimed for one config, and the weights it leaves."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
+from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.loop import Progress
 from depthpose.core.run import claim_folder, find_shard
@@ -55,7 +55,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     settings["sha256"] = [file_sha256(Path(path)) for path in files]
     if config.start is not None:
         settings["start_sha256"] = file_sha256(find_weights(config.start))
-        say_terms(read_checkpoint(find_weights(config.start)).facts)
+        say_terms(bound_facts({}, [config.start]))
     claim_folder(run.folder, settings)
     write_config(run.folder / "config.yaml", config)
 
@@ -65,31 +65,38 @@ def packed(
     models: tuple[ObjectModel, ...],
     config: Any,  # noqa: ANN401
 ) -> PoseWeights:
-    """Put a trained network and its objects together, with what the card says of them.
-
-    Terms of the weights that it began with bind it too.
-    """
+    """Put a trained network and its objects together, with what the card says of them."""
     frames: FramesConfig | None = config.frames
     cloud: CloudConfig = config.cloud
     names = ", ".join(model.name for model in models)
     source = "made views" if frames is None else f"{Path(frames.folder).name} and made views"
     facts = {
         "trained_on": f"{source} of {names}",
-        "stage": type(config).__name__,
         "licence": config.models.licence,
     }
-    terms = config.models.terms
-    if config.start is not None:
-        facts["began_with"] = Path(config.start).stem
-        theirs = read_checkpoint(find_weights(config.start)).facts.get("terms", "")
-        terms = terms if theirs in terms else f"{terms} {theirs}".strip()
+    if config.models.terms:
+        facts["terms"] = config.models.terms
     return PoseWeights(
         network=network.cpu().eval(),
         models=models,
         cloud=cloud,
         refusal=RefusalConfig(),
-        facts=facts | ({"terms": terms} if terms else {}),
+        facts=with_origin(facts, config),
     )
+
+
+def card_facts(weights: PoseWeights) -> dict[str, str]:
+    """Put before the facts of weights the objects that they know, and their sizes."""
+    known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
+    return {"objects": known, **weights.facts}
+
+
+def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
+    """Add to a card the stage, and the weights that it began with: their terms bind it too."""
+    origin = {**facts, "stage": type(config).__name__}
+    if config.start is None:
+        return origin
+    return bound_facts({**origin, "began_with": Path(config.start).stem}, [config.start])
 
 
 def with_classes(

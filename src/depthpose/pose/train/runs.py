@@ -9,8 +9,8 @@ import torch
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, write_json
-from depthpose.core.loop import train
+from depthpose.core.files import write_json
+from depthpose.core.loop import leave_card, train
 from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
@@ -20,9 +20,9 @@ from depthpose.pose.train.clouds import TrainingClouds
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.depth_image import train_depth_image
 from depthpose.pose.train.held_out import HeldOut
-from depthpose.pose.train.judge import calibrated, card_text, judged
+from depthpose.pose.train.judge import calibrated, judged, table_text
 from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, claim_run, packed, with_classes
+from depthpose.pose.train.run import Run, card_facts, claim_run, packed, with_classes
 from depthpose.pose.train.segmentation import train_segmentation
 from depthpose.pose.train.segmentation_config import SegmentationTraining
 from depthpose.pose.train.task import PoseTask
@@ -52,10 +52,10 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
-    train(task, clouds, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    seconds = train(task, clouds, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
     if isinstance(network, PointNet):
-        return _leave(run.folder / "pointnet.safetensors", network, models, config)
-    return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config)
+        return _leave(run.folder / "pointnet.safetensors", network, models, config, seconds)
+    return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
 
 
 STAGES = {
@@ -68,7 +68,11 @@ STAGES = {
 
 
 def _leave(
-    path: Path, network: ResUNet | PointNet, models: tuple[ObjectModel, ...], config: PoseTraining
+    path: Path,
+    network: ResUNet | PointNet,
+    models: tuple[ObjectModel, ...],
+    config: PoseTraining,
+    seconds: float,
 ) -> Path:
     """Calibrate the refusal, write the weights, judge what the file holds, and write its card."""
     if find_shard().rank:
@@ -78,8 +82,8 @@ def _leave(
     write_pose_weights(path, weights, with_half=config.with_half)
     table = judged(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
-    with atomic_write(path.with_suffix(".md")) as part:
-        part.write_text(card_text(models, weights.facts, table))
+    words = f"pose train --what {path.stem}"
+    leave_card(path, words, seconds, card_facts(weights), table_text(table))
     return path
 
 

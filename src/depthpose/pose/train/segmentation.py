@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
-from depthpose.core.loop import Evidence, Turn, make_adam, train
+from depthpose.core.loop import Evidence, Turn, held_out_text, leave_card, make_adam, train
 from depthpose.core.run import find_shard
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.resnet import KIND, normalise_colors, read_encoder_state
@@ -24,7 +24,7 @@ from depthpose.pose.train.images import (
     LabelledImage,
     TrainingImages,
 )
-from depthpose.pose.train.run import Run, claim_run
+from depthpose.pose.train.run import Run, claim_run, with_origin
 from depthpose.pose.train.segmentation_config import SegmentationTraining
 
 
@@ -86,21 +86,22 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
-    train(task, samples, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    seconds = train(task, samples, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
     path = run.folder / "segmentation.safetensors"
-    if find_shard().rank == 0:
-        facts = {
-            "trained_on": Path(config.images.folder).name,
-            "stage": type(config).__name__,
-            "licence": "not stated; that of the training data binds",
-        }
-        weights = SegmentationWeights(
-            network=network.cpu().eval(),
-            objects=images.objects.names,
-            numbers=images.objects.numbers,
-            facts=facts,
-        )
-        write_segmentation(path, weights, with_half=config.with_half)
+    if find_shard().rank:
+        return path
+    licence = "not stated; that of the training data binds"
+    facts = {"trained_on": Path(config.images.folder).name, "licence": licence}
+    weights = SegmentationWeights(
+        network=network.cpu().eval(),
+        objects=images.objects.names,
+        numbers=images.objects.numbers,
+        facts=with_origin(facts, config),
+    )
+    write_segmentation(path, weights, with_half=config.with_half)
+    measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
+    known = {"objects": ", ".join(weights.objects), **weights.facts}
+    leave_card(path, "pose train --what segmentation", seconds, known, measured)
     return path
 
 
