@@ -20,7 +20,7 @@ _STEEP = 1.73
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Voxels:
+class VoxelGrid:
     """Which cells of a grid a cloud fills, and the point that was kept in each.
 
     Attributes:
@@ -149,7 +149,7 @@ def sample_points(
     return points_m[index.to(points_m.device)]
 
 
-def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> Voxels:
+def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
 
     The grid's axes are the camera's, or with ``with_sight_axis`` turned so that the third points at
@@ -190,7 +190,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> Voxels:
     if config.with_shape:
         parts = (_means(places - cells, row_of_point), _planes(points_m, kept, turn))
         features = torch.cat([features, *parts], 1)
-    return Voxels(
+    return VoxelGrid(
         coordinates=cells[kept],
         kept=kept,
         row_of_point=row_of_point,

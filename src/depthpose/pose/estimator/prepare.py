@@ -8,7 +8,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.pose.cloud import (
-    Voxels,
+    VoxelGrid,
     cloud_from_depth,
     frame_advice,
     is_flying,
@@ -39,7 +39,7 @@ class Prepared:
 
     cloud_m: Float[Tensor, "n 3"]
     points_m: Float[Tensor, "m 3"]
-    voxels: Voxels
+    voxels: VoxelGrid
 
 
 @dataclass(frozen=True, kw_only=True)
