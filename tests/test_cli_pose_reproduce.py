@@ -9,8 +9,8 @@ from tests.pose.made_frames import draw_frame, made_models, moved, predictions_o
 from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
-from depthpose.cli.pose_views import spread_evenly
 from depthpose.core.files import read_image, write_depth_png, write_image
+from depthpose.pages.choose import spread_evenly
 from depthpose.pose.bop import BopDataset, open_bop
 from depthpose.pose.bop.dataset import read_instance_mask
 from depthpose.pose.bop.linemod import segnet_mask

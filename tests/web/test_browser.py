@@ -149,7 +149,7 @@ def test_pose_good(page: Page, address: str, samples: Path) -> None:
     said = send(page, "pose", {field: samples / name for field, name in view.items()})
     assert said.startswith(f"The {PART} is at x ")
     assert drawn_share(page, "#pose") > 0.02
-    votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^ votes$"))
+    votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^\s*votes$"))
     before = picture_of(page, "#pose")
     votes.locator("input").check()
     page.wait_for_timeout(1000)

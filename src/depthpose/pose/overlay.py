@@ -86,20 +86,22 @@ def bent_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
 
 
 def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> list[Layer]:
-    """Show a posed object in space: its surface, edges, box and axes; the truth as a box alone."""
+    """Show a posed object in space: surface, edges, box and axes; the truth by edges and box."""
     pose = Rigid(pose.R.double(), pose.t_m.double())
 
     def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
 
     box_m = posed(box_edges(model))
+    edges_m = posed(bent_edges(model)) if len(model.faces) else None
     if is_true:
-        return [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
-    surface = posed_cloud(torch.empty(0, 3), pose, model)
-    layers = [Layer(name="posed model", shape=surface)]
-    if len(model.faces):
-        edges = colored_lines(posed(bent_edges(model)), FOUND)
-        layers.append(Layer(name="its edges", shape=edges))
+        layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
+        if edges_m is not None:
+            layers.append(Layer(name="true edges", shape=colored_lines(edges_m, TRUE)))
+        return layers
+    layers = [Layer(name="posed model", shape=posed_cloud(torch.empty(0, 3), pose, model))]
+    if edges_m is not None:
+        layers.append(Layer(name="its edges", shape=colored_lines(edges_m, FOUND)))
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
     box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=False)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
