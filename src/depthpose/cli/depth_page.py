@@ -15,6 +15,7 @@ from depthpose.pages.choose import MOST_VIEWS, choose_ranked, share_views, sprea
 from depthpose.pages.depth import DepthError, DepthShown, depth_section
 
 PAGE = "report.html"
+_SAID_ABOVE = ("method", "sees", "weights", "protocol", "dataset")
 
 
 def write_depth_page(
@@ -29,16 +30,17 @@ def write_depth_page(
     Args:
         out: the folder.
         names: of all that are there.
-        read: gives what some of them were made of.
+        read: gives what some of them were made of, as far as that can still be read.
         failures: why others are not there, a sentence each.
         range_m: metres of the brightest and the darkest colour.
     """
     chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
-    which = "all" if len(chosen) == len(names) else "spread evenly over all"
-    text = f"Shown: {len(chosen)} of {_count(len(names), 'depth map')} in this folder ({which})."
+    pairs = list(read(chosen))
+    which = "all" if len(pairs) == len(names) else "spread evenly"
+    text = f"Shown: {len(pairs)} of {_count(len(names), 'depth map')} in this folder ({which})."
     failed = [{"not estimated, because": reason} for reason in failures]
     sections = [Section(title="What is here", text=text, rows=failed)]
-    for pair in read(chosen):
+    for pair in pairs:
         estimate = read_estimate(out, pair.name, pair.camera)
         shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)
         sections.append(depth_section(pair.name, shown))
@@ -75,8 +77,9 @@ def frame_sections(
             )
             title = f"{folder.name}: {row['frame']}, {role}"
             index = places[row["frame"]]
-            sections.append(_frame_section(dataset, index, folder, (protocol, cap_m), title, text))
-            sections[-1] = replace(sections[-1], rows=[row])
+            section = _frame_section(dataset, index, folder, (protocol, cap_m), title, text)
+            own = {name: value for name, value in row.items() if name not in _SAID_ABOVE}
+            sections.append(replace(section, rows=[own]))
     return sections
 
 

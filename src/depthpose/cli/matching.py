@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,6 +107,8 @@ def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:
     places = {path.stem: k for k, path in enumerate(pairs.left) if is_finished(out, path.stem)}
 
     def read(names: Sequence[str]) -> Iterator[StereoInput]:
-        return (pairs.read(places[name]) for name in names)
+        for name in names:
+            with suppress(InputError):
+                yield pairs.read(places[name])
 
     write_depth_page(out, list(places), read, failures)

@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -129,8 +130,10 @@ def _write_page(
     def read(names: Sequence[str]) -> Iterator[StereoInput]:
         for source in sources:
             wanted = [name for name in done[source] if name in names]
-            for name, image in _read_some(source, wanted):
-                yield StereoInput(name=name, left=image, right=None, camera=lens.camera_of(image))
+            with suppress(InputError):
+                for name, image in _read_some(source, wanted):
+                    camera = lens.camera_of(image)
+                    yield StereoInput(name=name, left=image, right=None, camera=camera)
 
     write_depth_page(out, [n for some in done.values() for n in some], read, failures, look.range_m)
 

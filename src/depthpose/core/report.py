@@ -20,6 +20,7 @@ Row = Mapping[str, Any]
 
 _MOST_PIXELS = 480_000
 """Of a drawing on a page of many: a frame of KITTI is whole."""
+_QUALITY = 85
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +49,7 @@ class Drawing:
     @property
     def data_uri(self) -> str:
         """The picture as a ``data:`` address."""
-        encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg")
+        encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg", _QUALITY)
         return "data:image/jpeg;base64," + base64.b64encode(encoded).decode()
 
 

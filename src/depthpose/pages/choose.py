@@ -12,7 +12,8 @@ def spread_evenly(total: int, number: int) -> list[int]:
 
     None where ``number`` is 0.
     """
-    return sorted({(2 * k + 1) * total // (2 * number) for k in range(number)})
+    number = min(number, total)
+    return [(2 * k + 1) * total // (2 * number) for k in range(number)]
 
 
 def choose_answers(is_ok: Sequence[bool], most: int = MOST_VIEWS) -> list[int]:

@@ -71,12 +71,13 @@ def depth_section(
     title: str, shown: DepthShown, text: str = "", *, with_image: bool = True
 ) -> Section:
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D."""
-    image = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
+    seen = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
+    own = [_map_drawing(shown), *_error_drawings(shown), *_other_drawings(shown.estimate)]
     return Section(
         title=title,
         text=text,
         facts=depth_facts(shown.pair, shown.estimate),
-        pictures=[*image, *_estimate_drawings(shown), *_error_drawings(shown)],
+        pictures=[*seen, *own],
         scenes=_scenes(title, shown),
     )
 
@@ -117,24 +118,23 @@ def depth_scene(
     )
 
 
-def _estimate_drawings(shown: DepthShown) -> list[Drawing]:
+def _map_drawing(shown: DepthShown) -> Drawing:
     found = shown.estimate
     if found.depth_m is None:
-        drawings = [
-            Drawing(
-                image=draw_disparity(found.disparity_px),
-                caption="disparity, large (near) bright; grey: none",
-                scale=rising_scale("disparity [px]", 96.0, has_more=True),
-            )
-        ]
-    else:
-        drawings = [
-            Drawing(
-                image=draw_depth(found.depth_m, *shown.range_m),
-                caption="estimated depth, near bright and far dark; grey: none",
-                scale=depth_scale(*shown.range_m),
-            )
-        ]
+        return Drawing(
+            image=draw_disparity(found.disparity_px),
+            caption="estimated disparity, large (near) bright; grey: none",
+            scale=rising_scale("disparity [px]", 96.0, has_more=True),
+        )
+    return Drawing(
+        image=draw_depth(found.depth_m, *shown.range_m),
+        caption="estimated depth, near bright and far dark; grey: none",
+        scale=depth_scale(*shown.range_m),
+    )
+
+
+def _other_drawings(found: DepthEstimate) -> list[Drawing]:
+    drawings: list[Drawing] = []
     if found.confidence is not None:
         drawings.append(
             Drawing(
@@ -149,39 +149,32 @@ def _estimate_drawings(shown: DepthShown) -> list[Drawing]:
 
 
 def _error_drawings(shown: DepthShown) -> list[Drawing]:
+    """Draw the truth where it is to be shown, and the error."""
     if shown.error is None:
         return []
-    error, left = shown.error, shown.pair.left
-    top = WORST_PX if error.is_disparity else WORST_SHARE
+    error, left, true_m = shown.error, shown.pair.left, shown.error.true_depth_m
     is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE
-    drawings: list[Drawing] = []
-    if (true_m := error.true_depth_m) is not None:
-        near_m, far_m = shown.range_m
-        image = (
-            draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
-            if is_sparse
-            else draw_depth(true_m, near_m, far_m)
-        )
-        where = "points over the dimmed image" if is_sparse else "grey: not compared"
-        drawings.append(
-            Drawing(image=image, caption=f"true depth; {where}", scale=depth_scale(near_m, far_m))
-        )
+    where = "over the dimmed image" if is_sparse else "grey: not compared"
+    top = WORST_PX if error.is_disparity else WORST_SHARE
+    what = "disparity error" if error.is_disparity else "depth error as a share of the truth"
+    bar = ("disparity error [px]", top) if error.is_disparity else ("depth error [%]", 100 * top)
     image = (
         draw_error_points(left, error.error, top, _RADIUS_PX)
         if is_sparse
         else draw_share(1 - error.error / top)
     )
-    what = "disparity error" if error.is_disparity else "depth error as a share of the truth"
-    bar = ("disparity error [px]", top) if error.is_disparity else ("depth error [%]", 100 * top)
-    where = "over the dimmed image" if is_sparse else "grey: not compared"
-    drawings.append(
-        Drawing(
-            image=image,
-            caption=f"{what}: dark is right, bright is wrong; {where}",
-            scale=rising_scale(*bar, has_more=True),
-        )
+    caption = f"{what}: dark is right, bright is wrong; {where}"
+    drawing = Drawing(image=image, caption=caption, scale=rising_scale(*bar, has_more=True))
+    if true_m is None:
+        return [drawing]
+    near_m, far_m = shown.range_m
+    truth = (
+        draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
+        if is_sparse
+        else draw_depth(true_m, near_m, far_m)
     )
-    return drawings
+    bar = depth_scale(near_m, far_m)
+    return [Drawing(image=truth, caption=f"true depth; {where}", scale=bar), drawing]
 
 
 def _scenes(title: str, shown: DepthShown) -> list[Scene]:

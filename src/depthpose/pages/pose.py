@@ -149,7 +149,7 @@ def pose_scene(
     layers = [Layer(name="the object, as seen", shape=_colored(points_m, SEEN))]
     pose = found.camera_from_model
     if pose is not None:
-        layers += pose_layers(pose, model)
+        layers += pose_layers(pose, model, with_box=truth is not None)
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if found.keypoints_m is not None:

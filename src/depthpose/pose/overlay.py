@@ -85,8 +85,17 @@ def bent_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
     return places_m[edges[is_bent | (count == 1)]]
 
 
-def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> list[Layer]:
-    """Show a posed object in space: surface, edges, box and axes; the truth by edges and box."""
+def pose_layers(
+    pose: Rigid, model: ObjectModel, *, is_true: bool = False, with_box: bool = False
+) -> list[Layer]:
+    """Show a posed object in space: surface, edges, box and axes; the truth by edges and box.
+
+    Args:
+        pose: ``camera_from_model``.
+        model: the object.
+        is_true: draw it as the truth beside an estimate.
+        with_box: whether an estimate's box is seen at first; that of a truth is.
+    """
     pose = Rigid(pose.R.double(), pose.t_m.double())
 
     def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
@@ -103,7 +112,7 @@ def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> li
     if edges_m is not None:
         layers.append(Layer(name="its edges", shape=colored_lines(edges_m, FOUND)))
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=False)
+    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=with_box)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 

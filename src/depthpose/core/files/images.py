@@ -82,8 +82,13 @@ def write_image(path: AnyPath, image: Tensor) -> None:
     write_bytes(path, encode_image(image, path))
 
 
-def encode_image(image: Tensor, name: AnyPath) -> bytes:
+def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
     """Give the bytes that :func:`write_image` writes to a file of this name.
+
+    Args:
+        image: see there.
+        name: decides the format by its suffix.
+        quality: of a JPEG, 1 to 95.
 
     Raises:
         InputError: the shape, the values or the suffix are wrong.
@@ -94,7 +99,7 @@ def encode_image(image: Tensor, name: AnyPath) -> bytes:
     _check_image(name, image)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
     form, options = (
-        ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": 95, "subsampling": 0})
+        ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": quality, "subsampling": 0})
     )
     encoded = BytesIO()
     with refused_as(name, "picture", "check its size"):
