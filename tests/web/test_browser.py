@@ -208,7 +208,8 @@ def test_the_page_of_a_prediction_is_drawn(
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.goto((tmp_path / "report.html").as_uri())
-    page.locator(".scene canvas").scroll_into_view_if_needed()
+    page.locator(".scene").scroll_into_view_if_needed()
+    page.locator(".scene canvas").wait_for()
     page.wait_for_timeout(1000)
     assert drawn_share(page, "body") > 0.02
     before = picture_of(page, "body")
