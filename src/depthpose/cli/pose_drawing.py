@@ -54,7 +54,7 @@ def write_figure(number: str, text: str, panels: Sequence[Panel], out: Path, col
         file = out / "panels" / f"{number}.{k}.png"
         write_image(file, panel.image)
         pictures.append(Picture(path=file, caption=panel.caption))
-    section = Section(title=f"Figure {number}", text=text, pictures=pictures)
+    section = Section(title="Panels", text=text, pictures=pictures)
     write_page(out / "report.html", f"Figure {number}", [section], environment())
     captions = "; ".join(panel.caption for panel in panels)
     print(f"{path}: {captions}. {text}")

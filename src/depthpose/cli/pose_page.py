@@ -17,13 +17,17 @@ from depthpose.pages.choose import (
 )
 from depthpose.pages.pose import PoseShown, pose_section
 from depthpose.pose.bop import BopDataset, Instance
-from depthpose.pose.evaluate import match, read_any
+from depthpose.pose.evaluate import match, nearest_copy, read_any
+from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import Job, Prediction, is_finished
 from depthpose.pose.types import PoseEstimate
 
 PAGE = "report.html"
 _MOST_ROWS = 1000
-_OF_TRUTH = "Mask and cloud are the annotated ones; blue is the estimate, green the truth."
+_OF_TRUTH = (
+    "Mask and cloud are the annotated ones; blue is the estimate, green the truth, in that of its "
+    "turns which looks alike and lies nearest."
+)
 _MEASURED = (
     "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
     "status",
@@ -141,10 +145,14 @@ def _choose(rows: Sequence[dict[str, Any]], most: int) -> list[tuple[str, dict[s
 
 
 def _shown(dataset: BopDataset, instance: Instance, estimate: PoseEstimate) -> PoseShown:
+    """Show an estimate beside the truth: of copies that look alike the one nearest to it."""
+    model, truth = dataset.objects[instance.object_id], instance.camera_from_model
+    if (found := estimate.camera_from_model) is not None:
+        truth = nearest_copy(found, truth, symmetry_transforms(model.symmetries))
     return PoseShown(
         given=dataset.view(instance).input,
         estimate=estimate,
-        model=dataset.objects[instance.object_id],
+        model=model,
         image=None if instance.rgb is None else read_image(instance.rgb),
-        truth=instance.camera_from_model,
+        truth=truth,
     )

@@ -1,5 +1,6 @@
 """Predictions and truth to rows: metrics read files, and nothing leaves the denominator."""
 
+from depthpose.pose.evaluate.errors import nearest_copy as nearest_copy
 from depthpose.pose.evaluate.evaluate import Evaluation as Evaluation
 from depthpose.pose.evaluate.evaluate import evaluate as evaluate
 from depthpose.pose.evaluate.evaluate import read_any as read_any
