@@ -47,8 +47,8 @@ def predict(
     and the seconds of each stage. A cloud or depth image NAME gives NAME.ply, the posed model
     beside the cloud, and NAME.png over the depth image; a data set gives
     depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. report.html shows some of them in 3D, and every
-    refusal. A rerun skips what is finished; other settings
-    need another --out; processes of torchrun share the work.
+    refusal. A rerun skips what is finished; other settings need another --out; processes of
+    torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli.pose_predicting import Unreadable
 from depthpose.core.files import read_image
 from depthpose.core.report import Section, write_page
 from depthpose.core.run import environment
@@ -25,8 +26,8 @@ from depthpose.pose.types import PoseEstimate
 PAGE = "report.html"
 _MOST_ROWS = 1000
 _OF_TRUTH = (
-    "Mask and cloud are the annotated ones; blue is the estimate, green the truth, in that of its "
-    "turns which looks alike and lies nearest."
+    "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "
+    "object, the copy nearest to the estimate)."
 )
 _MEASURED = (
     "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
@@ -56,17 +57,21 @@ def write_pose_page(
     readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
     answered = [predictions[k].estimate.is_ok for k in readable]
     chosen = [readable[k] for k in choose_answers(answered)]
-    sections = [_results(predictions, len(chosen))]
+    sections: list[Section] = []
     for k in chosen:
+        given = jobs[k].read()
+        if isinstance(given, Unreadable):  # by now; it was read when it was estimated
+            continue
         estimate, place = predictions[k].estimate, predictions[k].place
         rgb = None if place is None else image_of[place[:2]]
         shown = PoseShown(
-            given=jobs[k].read(),
+            given=given,
             estimate=estimate,
             model=models[estimate.object],
             image=None if rgb is None else read_image(rgb),
         )
         sections.append(pose_section(estimate.name, shown))
+    sections.insert(0, _results(predictions, len(sections)))
     page = out / PAGE
     number = len(predictions)
     write_page(page, f"Poses of {number} input{'s' * (number != 1)}", sections, environment())

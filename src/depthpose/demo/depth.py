@@ -79,7 +79,9 @@ def _try_all(
         estimate = net.estimate_pair(pair)
         rows.append({"scene": name, "method": method, "sees": sees, **_measure(sample, estimate)})
         folder = out / method.lower().replace(",", "").replace(" ", "-")
-        shown.append(_show(folder, f"{name}: {method}, {sees}", sample, estimate))
+        shown.append(
+            _show(folder, f"{name}: {method}, {sees}", replace(sample, input=pair), estimate)
+        )
     return rows, [_opening(out / name, sample, text, rows), *shown]
 
 
