@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from tests.made_street import make_street
+from tests.pages.read_page import read_page
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import find_weights, read_checkpoint
@@ -103,6 +104,41 @@ def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
     ):
         wanted = draw_depth(read_map(file), 1.0, 40.0)
         assert float((picture - wanted).abs().mean()) < 0.05, file
+
+
+def test_the_page_shows_some_of_many_and_the_numbers_of_their_files(
+    home: Path, tmp_path: Path
+) -> None:
+    for number in range(9):
+        image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(number))
+        write_image(tmp_path / "in" / f"<b>{number}.png", image)
+    (tmp_path / "in" / "broken.png").write_bytes(b"no picture")
+    out = tmp_path / "out"
+    assert predict(home, out, str(tmp_path / "in"), "--camera", str(home / "cam.json")) == 1
+    page = read_page(out / "report.html")
+    assert page.texts["h1"] == ["Depth of 9 images"]
+    assert "Shown: 6 of 9 depth maps in this folder (spread evenly)." in page.texts["p"]
+    (reason,) = page.texts["td"]
+    assert "broken.png" in reason
+    names = page.texts["h2"][1:]
+    assert names == [f"<b>{number}" for number in (0, 2, 3, 5, 6, 8)]
+    assert "b" not in page.tags, "a name is no markup"
+    assert len(page.pictures) == 6 * 4
+    facts = [value for value in page.texts["dd"] if value.endswith(" m")]
+    for name, scene, said in zip(names, page.scenes, facts, strict=True):
+        depth_m = read_map(out / f"{name}.depth_m.npy")
+        known_m = depth_m[depth_m.isfinite()]
+        numbers = [float(f(known_m)) for f in (torch.min, torch.median, torch.max)]
+        assert said == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
+        assert scene["layers"][0]["count"] == int((known_m <= 80).sum())
+
+
+def test_the_page_of_a_video_shows_its_frames(home: Path, tmp_path: Path) -> None:
+    frames = [torch.full((3, 48, 64), 0.05 * k) for k in range(8)]
+    write_video(tmp_path / "drive.avi", frames, 5.0)
+    assert predict(home, tmp_path, str(tmp_path / "drive.avi"), "--focal-px", "70") == 0
+    shown = read_page(tmp_path / "report.html").texts["h2"][1:]
+    assert shown == [f"drive_{k:06d}" for k in (0, 2, 3, 4, 6, 7)]
 
 
 def test_one_broken_image_stops_no_other(

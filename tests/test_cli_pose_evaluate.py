@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import pytest
 import torch
+from tests.pages.read_page import read_page
 from tests.pose.made_frames import made_models, make_dataset, moved, predictions_of
 from tests.pose.made_object import tiny_weights
 
@@ -59,6 +60,38 @@ def test_a_csv_is_measured(
     assert statuses == ["missing", "ok"] * 2
     assert "Success by masks" in (out / "report.html").read_text()
     assert "4 instances, layout BOP; objects: bracket, bottle" in capsys.readouterr().out
+
+
+def test_the_page_shows_best_median_and_worst_beside_the_truth(
+    made: BopDataset, tmp_path: Path
+) -> None:
+    off_m = {name: 0.004 * (k + 1) for k, name in enumerate(i.name for i in made.instances)}
+    refused = made.instances[2].name
+    found = predictions_of(
+        made, lambda i: None if i.name == refused else moved(i, [0.0] * 5 + [off_m[i.name]])
+    )
+    write_predictions(tmp_path / "own", found)
+    words = ["--bop", str(made.folder), "--predictions", str(tmp_path / "own"), "--no-vsd"]
+    assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
+    page = read_page(tmp_path / "out/report.html")
+    shown = [text for text in page.texts["h2"] if text.startswith("own: ")]
+    names = {instance.name: made.objects[instance.object_id].name for instance in made.instances}
+    rows = json.loads((tmp_path / "out/instances.json").read_text())
+    size = {row["instance"]: (row["error_m"] or 9.0) / row["diameter_m"] for row in rows}
+    ranked = sorted((i for i in names if i != refused), key=size.__getitem__, reverse=True)
+    roles = zip(("worst", "median", "best"), ranked, strict=True)
+    assert shown == [
+        *(f"own: {names[i]} in {i}, {role} answer of 3" for role, i in roles),
+        f"own: {names[refused]} in {refused}, one of 1 refused",
+    ]
+    for k, name in enumerate([*ranked, refused]):
+        layers = page.layers(k)
+        assert {"true box", "true edges"} <= set(layers)
+        assert ("posed model" in layers) == (name != refused)
+    errors = [f"{row['error_m']:.4f}" for row in rows if row["error_m"] is not None]
+    assert set(errors) <= set(page.texts["td"])
+    reason = next(row["reason"] for row in rows if row["instance"] == refused)
+    assert any(f": {reason}." in text for text in page.texts["p"])
 
 
 def test_weights_predict_once_with_true_and_predicted_masks(

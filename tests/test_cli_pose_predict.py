@@ -1,11 +1,13 @@
 """``pose predict`` from the words to the files, with an oracle in place of the network."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from tests.pages.read_page import read_page
 from tests.pose.made_frames import make_dataset
 from tests.pose.made_object import (
     K,
@@ -116,6 +118,41 @@ def test_a_folder_of_depth_images_is_done_once(
     assert "holds results made with" in capsys.readouterr().err
 
 
+def test_the_page_says_each_refusal_and_shows_few_of_many(weights: Path, tmp_path: Path) -> None:
+    words = frames(tmp_path)
+    for k in range(8):
+        for folder, name in (("depth", "seen"), ("mask", "seen")):
+            shutil.copy(tmp_path / folder / f"{name}.png", tmp_path / folder / f"<b>{k}.png")
+    (tmp_path / "depth" / "torn.png").write_bytes(b"no picture")
+    shutil.copy(tmp_path / "mask" / "seen.png", tmp_path / "mask" / "torn.png")
+    out = tmp_path / "out"
+    given = ["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]
+    assert main(given) == 1
+    page = read_page(out / "report.html")
+    assert page.texts["h1"] == ["Poses of 11 inputs"]
+    (said,) = [text for text in page.texts["p"] if text.startswith("11 inputs")]
+    assert said == (
+        "11 inputs: 9 ok, 1 too few points, 1 unreadable. Shown below: 6, answers and refusals "
+        "spread evenly."
+    )
+    rows = poses_of(out)
+    for row in rows.values():
+        assert row["name"] in page.texts["td"]
+        assert row["reason"] in page.texts["td"], "each refusal in words"
+    assert "b" not in page.tags, "a name is no markup"
+    shown = page.texts["h2"][1:]
+    assert len(shown) == 6
+    assert "hidden" in shown
+    assert "torn" not in shown
+    for name, scene in zip(shown, page.scenes, strict=True):
+        layers = [layer["name"] for layer in scene["layers"]]
+        assert ("posed model" in layers) == (rows[name]["status"] == "ok")
+        x, y, z = (line[3] for line in (rows[name]["camera_from_model"] or [[0] * 4] * 3)[:3])
+        place = f"The bracket is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+        refusal = f"Refused (too few points): {rows[name]['reason']}."
+        assert (refusal if name == "hidden" else place) in page.texts["p"]
+
+
 def test_an_unreadable_image_stops_no_other_and_is_read_when_mended(
     weights: Path,
     tmp_path: Path,
@@ -155,6 +192,9 @@ def test_a_data_set_gives_the_csv_and_pictures(
     assert len(results) == len(answered) > 0
     images = {(p.place.scene_id, p.place.image_id) for p in answered if p.place is not None}
     assert {f"{s:06d}_{i:06d}.png" for s, i in images} == {p.name for p in out.glob("*.png")}
+    page = read_page(out / "report.html")
+    assert page.texts["h2"][1:] == [instance.name for instance in made.instances]
+    assert any(picture["alt"].startswith("picture; ") for picture in page.pictures)
 
 
 def test_two_processes_share_the_work(

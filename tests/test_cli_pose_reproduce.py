@@ -9,7 +9,6 @@ from tests.pose.made_frames import draw_frame, made_models, moved, predictions_o
 from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
-from depthpose.cli.pose_views import spread_evenly
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.pose.bop import BopDataset, open_bop
 from depthpose.pose.bop.dataset import read_instance_mask
@@ -67,12 +66,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:
     return json.loads((out / f"{name}.json").read_text())
-
-
-def test_instances_are_chosen_from_all_over() -> None:
-    assert spread_evenly(10, 2) == [2, 7]
-    assert spread_evenly(3, 5) == [0, 1, 2]
-    assert spread_evenly(3, 0) == []
 
 
 def test_table_3_2_walks_over_the_layout_of_the_thesis(

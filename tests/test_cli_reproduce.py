@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from tests.made_street import make_street
+from tests.pages.read_page import read_page
 
 from depthpose.cli import main
 from depthpose.cli.methods import Method
@@ -113,6 +114,16 @@ def test_floors_know_the_street_they_were_fitted_to(street: Path, tmp_path: Path
     nearest, rows = (float(str(by_method[f"floor: {n}"]["abs_rel"])) for n in ("nearest", "rows"))
     assert nearest < 0.01 < rows < 0.5
     assert "ause" not in by_method["floor: rows"]
+    page = read_page(tmp_path / "report.html")
+    measured = json.loads((tmp_path / "frames.json").read_text())
+    for method in by_method:
+        own = [r["abs_rel"] for r in measured if (r["method"], r["cap_m"]) == (method, 80)]
+        for role, error in (("worst", max(own)), ("best", min(own))):
+            said = f"The {role} of 4 frames by abs_rel: {error:.4f}, truth up to 80 m."
+            assert said in page.texts["p"]
+            assert f"{error:.4f}" in page.texts["td"]
+    assert len(page.scenes) == 6
+    assert all(page.layers(k) == ["points", "true points"] for k in range(len(page.scenes)))
 
 
 def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path) -> None:

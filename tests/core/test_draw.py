@@ -1,12 +1,19 @@
+from itertools import pairwise
+
+import pytest
 import torch
 
 from depthpose.core.draw import (
+    depth_scale,
     draw_depth,
     draw_disparity,
+    draw_error_points,
     draw_lines,
     draw_outline,
     draw_points,
     draw_share,
+    rising_scale,
+    shrink_to_pixels,
 )
 
 
@@ -65,3 +72,40 @@ def test_the_outline_lies_inside_the_mask() -> None:
     drawn = draw_outline(torch.zeros(3, 10, 10), mask, (0.0, 1.0, 0.0))[1] > 0
     assert int(drawn.sum()) == 36 - 16
     assert not bool((drawn & ~mask).any())
+
+
+def test_the_marks_of_a_bar_stand_where_their_colours_are() -> None:
+    for near_m, far_m in ((3.0, 80.0), (0.25, 7.0), (1.5, 8.0)):
+        scale = depth_scale(near_m, far_m)
+        places, words = zip(*scale.marks, strict=True)
+        assert (words[0], words[-1]) == (f"{near_m:g}", f"{far_m:g}")
+        assert min(b - a for a, b in pairwise(places)) >= 0.08 - 1e-9
+        metres = torch.tensor([[float(word) for word in words]])
+        shares = torch.tensor([list(places)]).float()
+        assert torch.allclose(draw_depth(metres, near_m, far_m), draw_share(shares), atol=1e-5)
+    assert [word for _, word in depth_scale().marks] == ["3", "5", "10", "20", "50", "80"]
+
+
+def test_a_rising_bar_ends_in_the_brightest_colour() -> None:
+    scale = rising_scale("error [px]", 4.0, has_more=True)
+    assert scale.marks == [(0.0, "0"), (0.5, "2"), (1.0, "4+")]
+    for color, share in ((scale.colors[0], 1.0), (scale.colors[-1], 0.0)):
+        assert draw_share(torch.tensor([[share]])).flatten().tolist() == pytest.approx(color)
+
+
+def test_of_errors_that_overlap_the_largest_is_seen() -> None:
+    error = torch.full((5, 7), torch.nan)
+    error[2, 2], error[2, 3] = 1.0, 4.0
+    picture = draw_error_points(torch.ones(3, 5, 7), error, 4.0)
+    assert torch.equal(picture[:, 1, 3], draw_share(torch.zeros(1, 1))[:, 0, 0])
+    assert torch.equal(picture[:, 2, 1], draw_share(torch.full((1, 1), 0.75))[:, 0, 0])
+    assert torch.equal(picture[:, 0, 0], torch.full((3,), 0.35))
+
+
+def test_a_large_picture_shrinks_and_a_small_one_stays() -> None:
+    image = torch.rand(3, 40, 60)
+    assert shrink_to_pixels(image, 2400) is image
+    small = shrink_to_pixels(image, 600)
+    assert small.shape == (3, 20, 30)
+    assert torch.allclose(small.mean(), image.mean(), atol=1e-6)
+    assert shrink_to_pixels(torch.rand(3, 1, 5000), 10).shape[1] == 1

@@ -2,12 +2,16 @@ import csv
 import io
 import json
 import re
+from base64 import b64decode
 from pathlib import Path
 
 import torch
+from PIL import Image
 
+from depthpose.core.draw import rising_scale
 from depthpose.core.files import Cloud, write_image
 from depthpose.core.report import (
+    Drawing,
     Picture,
     Section,
     csv_table,
@@ -63,6 +67,29 @@ def test_a_page_holds_its_scenes_and_the_viewer_once(tmp_path: Path) -> None:
     assert [json.loads(text) for text in found] == [scene.encoded()] * 3
     assert "a &lt;cloud&gt;" in html
     assert "://" not in html
+
+
+def test_a_page_shows_facts_numbers_and_pictures_of_no_file(tmp_path: Path) -> None:
+    scale = rising_scale("error <px>", 4.0)
+    drawing = Drawing(image=torch.rand(3, 1000, 1000), caption="a <drawing>", scale=scale)
+    section = Section(
+        title="One",
+        facts=[("size", "2 < 3")],
+        tables={"R | t": [["1.0", "<2>"]]},
+        pictures=[drawing],
+    )
+    write_page(tmp_path / "page.html", "Title", [section], {})
+    html = (tmp_path / "page.html").read_text()
+    assert "<dt>size</dt><dd>2 &lt; 3</dd>" in html
+    assert "<caption>R | t</caption>" in html
+    assert "<td>1.0</td><td>&lt;2&gt;</td>" in html
+    assert "error &lt;px&gt;" in html
+    assert 'alt="a &lt;drawing&gt;"' in html
+    assert "linear-gradient(to right, rgb(5, 5, 26), " in html
+    encoded = re.findall(r'src="data:image/jpeg;base64,(.*?)"', html)
+    (picture,) = (Image.open(io.BytesIO(b64decode(text))) for text in encoded)
+    assert 460_000 < picture.width * picture.height <= 480_000
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_a_page_without_scenes_brings_no_viewer(tmp_path: Path) -> None:

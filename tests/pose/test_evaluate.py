@@ -4,10 +4,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.made_frames import K, make_dataset, moved, predictions_of
+from tests.pose.made_frames import (
+    K,
+    made_models,
+    made_pose,
+    make_dataset,
+    moved,
+    predictions_of,
+)
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.bop import BopDataset, Target
 from depthpose.pose.bop.linemod import linemod_symmetries
 from depthpose.pose.config import EvaluationConfig
@@ -17,11 +24,12 @@ from depthpose.pose.evaluate import (
     evaluate,
     frames_hash,
     is_adds,
+    nearest_copy,
     of_targets,
     read_any,
 )
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.metrics import add_m, adds_m, mspd_px
+from depthpose.pose.metrics import add_m, adds_m, mspd_px, rotation_error_rad
 from depthpose.pose.predictions import Place, write_bop_results, write_predictions
 from depthpose.pose.types import Symmetries
 
@@ -204,3 +212,19 @@ def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:
     assert evaluate(made, []).rows[0]["refused"] == 1.0
     with pytest.raises(InputError, match="vsd_delta_m is 15"):
         EvaluationConfig(vsd_delta_m=15.0)
+
+
+def test_the_nearest_copy_of_what_turns_freely_is_the_estimate_itself() -> None:
+    bracket, bottle = made_models()
+    true = made_pose(0.0, 3)
+    (axis,) = bottle.symmetries.continuous
+    turn = perturb(
+        Rigid(torch.eye(3).double(), torch.zeros(3).double()),
+        torch.cat([0.5 * math.pi * axis.direction.double(), torch.zeros(3).double()]),
+    )
+    found = Rigid(true.R @ turn.R, true.t_m)
+    free = nearest_copy(found, true, symmetry_transforms(bottle.symmetries))
+    fixed = nearest_copy(found, true, symmetry_transforms(bracket.symmetries))
+    assert math.degrees(float(rotation_error_rad(found, free))) < 3
+    assert torch.allclose(fixed.R, true.R)
+    assert torch.allclose(fixed.t_m, true.t_m)

@@ -6,7 +6,7 @@ from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weig
 from depthpose.core.files import Cloud
 from depthpose.core.scene import Lines
 from depthpose.pose.mesh import make_model
-from depthpose.pose.overlay import bent_edges, keypoint_layers, pose_layers, vote_layer
+from depthpose.pose.overlay import TRUE, bent_edges, keypoint_layers, pose_layers, vote_layer
 from depthpose.pose.types import CloudInput, ObjectModel
 
 
@@ -45,9 +45,14 @@ def test_a_posed_model_lies_where_its_pose_says() -> None:
     corners_m = pose.inverse().apply(box.ends_m.flatten(0, 1))
     torch.testing.assert_close(corners_m.amin(0), low_m)
     torch.testing.assert_close(corners_m.amax(0), high_m)
-    (true,) = pose_layers(pose, model, is_true=True)
-    assert isinstance(true.shape, Lines)
-    assert torch.equal(true.shape.ends_m, box.ends_m)
+    truth = {layer.name: layer.shape for layer in pose_layers(pose, model, is_true=True)}
+    for own, true in (("its box", "true box"), ("its edges", "true edges")):
+        one, other = layers[own], truth.pop(true)
+        assert isinstance(one, Lines)
+        assert isinstance(other, Lines)
+        assert torch.equal(one.ends_m, other.ends_m)
+        assert torch.equal(other.color, torch.tensor(TRUE).expand(len(other.ends_m), 3))
+    assert not truth
 
 
 def test_a_model_of_points_has_no_edges() -> None:

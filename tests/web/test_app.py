@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import tempfile
 import threading
 import zipfile
@@ -281,18 +280,6 @@ def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(
     found = ask(page, "pose", samples, files, **data).json()
     assert_posed(page, found, truth, "cloud")
     assert dict(found["facts"])["by"] == f"network; the CAD file is the weights' '{PART}'"
-
-
-def test_a_turn_about_the_camera_moves_an_origin_that_is_far_from_it() -> None:
-    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
-    covariance = torch.zeros(6, 6)
-    covariance[1, 1] = 0.01**2  # about y: two metres ahead, sideways by 20 mm
-    turn_deg, origin_mm = pose_tab.spreads(pose, covariance)
-    assert turn_deg == pytest.approx([0.0, math.degrees(0.01), 0.0], rel=1e-5)
-    assert origin_mm == pytest.approx([20.0, 0.0, 0.0], rel=1e-5)
-    # A translation that takes the turn back leaves the origin where it is.
-    covariance[3, 3], covariance[1, 3], covariance[3, 1] = 0.02**2, -0.0002, -0.0002
-    assert pose_tab.spreads(pose, covariance)[1] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
 
 
 def test_another_object_is_refused_in_words(page: TestClient, samples: Path, truth: Rigid) -> None:

@@ -15,6 +15,7 @@ import torch
 from playwright.sync_api import Browser, Page, sync_playwright
 from tests.web.samples import PART, write_street, write_view
 
+from depthpose.cli import main
 from depthpose.core.files import Cloud
 from depthpose.core.report import Section, write_page
 from depthpose.core.scene import Layer, Scene, colored_lines
@@ -174,7 +175,7 @@ def test_pose_good(page: Page, address: str, samples: Path) -> None:
     assert said.startswith(f"The {PART} is at x ")
     assert page.locator("#pose .terms").count() == 0, "the weights have none"
     assert drawn_share(page, "#pose") > 0.02
-    votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^ votes$"))
+    votes = page.locator("#pose .keys label").filter(has_text=re.compile(r"^\s*votes$"))
     before = picture_of(page, "#pose")
     votes.locator("input").check()
     page.wait_for_timeout(1000)
@@ -216,6 +217,39 @@ def test_a_report_turns_hides_sorts_and_needs_no_server(page: Page, tmp_path: Pa
     for click, order in enumerate((["a", "b", "c"], ["b", "a", "c"])):
         page.locator("th", has_text="x").click()
         assert page.locator("td:first-child").all_text_contents() == order, click
+
+
+@pytest.mark.parametrize("room", ["depth", "pose"])
+def test_the_page_of_a_prediction_is_drawn(
+    page: Page, samples: Path, tmp_path: Path, room: str
+) -> None:
+    given = {
+        "depth": ["left.png", "--camera", "camera.json"],
+        "pose": ["--depth", "depth.png", "--mask", "mask.png", "--camera", "view.json"],
+    }[room]
+    words = [str(samples / word) if "." in word else word for word in given]
+    words += ["--object", PART] if room == "pose" else []
+    assert main([room, "predict", *words, "--out", str(tmp_path)]) == 0
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.goto((tmp_path / "report.html").as_uri())
+    page.locator(".scene").scroll_into_view_if_needed()
+    page.locator(".scene canvas").wait_for()
+    page.wait_for_timeout(1000)
+    assert drawn_share(page, "body") > 0.02
+    before = picture_of(page, "body")
+    page.locator(".scene canvas").press("ArrowLeft")
+    page.wait_for_timeout(1000)
+    assert picture_of(page, "body") != before, "the cloud turns"
+    for picture in page.locator("img").all():
+        assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)")
+    if room == "pose":
+        swatches = page.locator(".keys label", has_text="posed model").locator(".swatch")
+        ink = swatches.first.evaluate("element => getComputedStyle(element).backgroundColor")
+        assert ink == "rgb(38, 89, 255)"
+    else:
+        assert page.locator(".scale .marks span").first.text_content() == "3"
+    assert not said
 
 
 def test_without_webgl_there_is_a_sentence(page: Page, tmp_path: Path) -> None:

@@ -32,7 +32,8 @@ def predict(
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png (16 bit, metres
     x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the drawn view),
     NAME.color.png, and NAME.ply with --cloud. A video gives the files of each frame and
-    NAME.color.mp4. A rerun skips what is finished; other settings need another --out.
+    NAME.color.mp4. report.html shows some of them, with the cloud in 3D. A rerun skips what is
+    finished; other settings need another --out.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --focal-px 1100 --out out
@@ -91,7 +92,8 @@ def match(
 
     For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
-    NAME.ply with --cloud. A rerun skips what is finished; other settings need another --out.
+    NAME.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips what
+    is finished; other settings need another --out.
 
         depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out out
 

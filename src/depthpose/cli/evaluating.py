@@ -9,6 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.depth_page import frame_sections
 from depthpose.cli.methods import Method
 from depthpose.core.errors import InputError
 from depthpose.core.report import Section, markdown_table, write_page, write_table
@@ -73,12 +74,14 @@ def measure(
     """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print."""
     if find_shard().rank > 0:
         return 0
-    measured = measure_all(dataset, folders, protocol, caps_m)
+    each = measure_each(dataset, folders, protocol, caps_m)
+    measured = join(each)
     write_table(out, measured.rows)
     write_details(measured, out)
     page = out / "report.html"
     sections = [
         Section(title="Mean over frames", text=describe_protocol(protocol), rows=measured.rows),
+        *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
         *detail_sections(measured),
     ]
     write_page(page, f"{protocol} on {dataset.name}", sections, environment())
@@ -91,20 +94,38 @@ def measure(
 def measure_all(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
-    """Measure several folders of predictions; each row says whose it is."""
-    rows: list[dict[str, Any]] = []
-    frames: list[dict[str, Any]] = []
-    deciles: list[dict[str, Any]] = []
-    skipped: dict[str, str] = {}
+    """Measure several folders of predictions as one table; each row says whose it is."""
+    return join(measure_each(dataset, folders, protocol, caps_m))
+
+
+def measure_each(
+    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
+) -> list[Evaluation]:
+    """Measure folders of predictions one by one; each row says whose it is."""
+    found: list[Evaluation] = []
     for folder in folders:
         result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
         who = _describe(folder)
         name = {column: who[column] for column in ("method", "sees", "weights")}
-        rows += [who | row for row in result.rows]
-        frames += [name | row for row in result.per_frame]
-        deciles += [name | row for row in result.deciles]
-        skipped |= result.skipped
-    return Evaluation(rows=rows, per_frame=frames, deciles=deciles, skipped=skipped)
+        found.append(
+            Evaluation(
+                rows=[who | row for row in result.rows],
+                per_frame=[name | row for row in result.per_frame],
+                deciles=[name | row for row in result.deciles],
+                skipped=result.skipped,
+            )
+        )
+    return found
+
+
+def join(each: Sequence[Evaluation]) -> Evaluation:
+    """Put the rows of several evaluations below each other."""
+    return Evaluation(
+        rows=[row for one in each for row in one.rows],
+        per_frame=[row for one in each for row in one.per_frame],
+        deciles=[row for one in each for row in one.deciles],
+        skipped={name: why for one in each for name, why in one.skipped.items()},
+    )
 
 
 def write_details(measured: Evaluation, out: Path) -> None:

@@ -1,11 +1,14 @@
 """The work behind ``depthpose depth match``."""
 
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
+from depthpose.cli.depth_page import write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
@@ -94,4 +97,18 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
+    if find_shard().rank == 0:
+        _write_page(pairs, out, failures)
     return 1 if failures else 0
+
+
+def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:
+    """Write the page of what is finished: other processes may still be at work."""
+    places = {path.stem: k for k, path in enumerate(pairs.left) if is_finished(out, path.stem)}
+
+    def read(names: Sequence[str]) -> Iterator[StereoInput]:
+        for name in names:
+            with suppress(InputError):
+                yield pairs.read(places[name])
+
+    write_depth_page(out, list(places), read, failures)

@@ -46,8 +46,9 @@ def predict(
     poses.json holds for each input camera_from_model (metres), its covariance, status and reason,
     and the seconds of each stage. A cloud or depth image NAME gives NAME.ply, the posed model
     beside the cloud, and NAME.png over the depth image; a data set gives
-    depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. A rerun skips what is finished; other settings
-    need another --out; processes of torchrun share the work.
+    depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. report.html shows some of them in 3D, and every
+    refusal. A rerun skips what is finished; other settings need another --out; processes of
+    torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
@@ -78,6 +79,7 @@ def predict(
     """
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_methods import pose_methods
+    from depthpose.cli.pose_page import write_pose_page
     from depthpose.core.run import claim_names, own_device
 
     _refuse_mixture(cloud, depth, bop)
@@ -111,6 +113,7 @@ def predict(
     if predictions is None:
         return 0
     posing.write_files(predictions, jobs, out, method)
+    write_pose_page(out, predictions, jobs, method)
     return posing.say_result(predictions, out)
 
 
@@ -173,8 +176,7 @@ def evaluate(
         pose_methods.predict_all(dataset, method, one, out) for method in methods for one in shown
     ]
     rule = EvaluationConfig(diameters=diameters, adds=adds, with_vsd=vsd)
-    measured = pose_evaluating.measure_all(dataset, [*paths, *csv, *predictions], rule)
-    return pose_evaluating.report(dataset, measured, out)
+    return pose_evaluating.measure(dataset, [*paths, *csv, *predictions], rule, out)
 
 
 def _predict_bop(
@@ -187,6 +189,7 @@ def _predict_bop(
 ) -> int:
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_masks import find_masks
+    from depthpose.cli.pose_page import write_pose_page
     from depthpose.pose.bop import open_bop
 
     folder, split, word = given
@@ -200,6 +203,7 @@ def _predict_bop(
     if predictions is None:
         return 0
     posing.write_bop_files(predictions, dataset, out, method)
+    write_pose_page(out, predictions, jobs, method, dataset)
     return posing.say_result(predictions, out)
 
 

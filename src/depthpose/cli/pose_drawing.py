@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.cli.pose_views import Views, spread_evenly
+from depthpose.cli.pose_views import Views
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image, write_image
 from depthpose.core.report import Picture, Section, write_page
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import environment
+from depthpose.pages.choose import spread_evenly
+from depthpose.pages.pose import close_up, draw_boxes
 from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.bop.dataset import read_instance_mask
 from depthpose.pose.estimator import GeoPoseNet
@@ -24,18 +26,14 @@ from depthpose.pose.figures import (
     embed_line,
     seen_points,
 )
-from depthpose.pose.overlay import draw_pose, grey_depth
+from depthpose.pose.overlay import grey_depth
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.tables import VotingCase, cases_of
-from depthpose.pose.types import ObjectModel
 from depthpose.pose.voting import vote_ransac
 
 _MOST_POINTS = 4000
 """Of a t-SNE: its time grows with the square."""
 _SCAN_POINTS = 1500
-_AROUND = 0.6
-"""Margin about an object in a picture, in its own width."""
-_PANEL_PX = 360
 
 BOXES = "Boxes: truth green and dashed, estimate blue and solid."
 
@@ -56,7 +54,7 @@ def write_figure(number: str, text: str, panels: Sequence[Panel], out: Path, col
         file = out / "panels" / f"{number}.{k}.png"
         write_image(file, panel.image)
         pictures.append(Picture(path=file, caption=panel.caption))
-    section = Section(title=f"Figure {number}", text=text, pictures=pictures)
+    section = Section(title="Panels", text=text, pictures=pictures)
     write_page(out / "report.html", f"Figure {number}", [section], environment())
     captions = "; ".join(panel.caption for panel in panels)
     print(f"{path}: {captions}. {text}")
@@ -112,7 +110,7 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Pa
     exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
     error_mm = 1000 * float(errors[index][which])
     view = views.samples[index]
-    image, _ = _close_up(views.picture(index), view.input.mask, view.input.K)
+    image, _ = close_up(views.picture(index), view.input.mask, view.input.K)
     name = f"{view.input.name}, keypoint {which}"
     return [
         Panel(f"(a) {name}", image),
@@ -131,24 +129,11 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Panel]:
     for k, view in enumerate(views.samples):
         found = net.estimate_many([view.input])[0]
         poses = (view.truth.camera_from_model, found.camera_from_model)
-        picture, K = _close_up(views.picture(k), view.input.mask, view.input.K)
+        picture, K = close_up(views.picture(k), view.input.mask, view.input.K)
         image = draw_boxes(picture, poses, models[view.input.object], K)
         caption = view.input.name if found.is_ok else f"{view.input.name}: refused, {found.reason}"
         panels.append(Panel(caption, image))
     return panels
-
-
-def draw_boxes(
-    image: Float[Tensor, "3 h w"],
-    poses: tuple[Rigid, Rigid | None],
-    model: ObjectModel,
-    K: Float[Tensor, "3 3"],
-) -> Float[Tensor, "3 h w"]:
-    """Draw the box of the truth, green and dashed, and of the estimate, blue and solid."""
-    truth, found = poses
-    if found is not None:
-        image = draw_pose(image, found, model, K.double())
-    return draw_pose(image, truth, model, K.double(), is_true=True)
 
 
 def picture_sections(
@@ -166,7 +151,7 @@ def picture_sections(
                 continue
             poses = (instance.camera_from_model, estimate.camera_from_model)
             model = dataset.objects[instance.object_id]
-            picture, K = _close_up(*_picture_of(instance), instance.K)
+            picture, K = close_up(*_picture_of(instance), instance.K)
             image = draw_boxes(picture, poses, model, K)
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
             write_image(path, image)
@@ -189,26 +174,3 @@ def _picture_of(instance: Instance) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor
 def _true_keypoints(case: VotingCase) -> Float[Tensor, "k 3"]:
     pose = Rigid(case.truth.R.float(), case.truth.t_m.float())
     return pose.apply(case.model.keypoints_m.float())
-
-
-def _close_up(
-    image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
-) -> tuple[Float[Tensor, "3 _ _"], Float[Tensor, "3 3"]]:
-    """Cut out a square about what the mask shows and enlarge it to a panel, with its camera."""
-    rows, columns = mask.nonzero(as_tuple=True)
-    if len(rows) == 0:
-        return image, K
-    low = torch.stack([columns.amin(), rows.amin()])
-    high = torch.stack([columns.amax(), rows.amax()]) + 1
-    side = int((1 + _AROUND) * float((high - low).max()))
-    left, top = ((low + high - side) // 2).tolist()
-    # Beyond the picture there is black.
-    padded = torch.nn.functional.pad(image, (side, side, side, side))
-    part = padded[:, top + side : top + 2 * side, left + side : left + 2 * side]
-    grown = torch.nn.functional.interpolate(part[None], size=(_PANEL_PX, _PANEL_PX))[0]
-    scale = _PANEL_PX / side
-    moved = K.double().clone()
-    moved[:2, 2] -= torch.tensor([left - 0.5, top - 0.5], dtype=torch.float64)
-    moved[:2] *= scale
-    moved[:2, 2] -= 0.5
-    return grown, moved

@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from depthpose.cli.pose_masks import of_dataset
 from depthpose.cli.pose_names import distinct_names
+from depthpose.cli.pose_page import instance_sections
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.report import Section, markdown_table, write_page, write_table
@@ -42,18 +43,36 @@ def open_instances(
 def measure_all(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
 ) -> Evaluation:
-    """Measure several folders or csv files of predictions; each row says whose it is."""
-    rows: list[dict[str, Any]] = []
-    instances: list[dict[str, Any]] = []
-    risk: list[dict[str, Any]] = []
+    """Measure several folders or csv files of predictions as one table."""
+    return join(measure_each(dataset, predictions, config))
+
+
+def measure_each(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
+) -> list[Evaluation]:
+    """Measure folders or csv files of predictions one by one; each row says whose it is."""
+    found: list[Evaluation] = []
     for path, who in zip(predictions, describe(predictions), strict=True):
         _refuse_others(path, dataset)
         result = evaluate(dataset, read_any(path), config, _show_progress)
-        rows += [who | row for row in result.rows]
         short = {"method": who["method"], "masks": who["masks"]}
-        instances += [short | row for row in result.per_instance]
-        risk += [short | row for row in result.risk]
-    return Evaluation(rows=rows, per_instance=instances, risk=risk)
+        found.append(
+            Evaluation(
+                rows=[who | row for row in result.rows],
+                per_instance=[short | row for row in result.per_instance],
+                risk=[short | row for row in result.risk],
+            )
+        )
+    return found
+
+
+def join(each: Sequence[Evaluation]) -> Evaluation:
+    """Put the rows of several evaluations below each other."""
+    return Evaluation(
+        rows=[row for one in each for row in one.rows],
+        per_instance=[row for one in each for row in one.per_instance],
+        risk=[row for one in each for row in one.risk],
+    )
 
 
 def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
@@ -121,13 +140,18 @@ def success_by_masks(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(table.values())
 
 
-def report(dataset: BopDataset, measured: Evaluation, out: Path) -> int:
-    """Write rows.json, rows.csv, table.md, report.html and instances.csv, and print the rows."""
+def measure(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
+) -> int:
+    """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
+    each = measure_each(dataset, predictions, config)
+    measured = join(each)
     write_table(out, measured.rows)
     write_details(measured, out)
     sections = [
         Section(title="Success by masks", text=HOW, rows=success_by_masks(measured.rows)),
         Section(title="All numbers", rows=measured.rows),
+        *instance_sections(dataset, predictions, [one.per_instance for one in each]),
         *detail_sections(measured),
     ]
     page = out / "report.html"

@@ -11,6 +11,7 @@ from torch import Tensor
 from depthpose.cli import pose_evaluating, pose_methods
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
+from depthpose.pages.choose import spread_evenly
 from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
@@ -103,14 +104,6 @@ def open_views(net: GeoPoseNet, source: Source, number: int | None = None) -> Vi
     return Views(
         samples=list(_views_of(dataset, net)), instances=list(dataset.instances), facts=facts
     )
-
-
-def spread_evenly(total: int, number: int) -> list[int]:
-    """Choose so many of 0 .. total - 1, the middle of each equal part; all where there are fewer.
-
-    None where ``number`` is 0.
-    """
-    return sorted({(2 * k + 1) * total // (2 * number) for k in range(number)})
 
 
 def _views_of(dataset: BopDataset, net: GeoPoseNet) -> Iterator[ViewSample]:

@@ -1,7 +1,9 @@
 """The work behind ``depthpose depth predict``."""
 
+import re
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -10,6 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from depthpose.cli.depth_page import write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.cli.viewing import Viewer, open_viewer
 from depthpose.core.camera import Camera, StereoRig, read_camera
@@ -113,7 +116,26 @@ def predict_all(
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{done} depth maps are in {out}")
+    if find_shard().rank == 0:
+        _write_page(sources, lens, out, look, [str(failure) for failure in failures])
     return 1 if failures else 0
+
+
+def _write_page(
+    sources: list[Path], lens: Lens, out: Path, look: Look, failures: list[str]
+) -> None:
+    """Write the page of what is finished: other processes may still be at work."""
+    done = {source: _finished_names(source, out) for source in sources}
+
+    def read(names: Sequence[str]) -> Iterator[StereoInput]:
+        for source in sources:
+            wanted = [name for name in done[source] if name in names]
+            with suppress(InputError):
+                for name, image in _read_some(source, wanted):
+                    camera = lens.camera_of(image)
+                    yield StereoInput(name=name, left=image, right=None, camera=camera)
+
+    write_depth_page(out, [n for some in done.values() for n in some], read, failures, look.range_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +217,27 @@ def _size_of(source: Path) -> tuple[int, int]:
 
 def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def _finished_names(source: Path, out: Path) -> list[str]:
+    """List what is finished of an image, or of a video's frames."""
+    if not _is_video(source):
+        return [source.stem] if is_finished(out, source.stem) else []
+    frame = re.compile(re.escape(source.stem) + r"_\d{6}\.disparity_px\.npy")
+    found = sorted(path.name for path in out.iterdir() if frame.fullmatch(path.name))
+    return [name.removesuffix(".disparity_px.npy") for name in found]
+
+
+def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tensor]]:
+    """Read an image again, or some frames of a video, no further than to the last of them."""
+    if wanted and not _is_video(source):
+        yield source.stem, read_image(source)
+    elif wanted:
+        for name, image in read_video(source):
+            if name in wanted:
+                yield name, image
+            if name == wanted[-1]:
+                return
 
 
 def _colors(names: list[str], out: Path, look: Look) -> Iterator[Tensor]:

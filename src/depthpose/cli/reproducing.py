@@ -211,7 +211,7 @@ def _write_panels(panels: Sequence[Panel], home: Path) -> list[Picture]:
     for k, panel in enumerate(panels, 1):
         path = home.with_name(f"{home.name}.{k}.jpg")
         write_image(path, shrink_to_width(panel.image, _PICTURE_WIDTH_PX))
-        pictures.append(Picture(path=path, caption=panel.caption))
+        pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
     return pictures
 
 

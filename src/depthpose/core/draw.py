@@ -1,6 +1,8 @@
 """Maps as pictures. A picture is for eyes only: values are read from the NPY beside it."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +16,49 @@ _NEAR_TO_FAR = (
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
+_DIMMED = 0.35
+"""Of a picture under points."""
+_LEAST_GAP = 0.08
+"""Of two marks on a bar, in its lengths: nearer ones would touch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """What the colours of a picture mean: a bar to stand beside it.
+
+    Attributes:
+        title: of what, with its unit.
+        colors: RGB in [0, 1] at even steps from the left end of the bar to the right.
+        marks: places on the bar, 0 (left) to 1, and what is written there.
+    """
+
+    title: str
+    colors: Sequence[tuple[float, float, float]]
+    marks: Sequence[tuple[float, str]]
+
+
+def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
+    """Give the bar of :func:`draw_depth`, with round metres between its ends."""
+    whole = math.log(far_m / near_m)
+    ends = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
+    exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
+    for round_m in (digit * 10.0**k for k in exponents for digit in (1, 2, 5)):
+        place = math.log(round_m / near_m) / whole
+        if all(abs(place - other) >= _LEAST_GAP for other, _ in ends) and 0 < place < 1:
+            ends.append((place, f"{round_m:g}"))
+    return Scale(title="depth [m]", colors=_NEAR_TO_FAR, marks=sorted(ends))
+
+
+def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
+    """Give the bar of what is dark at 0 and bright at ``top``.
+
+    Args:
+        title: of what, with its unit.
+        top: the brightest.
+        has_more: whether what is beyond it is as bright.
+    """
+    marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
+    return Scale(title=title, colors=_NEAR_TO_FAR[::-1], marks=marks)
 
 
 def draw_depth(
@@ -48,15 +93,44 @@ def draw_points(
     depth_m: Float[Tensor, "h w"],
     far_m: float = 80.0,
     radius_px: int = 1,
+    near_m: float = 3.0,
 ) -> Float[Tensor, "3 h w"]:
     """Lay sparse depth (LiDAR) over a darkened image, each point grown to a square.
 
     Its side is ``2 radius_px + 1`` pixels; where squares overlap the nearest point is seen.
     """
-    side = 2 * radius_px + 1
-    nearest_m = -F.max_pool2d(-depth_m.nan_to_num(torch.inf)[None], side, 1, radius_px)[0]
-    grown_m = torch.where(torch.isfinite(nearest_m), nearest_m, torch.nan)
-    return torch.where(torch.isnan(grown_m), 0.35 * image, draw_depth(grown_m, far_m=far_m))
+    grown_m = -_grow(-depth_m, radius_px)
+    return torch.where(
+        torch.isnan(grown_m), _DIMMED * image, draw_depth(grown_m, near_m=near_m, far_m=far_m)
+    )
+
+
+def draw_error_points(
+    image: Float[Tensor, "3 h w"], error: Float[Tensor, "h w"], top: float, radius_px: int = 1
+) -> Float[Tensor, "3 h w"]:
+    """Lay sparse errors over a darkened image as :func:`draw_points` does; the largest is seen.
+
+    0 is dark and ``top`` bright.
+    """
+    grown = _grow(error, radius_px)
+    return torch.where(torch.isnan(grown), _DIMMED * image, draw_share(1 - grown / top))
+
+
+def shrink_to_pixels(image: Float[Tensor, "3 h w"], most: int) -> Float[Tensor, "3 _ _"]:
+    """Scale a picture down to about so many pixels at most, its proportions kept."""
+    height, width = image.shape[1:]
+    scale = math.sqrt(most / (height * width))
+    if scale >= 1:
+        return image
+    size = (max(1, int(height * scale)), max(1, int(width * scale)))
+    return F.interpolate(image[None], size, mode="area")[0]
+
+
+def _grow(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:
+    """Grow each number to a square; where squares overlap the largest wins."""
+    known = values.nan_to_num(-torch.inf)[None]
+    grown = F.max_pool2d(known, 2 * radius_px + 1, 1, radius_px)[0]
+    return torch.where(torch.isfinite(grown), grown, torch.nan)
 
 
 def draw_lines(

@@ -8,20 +8,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from torch import Tensor
 
-from depthpose.core.files import atomic_write, write_json
+from depthpose.core.draw import Scale, shrink_to_pixels
+from depthpose.core.files import atomic_write, encode_image, write_json
 from depthpose.core.scene import Scene, page_file
 
 Row = Mapping[str, Any]
 
+_MOST_PIXELS = 480_000
+"""Of a drawing on a page of many: a frame of KITTI is whole."""
+_QUALITY = 85
+
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture file with a caption."""
+    """A picture file with a caption, and with the bar of its colours where they are numbers."""
 
     path: Path
     caption: str
+    scale: Scale | None = None
 
     @property
     def data_uri(self) -> str:
@@ -30,14 +38,41 @@ class Picture:
         return f"data:image/{kind};base64," + base64.b64encode(self.path.read_bytes()).decode()
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawing:
+    """A picture that lies on the page alone, small enough for a page of many."""
+
+    image: Float[Tensor, "3 h w"]
+    caption: str
+    scale: Scale | None = None
+
+    @property
+    def data_uri(self) -> str:
+        """The picture as a ``data:`` address."""
+        encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg", _QUALITY)
+        return "data:image/jpeg;base64," + base64.b64encode(encoded).decode()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page: words, then a table, then pictures, then 3D views."""
+    """A part of a page, in this order.
+
+    Attributes:
+        title: its heading.
+        text: words.
+        facts: names and values.
+        rows: a table that sorts.
+        tables: small tables by what they show, rows of equal length.
+        pictures: beside each other.
+        scenes: 3D views.
+    """
 
     title: str
     text: str = ""
+    facts: Sequence[tuple[str, str]] = ()
     rows: Sequence[Row] = ()
-    pictures: Sequence[Picture] = field(default_factory=tuple)
+    tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
+    pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     scenes: Sequence[Scene] = field(default_factory=tuple)
 
 

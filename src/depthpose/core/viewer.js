@@ -111,6 +111,13 @@ const showScene = (() => {
     return { place, other, side, color };
   }
 
+  // The one colour of some layers; nothing where there are more.
+  function onlyColor(layers) {
+    const first = layers[0].colors.subarray(0, 3);
+    const isAlike = ({ colors }) => colors.every((value, i) => value === first[i % 3]);
+    return first.length && layers.every(isAlike) ? first.join(", ") : undefined;
+  }
+
   // The middle of points, and the size of the box that holds nearly all: strays do not set the view.
   function extent(layers) {
     const axes = [[], [], []];
@@ -151,7 +158,7 @@ const showScene = (() => {
     // From where the camera stood, but no farther off than all is seen.
     const reach = 1.3 * Math.hypot(...middle);
     const start = { yaw: 0.22, pitch: 0.18, target: middle,
-      distance: Math.min(reach > 0.1 * size ? reach : size, size) };
+      distance: Math.min(reach > 0.1 * size ? reach : size, 1.25 * size) };
     let eye = { ...start }, waiting = false;
 
     const ask = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
@@ -245,7 +252,10 @@ const showScene = (() => {
       const same = layers.filter(layer => layer.name === name);
       const label = made("label"), box = made("input", { type: "checkbox", checked: same[0].shown });
       box.addEventListener("change", () => { for (const layer of same) layer.shown = box.checked; ask(); });
-      label.append(box, ` ${name}`);
+      label.append(box, " ");
+      const ink = onlyColor(same);
+      if (ink) label.append(made("span", { className: "swatch", style: `background: rgb(${ink})` }), " ");
+      label.append(name);
       keys.append(label);
     }
     keys.append(made("span", { className: "hint", textContent: HINT }));

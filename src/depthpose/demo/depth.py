@@ -7,29 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.camera import StereoRig, write_camera
-from depthpose.core.draw import draw_depth, draw_share
+from depthpose.core.draw import depth_scale, draw_depth
 from depthpose.core.files import write_image
 from depthpose.core.report import Picture, Section
-from depthpose.core.scene import Layer, Scene
 from depthpose.demo.motorcycle import read_motorcycle
 from depthpose.depth.config import SGBMConfig, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import depth_errors, disparity_errors
-from depthpose.depth.predictions import estimate_cloud, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import write_estimate, write_estimate_cloud
 from depthpose.depth.streets import Streets
-from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample
+from depthpose.depth.types import DepthEstimate, StereoSample
+from depthpose.pages.depth import DepthError, DepthShown, depth_section
 
 STREETS_SEED = 9
 """No weights were trained on streets of this seed."""
 
 _STREET = 1
 _CAP_M = 80.0
-_WORST_PX = 4.0
 _FROM_ONE, _FROM_PAIR = "one image", "both images"
 Nets = Mapping[str, tuple[str, FakestereoNet]]
 
@@ -82,8 +79,10 @@ def _try_all(
         estimate = net.estimate_pair(pair)
         rows.append({"scene": name, "method": method, "sees": sees, **_measure(sample, estimate)})
         folder = out / method.lower().replace(",", "").replace(" ", "-")
-        shown.append(_show(folder, f"{name}: {method}, {sees}", sample, estimate))
-    return rows, [_opening(out / name, name, text, rows), *shown]
+        shown.append(
+            _show(folder, f"{name}: {method}, {sees}", replace(sample, input=pair), estimate)
+        )
+    return rows, [_opening(out / name, sample, text, rows), *shown]
 
 
 def _write_pair(folder: Path, sample: StereoSample) -> None:
@@ -130,15 +129,16 @@ _MOTORCYCLE_TEXT = (
 )
 
 
-def _opening(folder: Path, name: str, text: str, rows: list[dict[str, Any]]) -> Section:
+def _opening(folder: Path, sample: StereoSample, text: str, rows: list[dict[str, Any]]) -> Section:
+    scale = depth_scale(*_range_m(sample))
     return Section(
-        title=f"The {name}",
+        title=f"The {sample.input.name}",
         text=text,
         rows=rows,
         pictures=[
             Picture(path=folder / "left.png", caption="left image"),
             Picture(path=folder / "right.png", caption="right image"),
-            Picture(path=folder / "depth.png", caption="true depth"),
+            Picture(path=folder / "depth.png", caption="true depth; grey: none", scale=scale),
         ],
     )
 
@@ -146,30 +146,9 @@ def _opening(folder: Path, name: str, text: str, rows: list[dict[str, Any]]) -> 
 def _show(folder: Path, title: str, sample: StereoSample, estimate: DepthEstimate) -> Section:
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
-    pair: StereoInput = sample.input
-    write_estimate(folder, pair, estimate, _range_m(sample))
-    write_estimate_cloud(folder, pair, estimate)
-    error = folder / f"{pair.name}.error.png"
-    write_image(error, _draw_error(estimate.disparity_px, truth_px))
-    pictures = [Picture(path=folder / f"{pair.name}.color.png", caption="estimated depth")]
-    if estimate.right is not None:
-        drawn = Picture(path=folder / f"{pair.name}.right.png", caption="right view as drawn")
-        pictures.append(drawn)
-    caption = f"disparity error, dark 0 to bright {_WORST_PX:.0f} px"
-    far_m = _range_m(sample)[1]
-    cloud = estimate_cloud(pair, estimate, far_m)
-    space = Scene(
-        caption=f"{title}: the cloud up to {far_m:.0f} m",
-        layers=[Layer(name="points in the image's colours", shape=cloud)],
-    )
-    return Section(
-        title=title,
-        pictures=[*pictures, Picture(path=error, caption=caption)],
-        scenes=[space],
-    )
-
-
-def _draw_error(
-    predicted_px: Float[Tensor, "h w"], true_px: Float[Tensor, "h w"]
-) -> Float[Tensor, "3 h w"]:
-    return draw_share(1 - (predicted_px - true_px).abs() / _WORST_PX)
+    range_m = _range_m(sample)
+    write_estimate(folder, sample.input, estimate, range_m)
+    write_estimate_cloud(folder, sample.input, estimate)
+    error = DepthError(error=(estimate.disparity_px - truth_px).abs(), is_disparity=True)
+    shown = DepthShown(pair=sample.input, estimate=estimate, range_m=range_m, error=error)
+    return depth_section(title, shown, with_image=False)

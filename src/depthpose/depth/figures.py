@@ -1,14 +1,14 @@
 """Figures 2-1 and 2-5 of the thesis: the same scene seen, synthesised, estimated and measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.draw import draw_depth, draw_points
+from depthpose.core.draw import Scale, depth_scale, draw_depth, draw_points
 from depthpose.core.errors import InputError
 from depthpose.depth.types import DepthEstimate, StereoInput
 
@@ -29,10 +29,12 @@ class Panel:
     Attributes:
         caption: what it shows.
         image: the picture, at the size of the frame.
+        scale: what its colours mean, where they are metres.
     """
 
     caption: str
     image: Float[Tensor, "3 h w"]
+    scale: Scale | None = None
 
 
 def draw_figure_2_5(
@@ -51,7 +53,7 @@ def draw_figure_2_5(
     panels = [Panel(caption="left image", image=pair.left)]
     if pair.right is not None:
         panels.append(Panel(caption="real right image", image=pair.right))
-    panels.append(Panel(caption="predicted depth", image=_depth(pair, estimate)))
+    panels.append(_depth("predicted depth", pair, estimate))
     if estimate.right is not None:
         panels.append(Panel(caption="predicted right image", image=estimate.right))
     return panels + _lidar(pair, lidar_m)
@@ -81,10 +83,9 @@ def draw_figure_2_1(
         Panel(caption="(a) left image", image=pair.left),
         Panel(caption="(b) real right image", image=pair.right),
         Panel(caption="(c) synthesised right image", image=mono.right),
-        Panel(caption="(d) depth from left and synthesised right", image=_depth(pair, mono)),
-        Panel(caption="(e) depth from left and real right", image=_depth(pair, stereo)),
-        *(Panel(caption=f"(f) {panel.caption}", image=panel.image)
-          for panel in _lidar(pair, lidar_m)),
+        _depth("(d) depth from left and synthesised right", pair, mono),
+        _depth("(e) depth from left and real right", pair, stereo),
+        *(replace(panel, caption=f"(f) {panel.caption}") for panel in _lidar(pair, lidar_m)),
     ]  # fmt: skip
 
 
@@ -118,10 +119,11 @@ def arrange(
     return canvas
 
 
-def _depth(pair: StereoInput, estimate: DepthEstimate) -> Float[Tensor, "3 h w"]:
+def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Panel:
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
-    return draw_depth(estimate.depth_m, _NEAR_M, _FAR_M)
+    image = draw_depth(estimate.depth_m, _NEAR_M, _FAR_M)
+    return Panel(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
 
 
 def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Panel]:
@@ -129,7 +131,7 @@ def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Pane
         return []
     # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.
     image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=2)
-    return [Panel(caption="LiDAR", image=image)]
+    return [Panel(caption="LiDAR", image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
 
 
 def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:

@@ -85,23 +85,34 @@ def bent_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
     return places_m[edges[is_bent | (count == 1)]]
 
 
-def pose_layers(pose: Rigid, model: ObjectModel, *, is_true: bool = False) -> list[Layer]:
-    """Show a posed object in space: its surface, edges, box and axes; the truth as a box alone."""
+def pose_layers(
+    pose: Rigid, model: ObjectModel, *, is_true: bool = False, with_box: bool = False
+) -> list[Layer]:
+    """Show a posed object in space: surface, edges, box and axes; the truth by edges and box.
+
+    Args:
+        pose: ``camera_from_model``.
+        model: the object.
+        is_true: draw it as the truth beside an estimate.
+        with_box: whether an estimate's box is seen at first; that of a truth is.
+    """
     pose = Rigid(pose.R.double(), pose.t_m.double())
 
     def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
 
     box_m = posed(box_edges(model))
+    edges_m = posed(bent_edges(model)) if len(model.faces) else None
     if is_true:
-        return [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
-    surface = posed_cloud(torch.empty(0, 3), pose, model)
-    layers = [Layer(name="posed model", shape=surface)]
-    if len(model.faces):
-        edges = colored_lines(posed(bent_edges(model)), FOUND)
-        layers.append(Layer(name="its edges", shape=edges))
+        layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
+        if edges_m is not None:
+            layers.append(Layer(name="true edges", shape=colored_lines(edges_m, TRUE)))
+        return layers
+    layers = [Layer(name="posed model", shape=posed_cloud(torch.empty(0, 3), pose, model))]
+    if edges_m is not None:
+        layers.append(Layer(name="its edges", shape=colored_lines(edges_m, FOUND)))
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=False)
+    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=with_box)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 
@@ -151,8 +162,13 @@ def _crosses(at_m: Float[Tensor, "k 3"], half_m: float) -> Float[Tensor, "n 2 3"
     return ends_m.flatten(0, 1).float()
 
 
-def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid, model: ObjectModel) -> Cloud:
-    """Put the posed surface beside the cloud: what was seen is grey, the model blue."""
+def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel) -> Cloud:
+    """Put the posed surface beside the cloud: what was seen is grey, the model blue.
+
+    Without a pose, the cloud alone.
+    """
+    if pose is None:
+        return Cloud(points=cloud_m.float(), color=torch.full((len(cloud_m), 3), 0.6))
     surface_m = pose.apply(sample_surface(model, _SURFACE)[0].to(pose.R))
     colors = [torch.full((len(cloud_m), 3), 0.6), torch.tensor(FOUND).expand(len(surface_m), 3)]
     return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))

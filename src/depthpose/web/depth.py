@@ -3,14 +3,13 @@
 import math
 import time
 
-from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image, write_cloud, write_image
-from depthpose.core.scene import Layer, Scene
+from depthpose.core.files import read_image, write_image
 from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
-from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud, write_estimate
+from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.pages.depth import depth_facts, depth_scene
 from depthpose.web.answer import Answer, Shown, read_files
 from depthpose.web.form import Form, small_size
 
@@ -35,21 +34,17 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     assert found.depth_m is not None
     folder = form.results()
     write_estimate(folder, pair, found, (near_m, far_m))
-    cloud = estimate_cloud(pair, found, far_m)
-    write_cloud(folder / f"{pair.name}.ply", cloud)
+    write_estimate_cloud(folder, pair, found, far_m)
+    focal = " (guessed, 0.75 widths: metres are as wrong as it is)" if is_guess else ""
     pictures = _pictures(pair, found, (near_m, far_m))
     if found.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - found.confidence))
-    scene = Scene(
-        caption=f"The cloud up to {far_m:g} m",
-        layers=[Layer(name="points", shape=cloud)],
-    )
     return Answer(
         is_ok=True,
         said=_sentence(pair, found),
-        facts=_facts(pair, found, seconds, is_guess=is_guess),
+        facts=[*depth_facts(pair, found, focal), ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
-        scene=scene,
+        scene=depth_scene(pair, found, far_m),
         terms=net.terms,
         files=read_files(folder),
     )
@@ -164,27 +159,3 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
         f"Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
         f"{middle_m:.2f} m."
     )
-
-
-def _facts(
-    pair: StereoInput, found: DepthEstimate, seconds: float, *, is_guess: bool
-) -> list[tuple[str, str]]:
-    camera, depth_m = pair.camera, found.depth_m
-    assert depth_m is not None
-    assert isinstance(camera, Camera)
-    known = depth_m[depth_m.isfinite()]
-    guess = " (guessed, 0.75 widths: metres are as wrong as it is)" if is_guess else ""
-    facts = [
-        ("size", f"{camera.width} x {camera.height} px"),
-        ("focal length", f"{float(camera.K[0, 0]):.1f} px{guess}"),
-    ]
-    if pair.right is not None and isinstance(camera, StereoRig):
-        facts.append(("baseline", f"{camera.baseline_m:g} m"))
-    facts.append(("pixels with depth", f"{len(known) / depth_m.numel():.1%}"))
-    if len(known):
-        facts.append(
-            ("nearest, farthest", f"{float(known.min()):.2f} m, {float(known.max()):.2f} m")
-        )
-    if found.confidence is not None:
-        facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
-    return [*facts, ("computed in", f"{seconds:.2f} s")]

@@ -1,7 +1,5 @@
 """The tab Pose: what a depth sensor saw of a known object to its pose, or why there is none."""
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,30 +9,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    Cloud,
-    read_map,
-    write_cloud,
-    write_image,
-)
-from depthpose.core.rigid import Rigid
-from depthpose.core.scene import Layer, Scene
+from depthpose.core.files import read_map, write_cloud, write_image
+from depthpose.core.scene import Scene
+from depthpose.pages.pose import pose_facts, pose_scene, pose_sentence, pose_tables
 from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Voted
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface
-from depthpose.pose.overlay import (
-    draw_pose,
-    grey_depth,
-    keypoint_layers,
-    pose_layers,
-    posed_cloud,
-    vote_layer,
-)
+from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
 from depthpose.pose.predictions import Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.web.answer import Answer, Shown, read_files
@@ -45,8 +30,6 @@ OWN_CAD = "cad"
 _SAME = 0.02
 """In diameters: a CAD file whose size and keypoints agree so well is the object of the weights."""
 _SURFACE = 20_000
-_SEEN = (0.55, 0.55, 0.55)
-_AROUND = (0.7, 0.66, 0.6)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,9 +63,9 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     folder = form.results()
     return Answer(
         is_ok=found.is_ok,
-        said=_sentence(found, target.model),
+        said=pose_sentence(found),
         facts=_facts(found, target),
-        tables=_tables(found),
+        tables=pose_tables(found),
         pictures=_write(folder, given, points_m, found, target.model),
         scene=_scene(given, points_m, found, target.model, voted),
         terms=terms,
@@ -100,8 +83,7 @@ def _write(
     """Write ``poses.json``, the cloud with the posed model, and the picture that is shown."""
     pose = found.camera_from_model
     write_predictions(folder, [Prediction(estimate=found)])
-    seen = _colored(points_m, _SEEN) if pose is None else posed_cloud(points_m, pose, model)
-    write_cloud(folder / f"{given.name}.ply", seen)
+    write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
     if not isinstance(given, ViewInput):
         return []
     picture, caption = grey_depth(given.depth_m), "depth image, near bright"
@@ -192,65 +174,10 @@ def _unit(form: Form, field: str) -> Unit:
     return cast(Unit, unit)
 
 
-def _sentence(found: PoseEstimate, model: ObjectModel) -> str:
-    if found.camera_from_model is None:
-        return f"Refused ({found.status}): {found.reason}."
-    x, y, z = found.camera_from_model.t_m.tolist()
-    return f"The {model.name} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
-
-
 def _facts(found: PoseEstimate, target: _Target) -> list[tuple[str, str]]:
-    facts = [
-        ("object", f"{found.object}, {target.model.diameter_m:.4f} m long"),
-        ("by", target.how),
-    ]
-    if found.risk is not None:
-        facts.append(("risk of being wrong", f"{found.risk:.3f}"))
-    if found.inlier_share is not None:
-        is_network = target.registration is None
-        what = "votes that agree" if is_network else "points near the model"
-        facts.append((what, f"{found.inlier_share:.0%}"))
-    if found.residual_m is not None and math.isfinite(found.residual_m):
-        facts.append(("distance left (RMS)", f"{1000 * found.residual_m:.2f} mm"))
-    if found.free_motions is not None and len(found.free_motions):
-        free = f"{len(found.free_motions)} (a declared symmetry; the covariance leaves them out)"
-        facts.append(("free motions", free))
-    stages = ", ".join(f"{name} {1000 * s:.0f}" for name, s in found.seconds.items())
-    return [*facts, ("ms", stages)]
-
-
-def _tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
-    """Show the pose, and how far it may be off along each axis."""
-    tables: dict[str, Sequence[Sequence[str]]] = {}
-    pose = found.camera_from_model
-    if pose is not None:
-        rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
-        tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
-    if pose is not None and found.covariance is not None:
-        turn_deg, origin_mm = spreads(pose, found.covariance)
-        tables["standard deviations along the camera's axes"] = [
-            ["", "x", "y", "z"],
-            ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
-            ["place of the model's origin [mm]", *(f"{v:.3f}" for v in origin_mm)],
-        ]
-        tables["covariance of rotation vector [rad] and translation [m], as poses.json has it"] = [
-            [f"{v:.2e}" for v in row] for row in found.covariance.tolist()
-        ]
-    return tables
-
-
-def spreads(pose: Rigid, covariance: Float[Tensor, "6 6"]) -> tuple[list[float], list[float]]:
-    """Give the standard deviations of the rotation [deg] and of the model's origin [mm].
-
-    The perturbation is a left one: a rotation about the camera moves an origin at t by
-    ``rotation x t``, beside the translation.
-    """
-    t, spread = pose.t_m.double(), covariance.double()
-    turned = torch.linalg.cross(torch.eye(3, dtype=torch.float64), t.expand(3, 3)).mT
-    by = torch.cat([turned, torch.eye(3, dtype=torch.float64)], 1)
-    origin = (by @ spread @ by.mT).diagonal().clamp(min=0).sqrt() * 1000
-    turn = spread.diagonal()[:3].clamp(min=0).sqrt() * 180 / math.pi
-    return turn.tolist(), origin.tolist()
+    is_network = target.registration is None
+    agreeing = "votes that agree" if is_network else "points near the model"
+    return pose_facts(found, target.model, target.how, agreeing)
 
 
 def _scene(
@@ -260,23 +187,9 @@ def _scene(
     model: ObjectModel,
     voted: Voted | None,
 ) -> Scene:
-    """Show what was seen, the votes and the posed model."""
-    layers = [Layer(name="the object, as seen", shape=_colored(points_m, _SEEN))]
-    pose = found.camera_from_model
-    if pose is not None:
-        layers += pose_layers(pose, model)
-    if found.keypoints_m is not None:
-        layers += keypoint_layers(found.keypoints_m, pose, model)
-        if voted is not None:
-            directions = voted.outputs[..., :3]
-            layers.append(vote_layer(voted.cloud.points_m, directions, found.keypoints_m))
-    if isinstance(given, ViewInput):
-        around_m = back_project(given.depth_m, given.K)[~given.mask]
-        around_m = around_m[around_m.isfinite().all(-1)].float()
-        layers.append(Layer(name="all else", shape=_colored(around_m, _AROUND), is_shown=False))
-    caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
-    return Scene(caption=caption, layers=layers)
-
-
-def _colored(points_m: Float[Tensor, "n 3"], color: tuple[float, float, float]) -> Cloud:
-    return Cloud(points=points_m, color=torch.tensor(color).expand(len(points_m), 3))
+    """Show what was seen, the posed model and the votes."""
+    scene = pose_scene(given, points_m, found, model)
+    if found.keypoints_m is None or voted is None:
+        return scene
+    votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], found.keypoints_m)
+    return replace(scene, layers=[*scene.layers, votes])

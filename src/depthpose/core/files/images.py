@@ -79,18 +79,32 @@ def write_image(path: AnyPath, image: Tensor) -> None:
     Raises:
         InputError: the shape, the values or the suffix are wrong, or the disk refuses.
     """
-    suffix = Path(path).suffix.lower()
+    write_bytes(path, encode_image(image, path))
+
+
+def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
+    """Give the bytes that :func:`write_image` writes to a file of this name.
+
+    Args:
+        image: see there.
+        name: decides the format by its suffix.
+        quality: of a JPEG, 1 to 95.
+
+    Raises:
+        InputError: the shape, the values or the suffix are wrong.
+    """
+    suffix = Path(name).suffix.lower()
     if suffix not in LISTED_SUFFIXES:
-        raise refused_suffix(path, "picture", LISTED_SUFFIXES)
-    _check_image(path, image)
+        raise refused_suffix(name, "picture", LISTED_SUFFIXES)
+    _check_image(name, image)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
     form, options = (
-        ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": 95, "subsampling": 0})
+        ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": quality, "subsampling": 0})
     )
     encoded = BytesIO()
-    with refused_as(path, "picture", "check its size"):
+    with refused_as(name, "picture", "check its size"):
         Image.fromarray(pixels.contiguous().numpy()).save(encoded, form, **options)
-    write_bytes(path, encoded.getvalue())
+    return encoded.getvalue()
 
 
 def list_images(path: AnyPath) -> list[Path]:

@@ -91,28 +91,33 @@ def measure(
     true, points = instance.camera_from_model, ruler.model.vertices_m
     adds = float(adds_m(estimated, true, points))
     scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
-    rotation_deg, translation = _nearest_copy(estimated, true, ruler.symmetries)
+    copy = nearest_copy(estimated, true, ruler.symmetries)
     row = {
         "error_m": adds if ruler.is_adds else float(add_m(estimated, true, points)),
         "adds_m": adds,
         "mssd_m": float(mssd_m(estimated, true, points, ruler.symmetries)),
         "mspd_px": scale * float(mspd_px(estimated, true, points, ruler.symmetries, instance.K)),
-        "rotation_deg": rotation_deg,
-        "translation_m": translation,
+        "rotation_deg": math.degrees(float(rotation_error_rad(estimated, copy))),
+        "translation_m": float(translation_error_m(estimated, copy)),
     }
     if ruler.vsd_delta_m is None:
         return row, None
     return row, _vsd(estimated, instance, ruler)
 
 
-def _nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> tuple[float, float]:
+def nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> Rigid:
+    """Give the true pose that is turned least against an estimate, of those that look alike.
+
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same.
+        symmetries: motions of the model that leave it as it is, the identity first.
+    """
     R, t_m = symmetries.R.double(), symmetries.t_m.double()
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
     one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
-    turned = rotation_error_rad(one, copies)
-    nearest = int(turned.argmin())
-    moved = translation_error_m(one, copies)[nearest]
-    return math.degrees(float(turned[nearest])), float(moved)
+    nearest = int(rotation_error_rad(one, copies).argmin())
+    return Rigid(copies.R[nearest], copies.t_m[nearest])
 
 
 def _vsd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Float[Tensor, "10"]:

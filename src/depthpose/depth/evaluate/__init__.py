@@ -1,0 +1,15 @@
+"""Named protocols to rows: predictions are files, metrics read files.
+
+A protocol fixes the truth, the pixels that count and how the prediction is prepared. Numbers of
+two protocols do not compare; every row carries its protocol's name.
+"""
+
+from depthpose.depth.evaluate.evaluate import Evaluation as Evaluation
+from depthpose.depth.evaluate.evaluate import evaluate as evaluate
+from depthpose.depth.evaluate.frames import FrameResult as FrameResult
+from depthpose.depth.evaluate.frames import clamped_depth as clamped_depth
+from depthpose.depth.evaluate.frames import frame_result as frame_result
+from depthpose.depth.evaluate.protocols import PROTOCOLS as PROTOCOLS
+from depthpose.depth.evaluate.protocols import Protocol as Protocol
+from depthpose.depth.evaluate.protocols import find_protocol as find_protocol
+from depthpose.depth.evaluate.protocols import has_truth as has_truth

@@ -1,0 +1,195 @@
+"""One frame: its truth and its prediction, brought to one size and ready to be compared."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    disparity_advice,
+    disparity_from_depth,
+    resize_disparity,
+)
+from depthpose.depth.evaluate.protocols import Protocol, find_protocol, has_truth
+from depthpose.depth.kitti import Dataset, Frame, lidar_truth
+from depthpose.depth.metrics import garg_crop, view_errors
+from depthpose.depth.predictions import (
+    has_prediction,
+    read_confidence,
+    read_disparity,
+    read_drawn_view,
+)
+from depthpose.depth.types import DepthEstimate
+
+SMALLEST_DEPTH_M = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prepared:
+    """A frame's truth and prediction, brought to the size of the image."""
+
+    frame: Frame
+    truth: Float[Tensor, "h w"]
+    disparity_px: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"] | None
+    camera: Camera | None
+    view: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Compared:
+    """The two maps that a frame's numbers are of: metres, or pixels of disparity.
+
+    Attributes:
+        predicted: as the protocol prepares it; NaN where there is no prediction.
+        truth: NaN where it does not count.
+    """
+
+    predicted: Float[Tensor, "h w"]
+    truth: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameResult:
+    """What a person looks at to see where the error of a frame is.
+
+    Attributes:
+        estimate: at the size of the image.
+        compared: what its numbers are of.
+        error: absolute disparity error [px], or absolute depth error as a share of the truth; NaN
+            where nothing is compared.
+        true_depth_m: the truth that counts as depth; None where it is a disparity without a rig.
+    """
+
+    estimate: DepthEstimate
+    compared: Compared
+    error: Float[Tensor, "h w"]
+    true_depth_m: Float[Tensor, "h w"] | None
+
+
+def frame_result(
+    dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
+) -> FrameResult:
+    """Read one frame again as :func:`evaluate` measured it.
+
+    Args:
+        dataset: as it was measured.
+        index: of the frame.
+        predictions: the folder.
+        protocol: a key of ``PROTOCOLS``.
+        cap_m: of the row; None for a protocol of disparity.
+
+    Raises:
+        InputError: the frame does not count, or a file is damaged.
+    """
+    rule = find_protocol(protocol)
+    prepared = prepare(dataset, index, predictions, rule)
+    if isinstance(prepared, str):
+        raise InputError(f"{dataset.frames[index].name}: {prepared}; choose a frame that counts")
+    rig = prepared.camera if isinstance(prepared.camera, StereoRig) else None
+    depth_m = None if rig is None else depth_from_disparity(prepared.disparity_px, rig)
+    if cap_m is None:
+        compared = compare_disparity(prepared)
+        error = (compared.predicted - compared.truth).abs()
+        true_m = None if rig is None else depth_from_disparity(compared.truth, rig)
+    else:
+        compared = compare_depth(prepared, rule, cap_m)
+        error = (compared.predicted - compared.truth).abs() / compared.truth
+        true_m = compared.truth
+    estimate = DepthEstimate(
+        depth_m=depth_m,
+        disparity_px=prepared.disparity_px,
+        confidence=prepared.confidence,
+        right=read_drawn_view(predictions, prepared.frame.name),
+    )
+    return FrameResult(estimate=estimate, compared=compared, error=error, true_depth_m=true_m)
+
+
+def compare_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Compared:
+    """Choose the true metres that count, and clamp the predicted ones."""
+    assert isinstance(prepared.camera, StereoRig)
+    truth = prepared.truth
+    counts = truth > (SMALLEST_DEPTH_M if rule.with_crop_and_cap else 0.0)
+    if rule.with_crop_and_cap:
+        counts &= (truth < cap_m) & garg_crop(*truth.shape)
+    return Compared(
+        predicted=clamped_depth(prepared.disparity_px, prepared.camera, cap_m),
+        truth=torch.where(counts, truth, torch.nan),
+    )
+
+
+def compare_disparity(prepared: Prepared) -> Compared:
+    """Take disparity as it is."""
+    return Compared(predicted=prepared.disparity_px, truth=prepared.truth)
+
+
+def clamped_depth(
+    disparity_px: Float[Tensor, "h w"], rig: StereoRig, cap_m: float
+) -> Float[Tensor, "h w"]:
+    """Turn disparity into depth as the published script does: infinity to 0, then the clamp.
+
+    NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
+    """
+    depth_m = depth_from_disparity(disparity_px, rig).nan_to_num(0.0)
+    clamped_m = depth_m.clamp(SMALLEST_DEPTH_M, cap_m)
+    return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
+
+
+def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> Prepared | str:
+    """Read truth and prediction of a frame, or say why it does not count."""
+    frame = dataset.frames[index]
+    if not has_truth(frame, rule):
+        return f"no truth of the kind {rule.truth}"
+    if frame.right is None and not has_prediction(predictions, frame.name):
+        return "no right view to match, and no prediction"
+    truth = _truth(dataset, index, rule)
+    camera = dataset.read_rig(index)
+    if rule.truth != "disparity" and not isinstance(camera, StereoRig):
+        raise InputError(f"{frame.name}: no calibration, so its disparity cannot become metres.")
+    height, width = truth.shape
+    predicted_px = resize_disparity(read_disparity(predictions, frame.name, camera), height, width)
+    true_px = truth
+    if rule.truth != "disparity" and isinstance(camera, StereoRig):
+        true_px = disparity_from_depth(truth, camera)
+    if (advice := disparity_advice(predicted_px, true_px)) is not None:
+        raise InputError(f"{predictions / frame.name}: {advice}")
+    confidence = read_confidence(predictions, frame.name)
+    if confidence is not None and confidence.shape != truth.shape:
+        confidence = resize_disparity(confidence, height, width) * (confidence.shape[1] / width)
+    return Prepared(
+        frame=frame,
+        truth=truth,
+        disparity_px=predicted_px,
+        confidence=confidence,
+        camera=camera,
+        view=_measure_view(frame, predictions),
+    )
+
+
+def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
+    """Compare the drawn right view with the real one, where there are both."""
+    drawn = read_drawn_view(predictions, frame.name)
+    if drawn is None or frame.right is None:
+        return {}
+    real = read_image(frame.right)
+    if real.shape != drawn.shape:
+        raise InputError(
+            f"{predictions}: the drawn view of {frame.name} is {drawn.shape[2]}x{drawn.shape[1]}, "
+            f"but its right image is {real.shape[2]}x{real.shape[1]}; predict it again"
+        )
+    return asdict(view_errors(drawn, real))
+
+
+def _truth(dataset: Dataset, index: int, rule: Protocol) -> Float[Tensor, "h w"]:
+    if rule.truth in ("velodyne_x", "camera_z"):
+        return lidar_truth(dataset.frames[index], rule.truth)
+    shipped = dataset.read_truth(index)
+    truth = shipped.disparity_px if rule.truth == "disparity" else shipped.depth_m
+    assert truth is not None  # has_truth said so
+    return truth

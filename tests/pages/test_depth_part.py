@@ -1,0 +1,90 @@
+"""A depth estimate as a part of a page."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.made_street import make_street
+from tests.pages.read_page import drawings
+
+from depthpose.core.draw import draw_depth, draw_share
+from depthpose.core.files import Cloud
+from depthpose.depth.types import DepthEstimate
+from depthpose.pages.depth import DepthError, DepthShown, depth_section
+
+SAMPLE = make_street(0.1)
+PAIR = replace(SAMPLE.input, right=None)
+
+
+def truth_m() -> torch.Tensor:
+    assert SAMPLE.truth.depth_m is not None
+    return SAMPLE.truth.depth_m
+
+
+def estimate(**more: torch.Tensor) -> DepthEstimate:
+    assert SAMPLE.truth.disparity_px is not None
+    disparity_px = SAMPLE.truth.disparity_px
+    return DepthEstimate(depth_m=truth_m(), disparity_px=disparity_px, **more)
+
+
+def test_what_there_is_is_shown_in_its_colours() -> None:
+    confidence = torch.rand(truth_m().shape)
+    found = estimate(confidence=confidence, right=PAIR.left)
+    section = depth_section("a frame", DepthShown(pair=PAIR, estimate=found, range_m=(2.0, 40.0)))
+    image, depth, sure, right = drawings(section)
+    assert [p.caption.split(",")[0] for p in (image, right)] == ["image", "right view as drawn"]
+    assert torch.equal(depth.image, draw_depth(truth_m(), 2.0, 40.0))
+    assert torch.equal(sure.image, draw_share(1 - confidence))
+    assert depth.scale is not None
+    assert [depth.scale.marks[0], depth.scale.marks[-1]] == [(0.0, "2"), (1.0, "40")]
+    assert sure.scale is not None
+    assert sure.scale.title == "confidence"
+    (scene,) = section.scenes
+    cloud = scene.layers[0].shape
+    assert isinstance(cloud, Cloud)
+    assert len(cloud.points) == int((truth_m() <= 40.0).sum())
+
+
+def test_the_facts_are_those_of_the_map() -> None:
+    facts = dict(depth_section("a", DepthShown(pair=PAIR, estimate=estimate())).facts)
+    known_m = truth_m()[truth_m().isfinite()]
+    numbers = [float(f(known_m)) for f in (torch.min, torch.median, torch.max)]
+    assert facts["nearest, middle, farthest"] == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
+    assert facts["pixels with depth"] == f"{len(known_m) / truth_m().numel():.1%}"
+    assert "baseline" not in facts, "one image has none"
+    assert "mean confidence" not in facts
+
+
+def test_without_a_camera_there_is_disparity_and_no_cloud() -> None:
+    found = replace(estimate(), depth_m=None)
+    section = depth_section("a", DepthShown(pair=replace(PAIR, camera=None), estimate=found))
+    assert section.pictures[1].scale is not None
+    assert section.pictures[1].scale.title == "disparity [px]"
+    assert not section.scenes
+
+
+@pytest.mark.parametrize("is_sparse", [True, False])
+def test_the_error_is_where_the_truth_is(is_sparse: bool) -> None:
+    error = torch.full(truth_m().shape, torch.nan)
+    known_m = error.clone()
+    part = (slice(20, 22), slice(30, 32)) if is_sparse else (slice(None), slice(None))
+    error[part], known_m[part] = 0.3, 10.0
+    wrong = DepthError(error=error, is_disparity=False, true_depth_m=known_m)
+    shown = DepthShown(pair=PAIR, estimate=estimate(), error=wrong)
+    section = depth_section("a", shown, with_image=False)
+    _, truth, errors = drawings(section)
+    bright = draw_share(torch.zeros(1, 1))[:, 0, 0]
+    ten = draw_depth(torch.full((1, 1), 10.0))[:, 0, 0]
+    for picture, ink in ((truth, ten), (errors, bright)):
+        image = picture.image
+        assert torch.equal(image[:, 21, 31], ink)
+        # Points are grown by two pixels, and no further.
+        assert torch.equal(image[:, 23, 33], ink)
+        assert torch.equal(image[:, 25, 35], 0.35 * PAIR.left[:, 25, 35] if is_sparse else ink)
+    assert errors.scale is not None
+    assert errors.scale.marks[-1] == (1.0, "30+")
+    layers = section.scenes[0].layers
+    assert [layer.name for layer in layers] == ["points", "true points"]
+    points = layers[1].shape
+    assert isinstance(points, Cloud)
+    assert bool(points.points[:, 2].allclose(torch.tensor(10.0)))
