@@ -174,6 +174,15 @@ def test_an_unknown_name_says_where_weights_come_from() -> None:
         find_weights("nope")
 
 
+@pytest.mark.parametrize("name", ["kitti-nc", "linemod-nc", "bunny-nc", "ycb"])
+def test_weights_that_stay_out_of_the_wheel_say_where_they_are(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("depthpose.core.checkpoint.SHIPPED", tmp_path)
+    with pytest.raises(InputError, match=f"not in the wheel.*weights/{name}.safetensors from the"):
+        find_weights(name)
+
+
 def test_the_fingerprint_is_sha256(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     assert file_sha256(tmp_path / "a").startswith("ba7816bf8f01cfea")

@@ -21,6 +21,9 @@ from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
 
+_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
+"""Weights that stay out of the wheel."""
+
 
 class LicenceNotice(UserWarning):
     """Weights whose terms bind whoever uses them."""
@@ -152,6 +155,11 @@ def find_weights(name: str | Path) -> Path:
         return _only_weights(path)
     if is_on_hub(name):
         return fetch_weights(str(name))
+    if str(name) in _IN_REPOSITORY:
+        raise InputError(
+            f"weights {str(name)!r}: not in the wheel, for their terms or their size. Take "
+            f"src/depthpose/weights/{name}.safetensors from the repository and give its path."
+        )
     raise InputError(
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
         f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones, "

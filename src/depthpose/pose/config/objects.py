@@ -63,10 +63,10 @@ class ObjectsConfig:
     resolution: tuple[float, float] = (0.4, 0.8)
     """The image is so many times as large: coarser pictures are faster made."""
 
-    occluded_share: float = 0.6
+    occluded_share: float = 0.7
     """Share of samples in which something stands before the object."""
 
-    occlusion: tuple[float, float] = (0.0, 0.4)
+    occlusion: tuple[float, float] = (0.0, 0.5)
     """Share of the silhouette that it hides."""
 
     with_background: bool = True
