@@ -38,6 +38,7 @@ class Machine:
     def __init__(self, folder: Path, data: Path | None) -> None:
         self.folder, self.clone = folder, folder / "depthpose"
         keep = {name: os.environ[name] for name in ("PATH", "LANG") if name in os.environ}
+        keep |= {name: word for name, word in os.environ.items() if name.startswith("PIP_")}
         self.environment = keep | {"HOME": str(folder), "DEPTHPOSE_DATA": str(data or "")}
 
     def run(self, line: str, at: Path) -> None:
@@ -56,7 +57,8 @@ class Machine:
         if done.returncode and " data " not in line:  # those answer 1 where they find something
             sys.exit(f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
         said = (done.stdout.strip().splitlines() or [""])[-1][:80].replace("|", " ")
-        print(f"| `{line}` | {seconds:.0f} | {more:.1f} | {said} |", flush=True)
+        shown = line.replace(str(self.folder), "~").replace(str(PROJECT), "REPOSITORY")
+        print(f"| `{shown}` | {seconds:.0f} | {more:.1f} | {said} |", flush=True)
 
 
 def readme_commands() -> list[str]:
