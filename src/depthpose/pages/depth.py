@@ -17,9 +17,8 @@ from depthpose.core.draw import (
     draw_share,
     rising_scale,
 )
-from depthpose.core.files import Cloud
 from depthpose.core.report import Drawing, Section
-from depthpose.core.scene import Layer, Scene
+from depthpose.core.scene import Layer, Scene, colored_points
 from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud
 from depthpose.depth.types import DepthEstimate, StereoInput
 
@@ -189,6 +188,5 @@ def _scenes(title: str, shown: DepthShown) -> list[Scene]:
     true_m = back_project(shown.error.true_depth_m, camera.K).reshape(-1, 3).float()
     true_m = true_m[true_m.isfinite().all(-1) & (true_m[:, 2] <= far_m)]
     true_m = take_evenly(true_m, _TRUE_POINTS)
-    truth = Cloud(points=true_m, color=torch.tensor(_TRUE).expand(len(true_m), 3))
-    layer = Layer(name="true points", shape=truth)
+    layer = Layer(name="true points", shape=colored_points(true_m, _TRUE))
     return [Scene(caption=f"{scene.caption}; the truth in green", layers=[*scene.layers, layer])]

@@ -11,16 +11,15 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project
 from depthpose.core.draw import draw_outline
-from depthpose.core.files import Cloud
 from depthpose.core.report import Drawing, Row, Section
 from depthpose.core.rigid import Rigid
-from depthpose.core.scene import Layer, Scene
+from depthpose.core.scene import Layer, Scene, colored_points
 from depthpose.pose.cloud import object_points
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.overlay import draw_pose, grey_depth, keypoint_layers, pose_layers
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
-SEEN = (0.55, 0.55, 0.55)
+_SEEN = (0.55, 0.55, 0.55)
 _AROUND = (0.7, 0.66, 0.6)
 _MASKED = (1.0, 0.85, 0.1)
 _AROUND_POINTS = 20_000
@@ -146,7 +145,7 @@ def pose_scene(
     truth: Rigid | None = None,
 ) -> Scene:
     """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
-    layers = [Layer(name="the object, as seen", shape=_colored(points_m, SEEN))]
+    layers = [Layer(name="the object, as seen", shape=colored_points(points_m, _SEEN))]
     pose = found.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
@@ -157,7 +156,7 @@ def pose_scene(
     if isinstance(given, ViewInput):
         around_m = back_project(given.depth_m, given.K)[~given.mask]
         around_m = around_m[around_m.isfinite().all(-1)].float()
-        around = _colored(take_evenly(around_m, _AROUND_POINTS), _AROUND)
+        around = colored_points(take_evenly(around_m, _AROUND_POINTS), _AROUND)
         layers.append(Layer(name="all else", shape=around, is_shown=False))
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)
@@ -228,7 +227,3 @@ def _drawings(shown: PoseShown) -> list[Drawing]:
         near = draw_boxes(near, poses, shown.model, K)
         drawings.append(Drawing(image=near, caption=f"the object from near by; {said}"))
     return drawings
-
-
-def _colored(points_m: Float[Tensor, "n 3"], color: tuple[float, float, float]) -> Cloud:
-    return Cloud(points=points_m, color=torch.tensor(color).expand(len(points_m), 3))
