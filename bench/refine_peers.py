@@ -19,7 +19,8 @@ from torch import Tensor
 
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.metrics import add_m
-from depthpose.pose.refine import prepare_surface, refine_pose
+from depthpose.pose.refine import refine_pose
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import ObjectModel
 
 STARTS = 20

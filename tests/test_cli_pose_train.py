@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from depthpose.cli import main
+from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import read_config
 from depthpose.pose.objects import write_part
 from depthpose.pose.train import STAGES, PoseTraining, Run
@@ -43,6 +45,29 @@ def test_a_cad_file_becomes_weights_with_a_card(
     again = [*words, "--cad", str(part), "--unit", "mm", "--seed", "5", "--resume"]
     assert main(again) == 2
     assert "seed" in capsys.readouterr().err
+
+
+def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bolder share of wrong answers gives more answers."""
+    config = tmp_path / "tiny.yaml"
+    config.write_text("held_out: {number: 4, occlusions: [0.0]}\ncalibration: {number: 20}\n")
+    limits = []
+    for share in ("0.01", "0.5"):
+        out = tmp_path / f"bold{share}.safetensors"
+        words = ["pose", "calibrate", "parts", "--config", str(config), "--out", str(out)]
+        assert main([*words, "--max-wrong-share", share]) == 0
+        said = capsys.readouterr().out
+        assert f"calibrated weights: {out}" in said
+        assert "| 0 | " in said
+        limits.append(read_pose_weights(out).refusal.max_risk)
+    assert limits[0] < limits[1]
+    old, new = (read_pose_weights(find_weights(name)) for name in ("parts", str(out)))
+    for name, tensor in old.network.state_dict().items():
+        assert torch.equal(new.network.state_dict()[name], tensor), name
+    assert new.facts == old.facts
+    assert out.stat().st_size == pytest.approx(find_weights("parts").stat().st_size, rel=0.01)
 
 
 @pytest.mark.parametrize(

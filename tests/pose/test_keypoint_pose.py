@@ -10,7 +10,8 @@ from depthpose.pose.bop import open_bop
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.metrics import add_m
-from depthpose.pose.refine import prepare_surface, refine_pose
+from depthpose.pose.refine import refine_pose
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import Axis
 from depthpose.pose.voting import (
     consistent_keypoints,

@@ -14,7 +14,8 @@ from depthpose.pose.bop import open_bop
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
-from depthpose.pose.refine import Surface, prepare_surface, refine_pose
+from depthpose.pose.refine import refine_best, refine_pose
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import ObjectModel
 
 
@@ -93,6 +94,49 @@ def test_a_pose_that_meets_nothing_stays(stone: ObjectModel, surface: Surface) -
     assert math.isinf(float(refined.residual_m))
 
 
+def test_a_far_turn_ends_at_the_true_pose_and_turns_about_the_object(
+    stone: ObjectModel, surface: Surface
+) -> None:
+    """At 0.8 m a turn of 25 degrees about the camera would carry the object away by its size."""
+    start = pose_near(TRUE, 3, math.radians(25), 0.0)
+    refined = refine_pose(seen_half(stone, TRUE), start, surface)
+    assert float(geodesic_rad(refined.camera_from_model.R, TRUE.R)) < 5e-3
+    far = TRUE.t_m + torch.tensor([0, 0, 5.0])
+    moved = refine_pose(
+        seen_half(stone, TRUE) + torch.tensor([0, 0, 5.0]), Rigid(start.R, far), surface
+    )
+    assert torch.allclose(moved.camera_from_model.t_m, refined.camera_from_model.t_m
+                          + torch.tensor([0, 0, 5.0]), atol=1e-6)  # fmt: skip
+
+
+def test_the_best_of_several_starts_is_found_and_named(
+    stone: ObjectModel, surface: Surface
+) -> None:
+    cloud = seen_half(stone, TRUE)
+    given = [pose_near(TRUE, seed, turn, 0.01) for seed, turn in ((0, 2.0), (1, 0.35), (2, 1.5))]
+    batch = Rigid(torch.stack([g.R for g in given]), torch.stack([g.t_m for g in given]))
+    best = refine_best(cloud, batch, surface)
+    assert best.start == 1
+    assert float(geodesic_rad(best.refined.camera_from_model.R, TRUE.R)) < 5e-3
+    assert best.scatter > 0.3
+    sure = refine_best(cloud, pose_near(TRUE, 5, 0.05, 0.002), surface)
+    assert (sure.start, sure.scatter) == (0, 0.0)
+
+
+def test_a_pose_that_would_hide_what_was_seen_is_not_the_best(stone: ObjectModel) -> None:
+    """A plate looks alike from both sides, but its far side was not seen through the near one."""
+    mesh = trimesh.creation.box((0.16, 0.1, 0.03))
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
+    plate = make_model(vertices, faces, name="plate")
+    tilt = pose_near(TRUE, 1, 0.0, 0.0)
+    cloud = seen_half(plate, tilt)
+    # The seen sides lie on the far sides of the same plate, pushed toward the camera.
+    push = Rigid(tilt.R, tilt.t_m - 0.03 * tilt.R[:, 2] * torch.sign(tilt.R[2, 2]))
+    batch = Rigid(torch.stack([push.R, tilt.R]), torch.stack([push.t_m, tilt.t_m]))
+    best = refine_best(cloud, batch, prepare_surface(plate)).refined.camera_from_model
+    assert float((best.t_m - tilt.t_m).norm()) < 1e-3
+
+
 def test_its_covariance_is_honest(stone: ObjectModel, surface: Surface) -> None:
     squares = []
     for seed in range(60):
@@ -157,5 +201,6 @@ def test_nothing_and_no_numbers_are_refused() -> None:
         (torch.zeros(0, 3), "ICP of 0 points, 0 of them not finite"),
         (torch.full((40, 3), torch.nan), "ICP of 40 points, 40 of them"),
     ):
-        with pytest.raises(InputError, match=said):
-            refine_pose(cloud, start, surface)
+        for refine in (refine_pose, refine_best):
+            with pytest.raises(InputError, match=said):
+                refine(cloud, start, surface)

@@ -52,6 +52,10 @@ COMMANDS = {
         "pose_training:train",
         "your CAD file, or a config, to a network that poses it",
     ),
+    "pose calibrate": (
+        "pose_training:calibrate",
+        "choose anew when poses of trained weights are withheld",
+    ),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),

@@ -1,8 +1,10 @@
-"""``depthpose pose train``."""
+"""``depthpose pose train`` and ``pose calibrate``."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any, Literal
+
+import tyro
 
 from depthpose.cli.training import changed, progress_bar, say_trained
 from depthpose.core.errors import InputError
@@ -86,6 +88,39 @@ def train(
         path = run_stage(chosen, run)
     if is_first:
         say_trained(path)
+    return 0
+
+
+def calibrate(
+    weights: tyro.conf.Positional[str],
+    out: Path,
+    config: Path | None = None,
+    max_wrong_share: float | None = None,
+    number: int | None = None,
+) -> int:
+    """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
+
+    A larger share of wrong answers buys more answers. The network stays as it is; the views by
+    which it is then judged are others.
+
+        depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
+
+    Args:
+        weights: a file, a name or hf://OWNER/NAME.
+        out: the .safetensors file to write.
+        config: YAML of the training: its sensor and distances, and what is not said here.
+        max_wrong_share: of the answers that are given.
+        number: views of each object to choose by.
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.config import read_config
+    from depthpose.pose.train import PoseTraining, recalibrate
+
+    chosen = PoseTraining() if config is None else read_config(config, PoseTraining)
+    knobs = changed(chosen.calibration, max_wrong_share=max_wrong_share, number=number)
+    chosen = dataclasses.replace(chosen, calibration=knobs)
+    print(recalibrate(find_weights(weights), out, chosen))
+    print(f"calibrated weights: {out}")
     return 0
 
 

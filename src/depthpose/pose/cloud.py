@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -211,13 +211,24 @@ def _planes(
 ) -> Float[Tensor, "m 4"]:
     """Lay a plane through the nearest 20 of each kept point: its normal, and how bent it is."""
     every, some = points_m.double().cpu(), points_m[kept].double().cpu()
-    count = min(_NEIGHBOURS, len(every))
-    index = KDTree(every.numpy()).query(some.numpy(), k=count, workers=1)[1]
-    near = every[torch.as_tensor(index).reshape(len(some), count)]
-    near = near - near.mean(1, keepdim=True)
-    spread, axes = torch.linalg.eigh(near.mT @ near)
+    normals, bend = local_planes(every, some)
+    return torch.cat([normals @ turn.double().cpu().mT, bend], 1).float().to(points_m.device)
+
+
+def local_planes(
+    every_m: Float64[Tensor, "n 3"], some_m: Float64[Tensor, "m 3"]
+) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 1"]]:
+    """Lay a plane through the 20 points nearest to each of some.
+
+    Returns:
+        Its normal toward the camera, and how bent it is: 0 where flat, 1 where a ball.
+    """
+    count = min(_NEIGHBOURS, len(every_m))
+    index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
+    near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]
+    near_m = near_m - near_m.mean(1, keepdim=True)
+    spread, axes = torch.linalg.eigh(near_m.mT @ near_m)
     normals = axes[:, :, 0]
-    is_behind = (normals * some).sum(-1, keepdim=True) > 0
-    normals = torch.where(is_behind, -normals, normals) @ turn.double().cpu().mT
+    is_behind = (normals * some_m).sum(-1, keepdim=True) > 0
     bend = 3 * spread[:, :1].clamp(min=0) / spread.sum(1, keepdim=True).clamp(min=1e-30)
-    return torch.cat([normals, bend], 1).float().to(points_m.device)
+    return torch.where(is_behind, -normals, normals), bend

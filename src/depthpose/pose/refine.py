@@ -1,44 +1,41 @@
 """Point-to-plane ICP: a pose slides onto the cloud along the model's surface."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from scipy.spatial import KDTree
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.mesh import sample_surface, turn_about
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.surface import Surface, look_along_rays
 
-_CONVERGED = 1e-4
+_CONVERGED = 3e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
 _TURN_RAD = math.radians(15)
 """By how much further starts are turned."""
+_ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0)
+"""Of the starts, step by step, over the last limit of all: they begin farther off."""
+_ROUGH_POINTS = 100
+"""Of the cloud, by which starts slide and are told apart."""
+_ROUGH_JUDGED = 1000
+"""Of the cloud, by which it is seen what a pose would hide."""
+_UNSEEN = 0.3
+"""What a surface that should be seen and is not counts against a pose: something may hide it."""
+_OTHER = 0.1
+"""Mean distance between the points of two poses, in diameters, from which they are two."""
 _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
 to be believed: a plane fits many places, and noise would choose among them."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
-    """What of a model the refinement needs; made once, used for every cloud.
-
-    Attributes:
-        points_m: of the surface, in the model frame.
-        normals: theirs; their side does not matter.
-        diameter_m: of the object.
-        tree: finds the nearest of them.
-    """
-
-    points_m: Float[Tensor, "m 3"]
-    normals: Float[Tensor, "m 3"]
-    diameter_m: float
-    tree: KDTree
+Nearest = Callable[[Float64[Tensor, "*batch n 3"]], Int64[Tensor, "*batch n"]]
+"""From points in the model frame to the numbers of the surface points near them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,16 +58,19 @@ class Refined:
     inlier_share: Float[Tensor, "*batch"]
 
 
-def prepare_surface(model: ObjectModel, config: IcpConfig | None = None) -> Surface:
-    """Sample a model once for many refinements."""
-    config = IcpConfig() if config is None else config
-    points, normals = (part.double() for part in sample_surface(model, config.surface_points))
-    return Surface(
-        points_m=points,
-        normals=normals,
-        diameter_m=model.diameter_m,
-        tree=KDTree(points.numpy()),
-    )
+class Best(NamedTuple):
+    """The best of several refined poses.
+
+    Attributes:
+        refined: it.
+        start: number of the given pose that it began from.
+        scatter: share of all starts that ended at another pose: where many do, the cloud says
+            little about which is right.
+    """
+
+    refined: Refined
+    start: int
+    scatter: float
 
 
 def refine_pose(
@@ -92,32 +92,19 @@ def refine_pose(
     Args:
         points_m: of the object, in the camera frame.
         initial: poses to begin from, ``camera_from_model``; one or a batch.
-        surface: of :func:`prepare_surface`.
+        surface: of :func:`~depthpose.pose.surface.prepare_surface`.
         config: limits and number of steps.
 
     Raises:
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
-        raise InputError(
-            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
-            "not finite: leave those out, and refuse a cloud of none."
-        )
+    _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
-    pose = Rigid(initial.R.double(), initial.t_m.double())
-    scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
-    for limit_m in _limits(config, surface.diameter_m):
-        H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m)
-        motion = torch.linalg.solve(H, pull)
-        pose = perturb(pose, _about(motion, _middle(cloud)))
-        if limit_m <= config.end_distance_diameters * surface.diameter_m and bool(
-            ((motion / scale).abs() < _CONVERGED).all()
-        ):
-            break
-    limit_m = config.end_distance_diameters * surface.diameter_m
-    H, _, residual_m, weight = _normal_equations(cloud, pose, surface, limit_m)
-    return _result(points_m, pose, (H, residual_m, weight), _middle(cloud))
+    limits_m = _limits(config, surface.diameter_m)
+    pose = _slide(cloud, _doubled(initial), surface, limits_m, surface.nearest)
+    equations = _normal_equations(cloud, pose, surface, limits_m[-1], surface.nearest)
+    return _result(points_m, pose, equations, _middle(cloud))
 
 
 def refine_best(
@@ -125,45 +112,106 @@ def refine_best(
     initial: Rigid,
     surface: Surface,
     config: IcpConfig | None = None,
-) -> Refined:
-    """Refine one pose, and beside it ones turned from it; give what explains the cloud best.
+) -> Best:
+    """Refine poses, and beside each ones turned from it; give what explains the cloud best.
 
-    All begin with a quarter of the points; the best goes on with all of them.
+    All begin with some of the points and a table of what lies near (:class:`Boxes`); the best goes
+    on with all. It is the one that leaves the most points near the surface, less those that it
+    would have hidden and some of the surface that it shows and nobody saw.
 
     Args:
         points_m: of the object, in the camera frame.
-        initial: ``camera_from_model``.
-        surface: of :func:`prepare_surface`.
+        initial: ``camera_from_model``, one or several; the first is trusted most.
+        surface: of :func:`~depthpose.pose.surface.prepare_surface`.
         config: ``starts`` and what :func:`refine_pose` takes.
 
     Raises:
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    if config.starts == 1:
-        return refine_pose(points_m, initial, surface, config)
-    few = replace(config, cloud_points=max(100, config.cloud_points // 4))
-    tried = refine_pose(points_m, _starts(initial, surface, config.starts), surface, few)
-    # Points near the surface count; of equals, the nearer ones.
-    value = tried.inlier_share - tried.residual_m / surface.diameter_m
-    value[0] += _TRUST
-    best = int(value.argmax())
-    found = tried.camera_from_model
-    slow = replace(config, start_distance_diameters=config.end_distance_diameters)
-    return refine_pose(points_m, Rigid(found.R[best], found.t_m[best]), surface, slow)
+    _refuse_no_points(points_m)
+    given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
+    starts = _starts(_doubled(given), surface, config.starts)
+    few = take_evenly(points_m.double(), _ROUGH_POINTS)
+    end_m = config.end_distance_diameters * surface.diameter_m
+    limits_m = [share * end_m for share in _ROUGH_LIMITS]
+    tried = _slide(few, starts, surface, limits_m, surface.boxes.look_up)
+    best = int(_worth(points_m, tried, surface, end_m).argmax())
+    steps = (config.iterations + 1) // 2  # it is near
+    if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
+        chosen = Rigid(given.R[best], given.t_m[best])
+    else:
+        chosen = Rigid(tried.R[best], tried.t_m[best])
+        config = replace(config, start_distance_diameters=config.end_distance_diameters)
+    refined = refine_pose(points_m, chosen, surface, replace(config, iterations=steps))
+    scatter = _scatter(tried, _doubled(refined.camera_from_model), surface)
+    return Best(refined, best % len(given.R), scatter)
 
 
-def _starts(pose: Rigid, surface: Surface, count: int) -> Rigid:
-    """Give the pose, and the same turned about axes through the middle of the object."""
-    pose = Rigid(pose.R.double(), pose.t_m.double())
-    middle_m = pose.apply(surface.points_m.mean(0)[None])[0]
-    axes = torch.eye(3, dtype=pose.R.dtype)[: count - 1]
-    angle = torch.tensor(_TURN_RAD, dtype=pose.R.dtype)
-    turns = [turn_about(axis, middle_m, angle) @ pose for axis in axes]
-    return Rigid(
-        torch.stack([pose.R, *(turn.R for turn in turns)]),
-        torch.stack([pose.t_m, *(turn.t_m for turn in turns)]),
+def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
+    if len(points_m) == 0 or not bool(points_m.isfinite().all()):
+        raise InputError(
+            f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
+            "not finite: leave those out, and refuse a cloud of none."
+        )
+
+
+def _slide(
+    cloud: Float[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    limits_m: list[float],
+    nearest: Nearest,
+) -> Rigid:
+    """Step by step to where the cloud lies on the surface, until nothing moves any more."""
+    scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
+    for limit_m in limits_m:
+        H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m, nearest)
+        motion = torch.linalg.solve(H, pull)
+        pose = _moved(pose, motion, _middle(cloud))
+        if limit_m <= limits_m[-1] and bool(((motion / scale).abs() < _CONVERGED).all()):
+            break
+    return pose
+
+
+def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
+    """Give the poses, then all of them turned once, twice ... about the middle of the object."""
+    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
+    axes = torch.eye(3, dtype=torch.float64)
+    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:count]
+    turns = torch.linalg.matrix_exp(cross_matrix(_TURN_RAD * axes))[:, None]
+    turned_m = (turns @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
+    return Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
+
+
+def _worth(
+    points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
+) -> Float64[Tensor, " b"]:
+    cloud = take_evenly(points_m.double(), _ROUGH_JUDGED)
+    few = take_evenly(cloud, _ROUGH_POINTS)
+    _, _, residual_m, weight = _normal_equations(
+        few, poses, surface, limit_m, surface.boxes.look_up
     )
+    near = (weight > 0).double().mean(-1)
+    front, unseen = look_along_rays(cloud, poses, surface, every=4)
+    # Of equals, the nearer one.
+    worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
+    worth[0] += _TRUST
+    return worth
+
+
+def _scatter(poses: Rigid, best: Rigid, surface: Surface) -> float:
+    """Share of the poses that are another than the best, where what looks alike is the same."""
+    own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
+    moved_m = (best.inverse() @ poses).apply(own_m.expand(len(poses.R), -1, -1))
+    if surface.is_symmetric:
+        own_m = surface.points_m[surface.boxes.look_up(moved_m)]
+    away_m = (moved_m - own_m).norm(dim=-1).mean(-1)
+    return float((away_m > _OTHER * surface.diameter_m).double().mean())
+
+
+def _doubled(pose: Rigid) -> Rigid:
+    return Rigid(pose.R.double(), pose.t_m.double())
 
 
 def _limits(config: IcpConfig, diameter_m: float) -> list[float]:
@@ -179,13 +227,16 @@ def _middle(cloud: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 
 
 def _normal_equations(
-    cloud: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, limit_m: float
+    cloud: Float[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    limit_m: float,
+    nearest: Nearest,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Linearise about the middle of the cloud, where turning and shifting hardly mix."""
     inverse = pose.inverse()
     local = cloud @ inverse.R.mT + inverse.t_m[..., None, :]
-    _, index = surface.tree.query(local.numpy(), workers=1)
-    index = torch.from_numpy(index)
+    index = nearest(local)
     # In the camera frame, where the covariance is wanted.
     normal = surface.normals[index] @ pose.R.mT
     target = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
@@ -204,9 +255,15 @@ def _normal_equations(
     return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight
 
 
-def _about(motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Float[Tensor, "*batch 6"]:
-    """Turn (rotation, translation) about a point into one about the origin of the camera."""
-    return motion @ _shift(middle).mT
+def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Rigid:
+    """Turn a pose about a point and shift it.
+
+    About the point itself: a turn by w about the camera, which is D away, with the shift that makes
+    it one about the object to first order would leave the object ``w^2 D / 2`` off.
+    """
+    centred = Rigid(pose.R, pose.t_m - middle)
+    turned = perturb(centred, motion)
+    return Rigid(turned.R, turned.t_m + middle)
 
 
 def _shift(middle: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:
@@ -216,18 +273,24 @@ def _shift(middle: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:
 
 
 def _result(
-    points_m: Tensor, pose: Rigid, terms: tuple[Tensor, Tensor, Tensor], middle: Tensor
+    points_m: Tensor, pose: Rigid, equations: tuple[Tensor, ...], middle: Tensor
 ) -> Refined:
-    H, residual_m, weight = terms
-    total = weight.sum(-1)
-    variance = (weight * residual_m.square()).sum(-1) / (total - 6).clamp(min=1)
+    H, _, residual_m, weight = equations
+    variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
     shift = _shift(middle)
     covariance = shift @ (variance[..., None, None] * torch.linalg.inv(H)) @ shift.mT
-    mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
-    rms_m = torch.where(total > 0, mean_square, torch.inf).sqrt()
     return Refined(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
         covariance=covariance.to(points_m),
-        residual_m=rms_m.to(points_m),
+        residual_m=_spread_m(residual_m, weight).to(points_m),
         inlier_share=(weight > 0).to(points_m).mean(-1),
     )
+
+
+def _spread_m(
+    residual_m: Float64[Tensor, "*batch n"], weight: Float64[Tensor, "*batch n"]
+) -> Float64[Tensor, "*batch"]:
+    """Root mean square distance of the points that count; infinite where none does."""
+    total = weight.sum(-1)
+    mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
+    return torch.where(total > 0, mean_square, torch.inf).sqrt()

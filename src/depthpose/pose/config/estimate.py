@@ -15,14 +15,15 @@ class RefusalConfig:
     as calibration needs it."""
 
     bias: float = 0.0
-    """Log odds of being wrong where every signal is 0."""
+    """Log odds of being wrong where every signal is 0.99, its logarithm 0."""
 
     slopes: dict[str, float] = field(default_factory=dict)
-    """How much each signal adds to the log odds; none: no estimate is refused for its risk."""
+    """How much the logarithm of each signal adds to the log odds; none: no estimate is refused for
+    its risk."""
 
     means: dict[str, float] = field(default_factory=dict)
-    """Of each signal over right answers: a refusal names the signal that lies farthest above its
-    mean, weighed by its slope. 0 where there is none."""
+    """Of each signal's logarithm over right answers: a refusal names the signal that lies farthest
+    above its mean, weighed by its slope. That of 0 where there is none."""
 
     min_hold: float = 0.02
     """A motion that no declared symmetry excuses must carry the seen surface across itself by this
@@ -63,8 +64,8 @@ class EstimateConfig:
 
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk judges what comes out: ICP
-    mends rough votes, and the risk finds those that it does not mend. A network that had trained
-    for 7 minutes found 60 % of 40 made cats so, 21 % of 24 with 0.1."""
+    mends rough votes, and the risk finds those that it does not mend. Nothing is refused for it
+    then: ICP also begins at the fit of all keypoints."""
 
     max_cloud_points: int = 100_000
     """Of a larger cloud so many points are taken, evenly in their order, before anything else."""

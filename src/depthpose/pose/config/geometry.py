@@ -164,16 +164,16 @@ class IcpConfig:
     surface_points: int = 10000
     """Points of the model's surface that stand for it."""
 
-    starts: int = 4
-    """1: from the given pose alone; up to 4: also from poses turned by 15 degrees about axes of the
-    camera, told apart by a quarter of the points (``bench/refine_starts.py``)."""
+    starts: int = 7
+    """From each given pose so many: 1, it alone; up to 7, also turned by 15 degrees one way and
+    the other about each axis of the camera (``bench/refine_starts.py``)."""
 
     def __post_init__(self) -> None:
         """Refuse limits that grow, and counts of nothing."""
-        if not 1 <= self.starts <= 4:
+        if not 1 <= self.starts <= 7:
             raise InputError(
-                f"starts is {self.starts}; take 1, the voted pose, to 4: it, and turned about each "
-                "axis of the camera"
+                f"starts is {self.starts}; take 1, the voted pose, to 7: it, and turned one way "
+                "and the other about each axis of the camera"
             )
         if self.iterations < 1 or min(self.surface_points, self.cloud_points) < 100:
             raise InputError(

@@ -1,43 +1,56 @@
 """What speaks for and against a pose: signals that need no truth, each larger where it is worse."""
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix
-from depthpose.pose.refine import Surface
-from depthpose.pose.types import PoseFit, Vote
+from depthpose.pose.cloud import local_planes
+from depthpose.pose.estimator.prepare import Prepared
+from depthpose.pose.surface import NEAR, Surface, look_along_rays
+from depthpose.pose.types import PoseFit
 
-NEAR = 0.05
-"""Of the diameter: a point of the cloud within this distance lies on the posed surface."""
-_CELL = 1 / 24
-"""Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
 _JUDGED = 1000
 """At most so many points of the cloud are judged, evenly taken."""
+_THINNED = 500
+"""Of so many points 20 neighbours reach about 0.08 diameters: far enough for normals that a real
+sensor's noise, alike from pixel to pixel, does not turn."""
+_TILTED = 250
+"""At so many of them the normal is looked at."""
 
 SIGNALS: dict[str, str] = {
-    "disagree": "{:.0%} of the directions miss the keypoint that they are for",
-    "lost": "{:.0%} of the keypoints break the model's distances and were outvoted",
     "misfit": "the keypoints fit the model badly for how sure they are (log misfit {:.2g})",
-    "bend": "the keypoints miss the model's by {:.1%} of the diameter",
-    "moved": "ICP moved the voted pose by {:.1%} of the diameter",
+    "disagree": "the directions miss the pose's keypoints by {:.2g} rad in the mean",
+    "scatter": "{:.0%} of ICP's starts end at another pose",
+    "tilt": "the cloud's normals differ from the posed surface's (1 - cosine {:.2g})",
     "gap": "the points lie {:.1%} of the diameter off the posed surface",
     "far": "{:.0%} of the points are nowhere near the posed surface",
     "front": "the posed surface would hide {:.0%} of the points that were seen",
     "unseen": "{:.0%} of the posed surface that faces the camera has no point",
+    "few": "the cloud fills few voxels: ten are {:.1%} of it",
 }
 """Name of each signal, and what it says to people."""
 
 
-def vote_signals(vote: Vote, fit: PoseFit, diameter_m: float) -> dict[str, float]:
-    """Say how well the directions meet, and how well the keypoints fit the model."""
-    used = fit.is_used
+def vote_signals(
+    cloud: Prepared, outputs: Float[Tensor, "n k c"], fit: PoseFit, keypoints_m: Tensor
+) -> dict[str, float]:
+    """Say how well the keypoints fit the model, and the directions the posed keypoints.
+
+    Args:
+        cloud: what voted.
+        outputs: the network's, the directions first.
+        fit: of the voted keypoints.
+        keypoints_m: of the model, posed as the answer says.
+    """
+    way = normalize(keypoints_m[None] - cloud.points_m.double()[:, None], dim=-1)
+    cosine = (normalize(outputs[..., :3].double(), dim=-1) * way).sum(-1).clamp(-1, 1)
     return {
-        "disagree": 1 - float(vote.inlier_share[used].mean()),
-        "lost": 1 - float(used.float().mean()),
         "misfit": float(fit.misfit.log1p()),
-        "bend": float(fit.residual_m) / diameter_m,
+        "disagree": float(cosine.arccos().mean()),
+        "few": 10 / len(cloud.points_m),
     }
 
 
@@ -46,17 +59,23 @@ def surface_signals(
 ) -> dict[str, float]:
     """Say how well the posed surface explains the cloud, and the cloud the surface.
 
-    Rays are those of a camera at the origin: a cell of them is as wide, where the object is, as
-    1/24 of its diameter. A point seen through the posed surface contradicts the pose; surface
-    that nobody saw may merely be hidden by something else.
+    A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
+    be hidden by something else.
     """
     limit_m = NEAR * surface.diameter_m
-    distance_m = _distances(take_evenly(cloud_m.double(), _JUDGED), pose, surface)
+    points_m = take_evenly(cloud_m.double(), _JUDGED)
+    distance_m, _ = _nearest(points_m, pose, surface)
     near_m = distance_m[distance_m < limit_m]
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
-    front, unseen = _look_along_rays(cloud_m.double(), pose, surface)
-    far = 1 - len(near_m) / len(distance_m)
-    return {"gap": gap_m / surface.diameter_m, "far": far, "front": front, "unseen": unseen}
+    alone = Rigid(pose.R[None], pose.t_m[None])
+    front, unseen = look_along_rays(cloud_m.double(), alone, surface)
+    return {
+        "tilt": _tilt(cloud_m.double(), pose, surface),
+        "gap": gap_m / surface.diameter_m,
+        "far": 1 - len(near_m) / len(distance_m),
+        "front": float(front),
+        "unseen": float(unseen),
+    }
 
 
 def hold_of(
@@ -81,13 +100,12 @@ def hold_of(
         length after scaling.
     """
     points = take_evenly(cloud_m.double(), _JUDGED)
-    local = pose.inverse().apply(points)
-    distance_m, index = surface.tree.query(local.numpy(), workers=1)
-    near = torch.from_numpy(distance_m < NEAR * surface.diameter_m)
+    distance_m, index = _nearest(points, pose, surface)
+    near = distance_m < NEAR * surface.diameter_m
     weakest = torch.zeros(6, dtype=torch.float64)
     if int(near.sum()) < 6:
         return 0.0, weakest
-    normal = (surface.normals[torch.from_numpy(index)] @ pose.R.mT)[near]
+    normal = (surface.normals[index] @ pose.R.mT)[near]
     middle, radius_m = points.mean(0), surface.diameter_m / 2
     arm = points[near] - middle
     J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
@@ -109,32 +127,26 @@ def without_motions(
     return (basis @ inner @ basis.T).to(covariance)
 
 
-def _look_along_rays(
-    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
-) -> tuple[float, float]:
-    posed_m = pose.apply(surface.points_m)
-    posed_m = posed_m[posed_m[:, 2] > 0]
-    if len(posed_m) == 0:
-        return 1.0, 1.0
-    scale = float(cloud_m[:, 2].median()) / (_CELL * surface.diameter_m)
-    rays = torch.cat([posed_m[:, :2] / posed_m[:, 2:], cloud_m[:, :2] / cloud_m[:, 2:]])
-    cells = torch.floor(rays * scale).long()
-    _, cell = torch.unique(cells, dim=0, return_inverse=True)
-    mine, theirs = cell[: len(posed_m)], cell[len(posed_m) :]
-    nearest_m = torch.full((int(cell.max()) + 1,), torch.inf, dtype=torch.float64)
-    nearest_m.scatter_reduce_(0, mine, posed_m[:, 2], "amin")
-    hidden = nearest_m[theirs] < cloud_m[:, 2] - 1.5 * NEAR * surface.diameter_m
-    is_seen = torch.zeros(len(nearest_m), dtype=torch.bool)
-    is_seen[theirs] = True
-    unseen = ~is_seen[nearest_m.isfinite()]
-    return float(hidden.double().mean()), float(unseen.double().mean())
+def _tilt(cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
+    """Mean of 1 - |cosine| between normals of the cloud and of the posed surface near it."""
+    thinned_m = take_evenly(cloud_m, _THINNED)
+    some_m = take_evenly(thinned_m, _TILTED)
+    distance_m, index = _nearest(some_m, pose, surface)
+    near = distance_m < NEAR * surface.diameter_m
+    if not bool(near.any()):
+        return 1.0
+    normals, _ = local_planes(thinned_m, some_m[near])
+    cosine = (normals * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
+    return float(1 - cosine.abs().mean())
 
 
-def _distances(
-    points: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
-) -> Float64[Tensor, " n"]:
-    distance_m, _ = surface.tree.query(pose.inverse().apply(points).numpy(), workers=1)
-    return torch.from_numpy(distance_m)
+def _nearest(
+    points_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
+) -> tuple[Float64[Tensor, " n"], Int64[Tensor, " n"]]:
+    """Distance of each point to the posed surface, and the number of the point of it there."""
+    local_m = pose.inverse().apply(points_m)
+    index = surface.nearest(local_m)
+    return (local_m - surface.points_m[index]).norm(dim=-1), index
 
 
 def _scaled(

@@ -23,7 +23,7 @@ from depthpose.pose.estimator.given import (
 )
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
-from depthpose.pose.refine import Surface, prepare_surface
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import PoseEstimate, SeenPoints
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -217,7 +217,7 @@ class GeoPoseNet:
     ) -> PoseEstimate:
         model = self.weights.models[number]
         if number not in self._surfaces:
-            self._surfaces[number] = prepare_surface(model, self.config.icp)
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
         found = pose_from_directions(
             voted, model, self._surfaces[number], self.weights.refusal, self.config
         )

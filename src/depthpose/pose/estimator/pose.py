@@ -5,7 +5,8 @@ import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
@@ -18,7 +19,8 @@ from depthpose.pose.estimator.evidence import (
 )
 from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.refusal import reason_of, risk_of
-from depthpose.pose.refine import Surface, refine_best
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import (
     consistent_keypoints,
@@ -81,14 +83,11 @@ def pose_from_directions(
     clock = _Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")
-    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if refusal.is_calibrated else strict)
-    used = _agreeing(vote, model, config.voting.max_condition, limit_m)
-    if isinstance(used, Refusal):
-        return _withheld(model, used, clock)
-    fit = fit_pose(vote.keypoints_m, vote.covariance_m2, model.keypoints_m, used)
+    fits = _fits(vote, model, config, refusal.is_calibrated)
+    if isinstance(fits, Refusal):
+        return _withheld(model, fits, clock)
     clock.note("svd")
-    found = _refine(voted.cloud.cloud_m, vote, fit, surface, config)
+    found = _refine(voted, fits, model, surface, config)
     if config.with_icp:
         clock.note("icp")
     free = free_motions(model.symmetries.continuous, found.pose)
@@ -111,10 +110,11 @@ def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
     return meet_lines(points, directions, weight, config.refinements)
 
 
-def _agreeing(
-    vote: Vote, model: ObjectModel, max_condition: float, limit_m: float
-) -> Bool[Tensor, " k"] | Refusal:
-    found = (vote.condition <= max_condition) & (vote.inlier_share > 0)
+def _fits(
+    vote: Vote, model: ObjectModel, config: EstimateConfig, is_judged: bool
+) -> PoseFit | Refusal:
+    """Fit the keypoints that agree; where a risk judges what comes out, all of them beside."""
+    found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
     total = len(found)
     if int(found.sum()) < _LEAST:
         return Refusal(
@@ -122,36 +122,61 @@ def _agreeing(
             reason=f"the directions meet at {int(found.sum())} of {total} keypoints, but {_LEAST} "
             "are needed: too few points, or not the object that the mask promises",
         )
+    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
+    limit_m = model.diameter_m * (rough if is_judged else strict)
     used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
-    if int(used.sum()) < _LEAST:
+    choices = [used] if int(used.sum()) >= _LEAST else []
+    if is_judged and not torch.equal(used, found):
+        choices.append(found)
+    if not choices:
         return Refusal(
             status="keypoints do not fit",
             reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
             f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it hidden",
         )
-    return used
+    count = len(choices)
+    return fit_pose(
+        vote.keypoints_m.expand(count, -1, -1),
+        vote.covariance_m2.expand(count, -1, -1, -1),
+        model.keypoints_m,
+        torch.stack(choices),
+    )
 
 
 def _refine(
-    cloud_m: Float[Tensor, "n 3"],
-    vote: Vote,
-    fit: PoseFit,
+    voted: Voted,
+    fits: PoseFit,
+    model: ObjectModel,
     surface: Surface,
     config: EstimateConfig,
 ) -> _Found:
-    pose, covariance, residual_m = fit.camera_from_model, fit.covariance, float(fit.residual_m)
-    signals = vote_signals(vote, fit, surface.diameter_m)
-    moved = 0.0
+    cloud_m = voted.cloud.cloud_m
+    fit, scatter, refined = _row(fits, 0), 0.0, None
     if config.with_icp:
-        refined = refine_best(cloud_m.double(), pose, surface, config.icp)
-        if float(refined.inlier_share) > 0:
-            found = refined.camera_from_model
-            shift_m = found.apply(surface.points_m) - pose.apply(surface.points_m)
-            moved = float(shift_m.norm(dim=-1).mean()) / surface.diameter_m
-            pose, covariance = found, refined.covariance
-            residual_m = float(refined.residual_m)
-    signals |= {"moved": moved, **surface_signals(cloud_m, pose, surface)}
-    return _Found(pose, covariance, residual_m, signals)
+        best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
+        if float(best.refined.inlier_share) > 0:
+            fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
+    given = fit.camera_from_model if refined is None else refined.camera_from_model
+    pose = Rigid(given.R.double(), given.t_m.double())
+    keypoints_m = pose.apply(model.keypoints_m.double())
+    signals = {
+        **vote_signals(voted.cloud, voted.outputs, fit, keypoints_m),
+        "scatter": scatter,
+        **surface_signals(cloud_m, pose, surface),
+    }
+    source = fit if refined is None else refined
+    return _Found(pose, source.covariance, float(source.residual_m), signals)
+
+
+def _row(fits: PoseFit, number: int) -> PoseFit:
+    pose = fits.camera_from_model
+    return PoseFit(
+        camera_from_model=Rigid(pose.R[number], pose.t_m[number]),
+        covariance=fits.covariance[number],
+        residual_m=fits.residual_m[number],
+        misfit=fits.misfit[number],
+        is_used=fits.is_used[number],
+    )
 
 
 def _answer(

@@ -14,6 +14,8 @@ from depthpose.pose.types import PoseEstimate
 _FOLDS = 5
 _RIDGE = 3.0
 """Of the slopes in units of each signal's spread: no signal decides alone."""
+_FLOOR = 0.01
+"""Added to a signal before its logarithm is taken."""
 _LEARNT = tuple(name for name in SIGNALS if name != "gap")
 """How far points lie off the surface is the sensor's noise as much as the pose's error. On made
 views it tells right from wrong best of all; a real sensor that is noisier than the made one would
@@ -21,7 +23,10 @@ have its right answers refused by it, as LineMOD's cat was."""
 
 
 def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None:
-    """Chance of being wrong: ``1 / (1 + exp(-(bias + sum slope signal)))``; None where no slope is.
+    """Chance of being wrong, ``1 / (1 + exp(-odds))``; None where no slope is.
+
+    The odds are ``bias + sum slope log(0.01 + signal)``: twice as much of a bad sign counts as much
+    from 1 % to 2 % as from 20 % to 40 %.
 
     Raises:
         InputError: a slope is of a signal that there is not.
@@ -32,9 +37,9 @@ def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None
     if unknown:
         raise InputError(
             f"the refusal weighs {unknown[0]!r}, but the signals are {', '.join(signals)}; the "
-            "weights are of another version: calibrate them again"
+            "weights are of another version: calibrate them again by 'depthpose pose calibrate'"
         )
-    odds = config.bias + sum(slope * signals[name] for name, slope in config.slopes.items())
+    odds = config.bias + sum(k * _log(signals[name]) for name, k in config.slopes.items())
     return 1 / (1 + math.exp(-max(-700.0, min(700.0, odds))))
 
 
@@ -42,7 +47,7 @@ def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) 
     """Say in a sentence what makes an answer doubtful most, by how far it is above the usual."""
 
     def excess(name: str) -> float:
-        return config.slopes[name] * (signals[name] - config.means.get(name, 0.0))
+        return config.slopes[name] * (_log(signals[name]) - config.means.get(name, _log(0.0)))
 
     worst = max(config.slopes, key=excess)
     return (
@@ -58,11 +63,11 @@ def calibrate_refusal(
 ) -> RefusalConfig:
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
-    The risk is a logistic regression on the signals but ``gap``; no slope is negative (more of a
-    bad sign is never better), and a ridge holds them. The limit is chosen by risks that each fifth
-    of the data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is
-    still ``max_wrong_share`` at most; where the data are too few for that, the largest at which
-    nothing is wrong.
+    The risk is a logistic regression on the logarithms of the signals but ``gap``; no slope is
+    negative (more of a bad sign is never better), and a ridge holds them. The limit is chosen by
+    risks that each fifth of the data got from the other four: the largest at which
+    ``(wrong + 1) / (answered + 1)`` is still ``max_wrong_share`` at most; where the data are too
+    few for that, the largest at which nothing is wrong.
 
     Args:
         estimates: made with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for its
@@ -84,7 +89,7 @@ def calibrate_refusal(
             "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
             "longer, or show easier views"
         )
-    x = np.array([[e.signals[name] for name in _LEARNT] for e, _ in answered])
+    x = np.array([[_log(e.signals[name]) for name in _LEARNT] for e, _ in answered])
     wrong = np.array([not ok for _, ok in answered], dtype=float)
     fold = np.arange(len(x)) % _FOLDS
     risks = np.empty(len(x))
@@ -138,6 +143,10 @@ def _choose_limit(risks: np.ndarray, wrong: np.ndarray, share: float) -> float:
     # Halfway to the next one, which is refused; where all are good, as far beyond as below 1.
     after = 1.0 if last + 1 == len(order) else float(risks[order[last + 1]])
     return (float(risks[order[last]]) + after) / 2
+
+
+def _log(signal: float) -> float:
+    return math.log(_FLOOR + signal)
 
 
 def _sigmoid(odds: np.ndarray) -> np.ndarray:

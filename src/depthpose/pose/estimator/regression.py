@@ -13,7 +13,8 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.refine import Surface, prepare_surface, refine_best
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -103,14 +104,14 @@ class DepthImageRegressor:
     ) -> PoseEstimate:
         start = time.perf_counter()
         if number not in self._surfaces:
-            self._surfaces[number] = prepare_surface(model, self.config.icp)
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
         points_m = cloud_from_depth(
             given.depth_m, given.mask, given.K, model.diameter_m, self.weights.cloud
         ).float()
         if (few := refusal_of(points_m, self.weights.cloud)) is not None:
             return replace(found, status="too few points", reason=few, camera_from_model=None)
         assert found.camera_from_model is not None
-        refined = refine_best(
+        refined, _, _ = refine_best(
             points_m, found.camera_from_model, self._surfaces[number], self.config.icp
         )
         found = replace(found, seconds={**found.seconds, "icp": time.perf_counter() - start})

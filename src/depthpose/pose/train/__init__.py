@@ -14,6 +14,7 @@ from depthpose.pose.train.held_out import HeldOut as HeldOut
 from depthpose.pose.train.models import read_models as read_models
 from depthpose.pose.train.run import Run as Run
 from depthpose.pose.train.runs import STAGES as STAGES
+from depthpose.pose.train.runs import recalibrate as recalibrate
 from depthpose.pose.train.runs import train_pose as train_pose
 from depthpose.pose.train.segmentation_config import (
     SegmentationTraining as SegmentationTraining,

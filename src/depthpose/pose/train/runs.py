@@ -58,6 +58,24 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
 
 
+def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
+    """Choose anew when the answers of weights are withheld; the network stays as it is.
+
+    Args:
+        weights: of a network of directions, with the meshes of its objects.
+        out: the file to write.
+        config: how views are made, how many calibrate, and how many judge.
+
+    Returns:
+        What was counted on views that did not calibrate, for people.
+    """
+    found = read_pose_weights(weights)
+    with_half = all(torch.equal(p, p.half().float()) for p in found.network.parameters())
+    found = calibrated(found, config.objects, config.calibration)
+    write_pose_weights(out, found, with_half=with_half)
+    return table_text(judged(read_pose_weights(out), config.objects, config.held_out))
+
+
 STAGES = {
     "pose": (PoseTraining, train_pose),
     "pointnet": (PointNetTraining, train_pose),

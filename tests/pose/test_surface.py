@@ -1,0 +1,94 @@
+"""The samples of a surface: nearest without searching, and what a camera would see of it."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from tests.pose.made_object import bottle, bracket, cloud_of, pose_at
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.mesh import make_model
+from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
+from depthpose.pose.types import ObjectModel
+
+
+@pytest.fixture(scope="module")
+def part() -> ObjectModel:
+    return bracket()
+
+
+@pytest.fixture(scope="module")
+def surface(part: ObjectModel) -> Surface:
+    return prepare_surface(part)
+
+
+def batch_of(*poses: Rigid) -> Rigid:
+    return Rigid(
+        torch.stack([pose.R.double() for pose in poses]),
+        torch.stack([pose.t_m.double() for pose in poses]),
+    )
+
+
+def test_the_table_is_off_by_no_more_than_a_box(surface: Surface) -> None:
+    points_m = surface.points_m + 0.01 * torch.randn(
+        surface.points_m.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    found, true = surface.boxes.look_up(points_m), surface.nearest(points_m)
+    to_found_m, to_true_m = (
+        (points_m - surface.points_m[index]).norm(dim=-1) for index in (found, true)
+    )
+    # The middle of a box lies half of its diagonal from its corner, there and back.
+    assert float((to_found_m - to_true_m).max()) < 3**0.5 * surface.boxes.side_m
+    assert float((to_found_m - to_true_m).mean()) < 0.2 * surface.boxes.side_m
+
+
+def test_batches_and_points_beyond_the_table_have_answers(surface: Surface) -> None:
+    some_m = torch.stack(
+        [surface.points_m[:5], surface.points_m[5:10] + 9.0, -9.0 + torch.zeros(5, 3)]
+    )
+    found = surface.boxes.look_up(some_m.double())
+    assert found.shape == (3, 5)
+    assert int(found.min()) >= 0
+    assert int(found.max()) < len(surface.points_m)
+    assert torch.equal(found[0], surface.boxes.look_up(surface.points_m[:5]))
+
+
+def test_a_thin_plate_has_a_table_of_its_shape() -> None:
+    mesh = trimesh.creation.box((0.2, 0.1, 0.001))
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
+    boxes = prepare_surface(make_model(vertices, faces, name="plate")).boxes
+    assert boxes.counts.tolist() == [48, 31, 13]
+    assert len(boxes.nearest) == 48 * 31 * 13
+
+
+def test_the_true_pose_hides_nothing_and_shows_what_was_seen(
+    part: ObjectModel, surface: Surface
+) -> None:
+    truth, cloud_m = pose_at(), cloud_of(part, pose_at()).double()
+    nearer = Rigid(truth.R, truth.t_m - torch.tensor([0.0, 0, 0.05]))
+    beside = Rigid(truth.R, truth.t_m + torch.tensor([0.5, 0, 0]))
+    behind = Rigid(truth.R, -truth.t_m)
+    poses = batch_of(truth, nearer, beside, behind)
+    front, unseen = look_along_rays(cloud_m, poses, surface)
+    assert front.tolist() == pytest.approx([0, 1, 0, 1], abs=0.08)
+    assert unseen.tolist() == pytest.approx([0, 0, 1, 1], abs=0.16)
+    # Each is judged alone.
+    alone = [look_along_rays(cloud_m, batch_of(Rigid(R, t_m)), surface)
+             for R, t_m in zip(poses.R, poses.t_m, strict=True)]  # fmt: skip
+    assert torch.equal(torch.cat([f for f, _ in alone]), front)
+    assert torch.equal(torch.cat([u for _, u in alone]), unseen)
+
+
+def test_half_of_a_cloud_leaves_half_of_the_surface_unseen(
+    part: ObjectModel, surface: Surface
+) -> None:
+    cloud_m = cloud_of(part, pose_at()).double()
+    half_m = cloud_m[cloud_m[:, 0] < cloud_m[:, 0].median()]
+    _, whole = look_along_rays(cloud_m, batch_of(pose_at()), surface)
+    _, unseen = look_along_rays(half_m, batch_of(pose_at()), surface)
+    assert 0.3 < float(unseen - whole) < 0.6
+
+
+def test_a_surface_knows_whether_poses_look_alike(surface: Surface) -> None:
+    assert prepare_surface(bottle()).is_symmetric
+    assert not surface.is_symmetric
