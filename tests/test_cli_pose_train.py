@@ -1,5 +1,6 @@
 """``depthpose pose train`` and ``depthpose data make objects``."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -7,11 +8,11 @@ import pytest
 import torch
 
 from depthpose.cli import main
-from depthpose.core.checkpoint import find_weights
+from depthpose.core.checkpoint import LicenceNotice, find_weights
 from depthpose.core.config import read_config
 from depthpose.pose.objects import write_part
 from depthpose.pose.train import STAGES, PoseTraining, Run
-from depthpose.pose.weights import read_pose_weights
+from depthpose.pose.weights import read_pose_weights, write_pose_weights
 
 _TINY = """
 network: {first_kernel: 3, encoder: [4, 4, 8, 8], decoder: [4, 4, 4, 8]}
@@ -45,6 +46,34 @@ def test_a_cad_file_becomes_weights_with_a_card(
     again = [*words, "--cad", str(part), "--unit", "mm", "--seed", "5", "--resume"]
     assert main(again) == 2
     assert "seed" in capsys.readouterr().err
+
+
+def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, blind = tmp_path / "own.safetensors", tmp_path / "blind.safetensors"
+    weights = read_pose_weights(find_weights("parts"))
+    write_pose_weights(own, weights)
+    cloud = dataclasses.replace(weights.cloud, min_points=10**6, max_points=None)
+    write_pose_weights(blind, dataclasses.replace(weights, cloud=cloud))
+    config = tmp_path / "tiny.yaml"
+    config.write_text("held_out: {number: 1, occlusions: [0.0]}\ncalibration: {number: 20}\n")
+    other = str(tmp_path / "other.safetensors")
+    for words, said in (
+        ([own, "--out", str(own)], "name another file than the weights"),
+        ([own, "--out", str(tmp_path / "bold")], "ending in .safetensors"),
+        ([own, "--out", other, "--number", "0"], "there is nothing to choose by; take 600"),
+        ([blind, "--out", other], "answered not one made view"),
+    ):
+        assert main(["pose", "calibrate", *map(str, words), "--config", str(config)]) == 2
+        assert said in capsys.readouterr().err
+    assert not Path(other).exists()
+    terms, bound = "For research alone.", tmp_path / "bound.safetensors"
+    facts = {**weights.facts, "terms": terms}
+    write_pose_weights(bound, dataclasses.replace(weights, facts=facts))
+    with pytest.warns(LicenceNotice, match=terms):
+        assert main(["pose", "calibrate", str(bound), "--out", other, "--config", str(config)]) == 0
+    assert read_pose_weights(Path(other)).facts["terms"] == terms
 
 
 def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(

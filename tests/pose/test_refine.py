@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.pose.made_object import bracket
+from tests.pose.made_object import bracket, cloud_of, pose_at
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
@@ -123,18 +123,41 @@ def test_the_best_of_several_starts_is_found_and_named(
     assert (sure.start, sure.scatter) == (0, 0.0)
 
 
-def test_a_pose_that_would_hide_what_was_seen_is_not_the_best(stone: ObjectModel) -> None:
+def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
     """A plate looks alike from both sides, but its far side was not seen through the near one."""
     mesh = trimesh.creation.box((0.16, 0.1, 0.03))
     vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
     plate = make_model(vertices, faces, name="plate")
-    tilt = pose_near(TRUE, 1, 0.0, 0.0)
-    cloud = seen_half(plate, tilt)
-    # The seen sides lie on the far sides of the same plate, pushed toward the camera.
-    push = Rigid(tilt.R, tilt.t_m - 0.03 * tilt.R[:, 2] * torch.sign(tilt.R[2, 2]))
-    batch = Rigid(torch.stack([push.R, tilt.R]), torch.stack([push.t_m, tilt.t_m]))
-    best = refine_best(cloud, batch, prepare_surface(plate)).refined.camera_from_model
-    assert float((best.t_m - tilt.t_m).norm()) < 1e-3
+    toward = -torch.sign(TRUE.R[:, 2] @ TRUE.t_m) * TRUE.R[:, 2]
+    seen = seen_half(plate, TRUE)
+    face = seen[(seen - TRUE.t_m) @ toward > 0.0149]
+    # Pushed toward the camera by its thickness, its far side lies where the near one was seen.
+    batch = Rigid(TRUE.R.expand(2, 3, 3), torch.stack([TRUE.t_m + 0.03 * toward, TRUE.t_m]))
+    best = refine_best(face, batch, prepare_surface(plate))
+    assert best.start == 1
+    assert float(((best.refined.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
+
+
+def test_what_a_start_won_is_not_lost_on_the_way() -> None:
+    """A given pose may be nearer than steps of a tenth of the diameter reach."""
+    model = bracket()
+    truth, part = pose_at(seed=3), prepare_surface(model)
+    start = pose_near(
+        Rigid(truth.R.double(), truth.t_m.double()), 46, math.radians(25), 0.15 * model.diameter_m
+    )
+    found = refine_best(cloud_of(model, truth), start, part).refined.camera_from_model
+    assert float(add_m(found, truth, model.vertices_m)) < 0.01 * model.diameter_m
+
+
+def test_one_step_is_judged_by_the_last_limit(stone: ObjectModel, surface: Surface) -> None:
+    cloud = seen_half(stone, TRUE)
+    noise = torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0)).double()
+    cloud = cloud + 0.04 * stone.diameter_m * noise
+    shares = [
+        float(refine_pose(cloud, TRUE, surface, IcpConfig(iterations=count)).inlier_share)
+        for count in (1, 30)
+    ]
+    assert shares[0] == pytest.approx(shares[1], abs=0.05)
 
 
 def test_its_covariance_is_honest(stone: ObjectModel, surface: Surface) -> None:

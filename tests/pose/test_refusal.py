@@ -6,6 +6,7 @@ import pytest
 import torch
 from tests.pose.made_object import bracket, cloud_of, pose_at
 
+from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -40,6 +41,20 @@ def test_the_risk_is_the_logistic_of_the_signals_logarithms() -> None:
     assert risk_of(signals, config) == pytest.approx(1 / (1 + math.exp(1) * 2**3))
     assert risk_of(signals, RefusalConfig()) is None
     assert risk_of(signals, RefusalConfig(bias=1e9, slopes={"far": 1.0})) == 1.0
+
+
+def test_the_weights_here_weigh_the_signals_that_there_are() -> None:
+    for path in SHIPPED.glob("*.safetensors"):
+        refusal = read_checkpoint(path).config.get("refusal", {})
+        assert refusal.get("slopes", {}).keys() <= SIGNALS.keys(), path.name
+
+
+def test_folds_are_no_objects() -> None:
+    """Views go round the objects. One of five is always wrong, and nothing but ``few`` tells it."""
+    answers = [answer(few=0.4 if k % 5 == 4 else 0.1) for k in range(500)]
+    config = calibrate_refusal(answers, [k % 5 != 4 for k in range(500)])
+    kept = [k for k in range(500) if (risk_of(answers[k].signals, config) or 0) <= config.max_risk]
+    assert kept == [k for k in range(500) if k % 5 != 4]
 
 
 def test_a_refusal_names_the_signal_that_is_unusual() -> None:

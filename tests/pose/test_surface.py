@@ -89,6 +89,22 @@ def test_half_of_a_cloud_leaves_half_of_the_surface_unseen(
     assert 0.3 < float(unseen - whole) < 0.6
 
 
+@pytest.mark.parametrize("point", [(0.0, 0, 0), (0.05, 0, 0), (0.05, 0.02, 1e-7), (0.0, 0, -1)])
+def test_points_at_and_behind_the_camera_are_no_part_of_what_it_saw(
+    part: ObjectModel, surface: Surface, point: tuple[float, float, float]
+) -> None:
+    """Organised clouds write missing readings so; their rays reach nowhere, or everywhere."""
+    cloud_m = cloud_of(part, pose_at()).double()
+    odd_m = torch.cat([torch.tensor([point]).double(), cloud_m])
+    pose = batch_of(pose_at())
+    for clean, odd in zip(
+        look_along_rays(cloud_m, pose, surface), look_along_rays(odd_m, pose, surface), strict=True
+    ):
+        assert float(odd) == pytest.approx(float(clean), abs=0.01)
+    none = look_along_rays(torch.zeros(5, 3).double(), pose, surface)
+    assert [float(share) for share in none] == [1.0, 1.0]
+
+
 def test_a_surface_knows_whether_poses_look_alike(surface: Surface) -> None:
     assert prepare_surface(bottle()).is_symmetric
     assert not surface.is_symmetric

@@ -27,6 +27,9 @@ _ROUGH_JUDGED = 1000
 """Of the cloud, by which it is seen what a pose would hide."""
 _UNSEEN = 0.3
 """What a surface that should be seen and is not counts against a pose: something may hide it."""
+_LOST = 0.1
+"""A given pose that leaves by so many points less near than its own start did was lost on the way:
+it began farther off than exact steps reach."""
 _OTHER = 0.1
 """Mean distance between the points of two poses, in diameters, from which they are two."""
 _TRUST = 0.02
@@ -103,7 +106,8 @@ def refine_pose(
     cloud = take_evenly(points_m.double(), config.cloud_points)
     limits_m = _limits(config, surface.diameter_m)
     pose = _slide(cloud, _doubled(initial), surface, limits_m, surface.nearest)
-    equations = _normal_equations(cloud, pose, surface, limits_m[-1], surface.nearest)
+    end_m = config.end_distance_diameters * surface.diameter_m
+    equations = _normal_equations(cloud, pose, surface, end_m, surface.nearest)
     return _result(points_m, pose, equations, _middle(cloud))
 
 
@@ -115,9 +119,11 @@ def refine_best(
 ) -> Best:
     """Refine poses, and beside each ones turned from it; give what explains the cloud best.
 
-    All begin with some of the points and a table of what lies near (:class:`Boxes`); the best goes
-    on with all. It is the one that leaves the most points near the surface, less those that it
-    would have hidden and some of the surface that it shows and nobody saw.
+    All begin with some of the points and a table of what lies near
+    (:class:`~depthpose.pose.surface.Boxes`); the best goes on exactly, in half of the steps, from
+    the given pose where it was that one. It is the one that leaves the most points near the
+    surface, less those that it would have hidden and some of the surface that it shows and nobody
+    saw.
 
     Args:
         points_m: of the object, in the camera frame.
@@ -136,14 +142,15 @@ def refine_best(
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
     tried = _slide(few, starts, surface, limits_m, surface.boxes.look_up)
-    best = int(_worth(points_m, tried, surface, end_m).argmax())
-    steps = (config.iterations + 1) // 2  # it is near
+    near, worth = _worth(points_m, tried, surface, end_m)
+    best = int(worth.argmax())
+    short = replace(config, iterations=(config.iterations + 1) // 2)
+    refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
-        chosen = Rigid(given.R[best], given.t_m[best])
-    else:
-        chosen = Rigid(tried.R[best], tried.t_m[best])
-        config = replace(config, start_distance_diameters=config.end_distance_diameters)
-    refined = refine_pose(points_m, chosen, surface, replace(config, iterations=steps))
+        refined = refine_pose(points_m, Rigid(given.R[best], given.t_m[best]), surface, short)
+    if refined is None or float(refined.inlier_share) < float(near[best]) - _LOST:
+        short = replace(short, start_distance_diameters=config.end_distance_diameters)
+        refined = refine_pose(points_m, Rigid(tried.R[best], tried.t_m[best]), surface, short)
     scatter = _scatter(tried, _doubled(refined.camera_from_model), surface)
     return Best(refined, best % len(given.R), scatter)
 
@@ -186,7 +193,8 @@ def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
 
 def _worth(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
-) -> Float64[Tensor, " b"]:
+) -> tuple[Float64[Tensor, " b"], Float64[Tensor, " b"]]:
+    """Give the share of points near each posed surface, and what speaks for the pose in all."""
     cloud = take_evenly(points_m.double(), _ROUGH_JUDGED)
     few = take_evenly(cloud, _ROUGH_POINTS)
     _, _, residual_m, weight = _normal_equations(
@@ -197,7 +205,7 @@ def _worth(
     # Of equals, the nearer one.
     worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
     worth[0] += _TRUST
-    return worth
+    return near, worth
 
 
 def _scatter(poses: Rigid, best: Rigid, surface: Surface) -> float:

@@ -15,8 +15,11 @@ NEAR = 0.05
 """Of the diameter: a point of the cloud within this distance lies on the posed surface."""
 _CELL = 1 / 24
 """Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
-_REACH = 36
-"""Cells beyond the cloud that are told apart; what lies farther off counts as if it lay there."""
+_REACH = 72
+"""Cells to each side of the middle of the cloud that are told apart, three diameters; what lies
+farther off counts as if it lay there."""
+_FRONT = 0.1
+"""Points nearer to the camera than this share of the median are no part of what it saw."""
 _BOXES = 48
 """Boxes along the longest side of a model, for looking up what is near without searching."""
 _MARGIN = 0.15
@@ -106,18 +109,22 @@ def look_along_rays(
         cells of the posed surface in which nothing was seen; both 1 where the surface lies behind
         the camera.
     """
+    median_m = float(cloud_m[:, 2].median())
+    cloud_m = cloud_m[cloud_m[:, 2] > _FRONT * max(median_m, 0.0)]
+    if len(cloud_m) == 0:
+        return torch.ones(2, len(poses.R), dtype=torch.float64).unbind()
     posed_m = poses.apply(surface.points_m[::every].expand(len(poses.R), -1, -1))
     depth_m = posed_m[..., 2]
-    scale = float(cloud_m[:, 2].median()) / (_CELL * surface.diameter_m)
-    seen = torch.floor(cloud_m[:, :2] / cloud_m[:, 2:] * scale)
-    low, high = seen.amin(0) - _REACH, seen.amax(0) + _REACH
-    rays = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
-    width = int(high[1] - low[1]) + 1
-    cells = (int(high[0] - low[0]) + 1) * width
+    scale = median_m / (_CELL * surface.diameter_m)
+    seen = cloud_m[:, :2] / cloud_m[:, 2:] * scale
+    posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
+    middle = seen.median(0).values.floor()
+    width = 2 * _REACH + 1
+    cells = width**2
     mine, theirs = (
-        (cell[..., 0] * width + cell[..., 1]).long()
-        for cell in (torch.floor(rays).clamp(low, high) - low, seen - low)
+        ((ray - middle).floor().clamp(-_REACH, _REACH) + _REACH).long() for ray in (posed, seen)
     )
+    mine, theirs = mine[..., 0] * width + mine[..., 1], theirs[..., 0] * width + theirs[..., 1]
     depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = depth_m.new_full((len(depth_m), cells), torch.inf)
     nearest_m = nearest_m.scatter_reduce_(1, mine, depth_m, "amin")

@@ -65,7 +65,7 @@ class EstimateConfig:
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk judges what comes out: ICP
     mends rough votes, and the risk finds those that it does not mend. Nothing is refused for it
-    then: ICP also begins at the fit of all keypoints."""
+    then: where fewer than four keypoints agree all are fitted, and ICP begins at both fits."""
 
     max_cloud_points: int = 100_000
     """Of a larger cloud so many points are taken, evenly in their order, before anything else."""

@@ -149,7 +149,7 @@ class IcpConfig:
     """How a pose is brought onto the cloud."""
 
     iterations: int = 30
-    """At most so many steps."""
+    """At most so many exact steps from one start; half of them after the best of several."""
 
     start_distance_diameters: float = 0.1
     """Points farther from the surface have no say in the first step."""
@@ -165,8 +165,8 @@ class IcpConfig:
     """Points of the model's surface that stand for it."""
 
     starts: int = 7
-    """From each given pose so many: 1, it alone; up to 7, also turned by 15 degrees one way and
-    the other about each axis of the camera (``bench/refine_starts.py``)."""
+    """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
+    way and the other about each axis of the camera (``bench/refine_starts.py``)."""
 
     def __post_init__(self) -> None:
         """Refuse limits that grow, and counts of nothing."""

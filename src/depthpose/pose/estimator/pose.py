@@ -126,7 +126,7 @@ def _fits(
     limit_m = model.diameter_m * (rough if is_judged else strict)
     used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
     choices = [used] if int(used.sum()) >= _LEAST else []
-    if is_judged and not torch.equal(used, found):
+    if is_judged and (not choices or config.with_icp) and not torch.equal(used, found):
         choices.append(found)
     if not choices:
         return Refusal(
@@ -154,6 +154,7 @@ def _refine(
     fit, scatter, refined = _row(fits, 0), 0.0, None
     if config.with_icp:
         best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
+        scatter = 1.0  # where ICP meets nothing, nothing speaks for the pose
         if float(best.refined.inlier_share) > 0:
             fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
     given = fit.camera_from_model if refined is None else refined.camera_from_model

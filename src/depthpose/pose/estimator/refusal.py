@@ -91,7 +91,8 @@ def calibrate_refusal(
         )
     x = np.array([[_log(e.signals[name]) for name in _LEARNT] for e, _ in answered])
     wrong = np.array([not ok for _, ok in answered], dtype=float)
-    fold = np.arange(len(x)) % _FOLDS
+    # Views go round the objects: in order, a fold would be an object.
+    fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
     risks = np.empty(len(x))
     for k in range(_FOLDS):
         bias, slopes = _fit(x[fold != k], wrong[fold != k])

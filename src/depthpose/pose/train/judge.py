@@ -32,7 +32,9 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     """
     if config.number == 0:
         return weights
-    open_weights = dataclasses.replace(weights, refusal=RefusalConfig(max_risk=1.0))
+    min_hold = weights.refusal.min_hold
+    opened = RefusalConfig(max_risk=1.0, min_hold=min_hold)
+    open_weights = dataclasses.replace(weights, refusal=opened)
     views = dataclasses.replace(
         made,
         seed=made.seed + _CALIBRATION_SEED,
@@ -53,7 +55,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
         refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
     except InputError:
         return weights
-    return dataclasses.replace(weights, refusal=refusal)
+    return dataclasses.replace(weights, refusal=dataclasses.replace(refusal, min_hold=min_hold))
 
 
 def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:

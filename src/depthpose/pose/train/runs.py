@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from depthpose.core.checkpoint import find_weights
+from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
@@ -68,11 +68,25 @@ def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
 
     Returns:
         What was counted on views that did not calibrate, for people.
+
+    Raises:
+        InputError: a file to write that is the one to read or of another kind, no views to choose
+            by, or none that is answered.
     """
+    if out.suffix != ".safetensors" or (out.exists() and out.samefile(weights)):
+        raise InputError(f"{out}: name another file than the weights, ending in .safetensors")
+    if config.calibration.number == 0:
+        raise InputError("calibration.number is 0, so there is nothing to choose by; take 600")
     found = read_pose_weights(weights)
+    say_terms(found.facts)
+    chosen = calibrated(found, config.objects, config.calibration)
+    if chosen is found:
+        raise InputError(
+            f"{weights}: answered not one made view, so nothing can be chosen; give the training's "
+            "own --config, whose distances and sensor the views have, or train longer"
+        )
     with_half = all(torch.equal(p, p.half().float()) for p in found.network.parameters())
-    found = calibrated(found, config.objects, config.calibration)
-    write_pose_weights(out, found, with_half=with_half)
+    write_pose_weights(out, chosen, with_half=with_half)
     return table_text(judged(read_pose_weights(out), config.objects, config.held_out))
 
 
