@@ -112,7 +112,8 @@ def look_along_rays(
     median_m = float(cloud_m[:, 2].median())
     cloud_m = cloud_m[cloud_m[:, 2] > _FRONT * max(median_m, 0.0)]
     if len(cloud_m) == 0:
-        return torch.ones(2, len(poses.R), dtype=torch.float64).unbind()
+        none = torch.ones(len(poses.R), dtype=torch.float64)
+        return none, none
     posed_m = poses.apply(surface.points_m[::every].expand(len(poses.R), -1, -1))
     depth_m = posed_m[..., 2]
     scale = median_m / (_CELL * surface.diameter_m)
