@@ -221,7 +221,7 @@ def local_planes(
     """Lay a plane through the 20 points nearest to each of some.
 
     Returns:
-        Its normal toward the camera, and how bent it is: 0 where flat, 1 where a ball.
+        The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
     """
     count = min(_NEIGHBOURS, len(every_m))
     index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
