@@ -70,13 +70,17 @@ class DepthEstimate:
     """Depth of one left image.
 
     Attributes:
-        depth_m: metres along the optical axis; NaN where disparity is invalid. None without a rig.
-        disparity_px: disparity that the depth was made from, at the size of the input.
+        depth_m: metres along the optical axis; NaN where disparity is invalid, and in the sky.
+            None without a rig.
+        disparity_px: disparity that the depth was made from, at the size of the input; that of
+            a point at infinity in the sky.
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
+        is_sky: where the image shows the sky, or None where the weights do not know it.
     """
 
     depth_m: Float[Tensor, "h w"] | None
     disparity_px: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None = None
     right: Float[Tensor, "3 h w"] | None = None
+    is_sky: Bool[Tensor, "h w"] | None = None

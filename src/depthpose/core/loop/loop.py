@@ -190,7 +190,7 @@ class _Run:
         optimizer = self.optimizers[name]
         _, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
-            group["lr"] = adam.rate_at(self.step, self.steps)
+            group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
         parameters = _parameters(optimizer)
         if self.world > 1:
             self._average_gradients(parameters)

@@ -118,3 +118,49 @@ class PairsConfig:
             raise InputError(f"limit must be 1 pair or more, got {self.limit}")
         if self.focal_px is not None and self.focal_px <= 0:
             raise InputError(f"focal_px must be positive, got {self.focal_px}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradeConfig:
+    """Random changes of an input image alone: what carries synthetic images over to real ones."""
+
+    colour: float = 0.35
+    """Exposure, contrast, saturation and gamma are each scaled by 1 +- this, channels by a third."""
+
+    hue_share: float = 0.1
+    """Share of images whose channels are exchanged."""
+
+    veil_share: float = 0.2
+    """Share of images under a veil of haze."""
+
+    glare_share: float = 0.2
+    """Share of images with a light in them."""
+
+    blur_share: float = 0.4
+    """Share of images that are blurred."""
+
+    blur_px: float = 1.2
+    """Largest standard deviation of the blur [px]."""
+
+    noise_share: float = 0.6
+    """Share of images with noise."""
+
+    noise: float = 0.04
+    """Largest standard deviation of the noise; white is 1."""
+
+    jpeg_share: float = 0.3
+    """Share of images that go through JPEG."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        for name in ("hue", "veil", "glare", "blur", "noise", "jpeg"):
+            share = getattr(self, f"{name}_share")
+            if not 0 <= share <= 1:
+                raise InputError(f"{name}_share must be from 0 to 1, got {share}")
+        if not 0 <= self.colour < 1:
+            raise InputError(f"colour must be in [0, 1), got {self.colour}")
+        if self.blur_px < 0.3 or self.noise < 0:
+            raise InputError(
+                f"blur_px must be 0.3 or more and noise 0 or more, got {self.blur_px} and "
+                f"{self.noise}"
+            )

@@ -11,18 +11,19 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, SGBMConfig
+from depthpose.depth.config import MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
 from depthpose.depth.estimator.virtual import (
     focal_size,
     from_virtual,
+    join_matches,
     resize_image,
     resized_match,
     square_camera,
 )
 from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
-from depthpose.depth.synthesis import Synthesiser
+from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights, read_depth_weights
 
@@ -83,7 +84,7 @@ class FakestereoNet:
         chosen = _choose_matcher(weights, found, matcher, own, config)
         if found is None or found.generator is None:
             return cls(chosen, terms=terms)
-        return cls(chosen, Synthesiser(found.generator, run.device), terms=terms)
+        return cls(chosen, make_synthesiser(found.generator, run.device), terms=terms)
 
     def estimate(
         self,
@@ -151,18 +152,36 @@ class FakestereoNet:
 
     def _virtual_size(self, image: StereoInput) -> tuple[int, int]:
         synthesiser, camera = self._usable_alone(image)
-        return focal_size(camera, synthesiser.generator.config.virtual_focal_px)
+        return focal_size(camera, synthesiser.config.virtual_focal_px)
 
     def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
         synthesiser, _ = self._usable_alone(images[0])
-        rig = synthesiser.generator.config
+        rig = synthesiser.config
         size = self._virtual_size(images[0])
         left = torch.stack([resize_image(image.left, *size) for image in images])
-        right = synthesiser.synthesise(left)
-        matches = self._match_many(left, right, square_camera(size, rig.virtual_focal_px))
-        parts = zip(images, right, matches, strict=True)
-        return [from_virtual(image, rig, drawn, match) for image, drawn, match in parts]
+        drawn = synthesiser.draw(left)
+        matches = self._disparities(left, drawn, square_camera(size, rig.virtual_focal_px))
+        skies = [None] * len(images) if drawn.is_sky is None else drawn.is_sky
+        parts = zip(images, matches, drawn.right, skies, strict=True)
+        return [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
+
+    def _disparities(
+        self, left: Float[Tensor, "b 3 h w"], drawn: Drawn, camera: Camera
+    ) -> list[Match]:
+        """Take the generator's own disparity, the matcher's, or both, as its weights say."""
+        assert self.synthesiser is not None, "checked before"
+        config = self.synthesiser.config
+        answer = config.answer if isinstance(config, SelectionConfig) else "matched"
+        matched = [] if answer == "own" else self._match_many(left, drawn.right, camera)
+        if answer == "matched":
+            return matched
+        assert drawn.disparity_px is not None and drawn.confidence is not None  # noqa: PT018
+        parts = zip(drawn.disparity_px, drawn.confidence, strict=True)
+        own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
+        if answer == "own":
+            return own
+        return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
 
     def _match(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
         return self._match_many(left[None], right[None], camera)[0]
