@@ -68,7 +68,9 @@ def train(
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
     pairs = changed(chosen.pairs, folders=data or None)
     if held_out:
-        looked_at = chosen.held_out or PairsConfig(focal_px=pairs.focal_px, limit=_LOOKED_AT)
+        looked_at = chosen.held_out or PairsConfig(
+            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
+        )
         chosen = dataclasses.replace(
             chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
         )

@@ -5,6 +5,10 @@ from typing import Literal
 
 from depthpose.core.errors import InputError
 
+TruthKind = Literal["scan", "annotated", "disparity"]
+"""scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
+(KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentConfig:
@@ -14,7 +18,8 @@ class AugmentConfig:
     """Rows and columns of the crop."""
 
     scale: tuple[float, float] = (1.0, 1.0)
-    """Range of the size at which a pair is seen; images that are too small for the crop grow."""
+    """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
+    on the right and below, never enlarged: another size would be another focal length."""
 
     jitter: float = 0.2
     """Brightness, contrast and saturation are each scaled by 1 +- this."""
@@ -99,6 +104,11 @@ class PairsConfig:
 
     exclude: tuple[str, ...] = ()
     """Names of frames to leave out."""
+
+    truth: TruthKind | None = None
+    """Which truth of the folders is learnt from, one kind alone; frames without it are left out.
+    None: the one kind that a folder has; a folder with several is refused. Streets that are made
+    while training have exact disparity, whatever this says."""
 
     limit: int | None = None
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""

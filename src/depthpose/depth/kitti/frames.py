@@ -17,6 +17,7 @@ from depthpose.core.files import (
     read_map,
     read_points_bin,
 )
+from depthpose.depth.config import TruthKind
 from depthpose.depth.kitti.calibration import (
     KittiCalibration,
     read_middlebury_calibration,
@@ -124,6 +125,17 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return read(frame.calibration, width, height)
 
 
+def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
+    """Say which kinds of truth a frame has."""
+    is_annotated = frame.depth is not None and not _has_drawn_scan(frame)
+    kinds: dict[TruthKind, bool] = {
+        "scan": has_lidar(frame, "camera_z"),
+        "annotated": is_annotated,
+        "disparity": frame.disparity is not None,
+    }
+    return tuple(kind for kind, is_there in kinds.items() if is_there)
+
+
 def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
     """Whether :func:`lidar_truth` has something to draw."""
     return frame.velodyne is not None or (depth == "camera_z" and _has_drawn_scan(frame))
@@ -139,7 +151,9 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
     if frame.velodyne is None and frame.depth is not None and has_lidar(frame, depth):
-        return read_depth_png(frame.depth)
+        depth_m = read_depth_png(frame.depth)
+        _check_size(frame.depth, depth_m, image_size(frame.left))
+        return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
     pixels_from_velodyne = kitti_calibration(frame).pixels_from_velodyne

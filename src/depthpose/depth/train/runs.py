@@ -121,7 +121,9 @@ def _walk(
     named = {knob: name for knob in _BEGINS_WITH if isinstance(name := settings.get(knob), str)}
     for knob, name in named.items():
         settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
-    facts = _facts(config, tuple(named.values()))
+    if pairs.truths:
+        settings["truth"] = list(pairs.truths)
+    facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
     claim_folder(run.folder, settings)
     write_config(run.folder / "config.yaml", config)
@@ -129,7 +131,11 @@ def _walk(
     return facts, seconds
 
 
-def _facts(config: Any, began_with: Sequence[str]) -> dict[str, str]:  # noqa: ANN401
+def _facts(
+    config: Any,  # noqa: ANN401
+    truths: Sequence[str],
+    began_with: Sequence[str],
+) -> dict[str, str]:
     """Say what the card says before anything is measured; terms of what it begins with bind it."""
     data = [Path(folder).name for folder in config.pairs.folders]
     facts = {
@@ -137,6 +143,8 @@ def _facts(config: Any, began_with: Sequence[str]) -> dict[str, str]:  # noqa: A
         "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
+    if truths:
+        facts["truth"] = ", ".join(truths)
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
     return bound_facts(facts, began_with)
