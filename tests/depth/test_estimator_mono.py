@@ -14,7 +14,7 @@ from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import write_depth_weights
 
@@ -46,7 +46,7 @@ def by_brightness(left: Tensor, _: Tensor) -> Tensor:
 
 
 def test_depth_is_virtual_focal_times_baseline_over_disparity(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image = torch.full((3, 40, 60), 0.5)
     estimate = net.estimate(image, camera(60, 40, FOCAL_PX))
     assert estimate.depth_m is not None
@@ -61,7 +61,7 @@ def test_depth_is_virtual_focal_times_baseline_over_disparity(generator: UNetGen
 def test_another_size_of_the_same_view_gives_the_same_metres(
     generator: UNetGenerator, scale: float
 ) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     ramp = torch.linspace(0.2, 0.8, 120)[None, None].expand(3, 80, 120)
     width, height = round(120 * scale), round(80 * scale)
     whole = net.estimate(ramp, camera(120, 80, 2 * FOCAL_PX)).depth_m
@@ -74,7 +74,7 @@ def test_another_size_of_the_same_view_gives_the_same_metres(
 
 
 def test_the_users_baseline_changes_disparity_and_no_metre(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
     rig = camera(60, 40, 90.0, baseline_m=0.1)
     assert isinstance(rig, StereoRig)
@@ -89,7 +89,7 @@ def test_the_users_baseline_changes_disparity_and_no_metre(generator: UNetGenera
 
 
 def test_one_image_needs_a_focal_length(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     with pytest.raises(InputError, match="metres from one image need its focal length"):
         net.estimate(torch.rand(3, 8, 8), None)
 

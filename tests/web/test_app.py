@@ -199,7 +199,7 @@ def test_the_matcher_may_want_a_larger_picture_than_the_generator(
 ) -> None:
     synthesiser = nets[0].synthesiser
     assert synthesiser is not None
-    focal_px = synthesiser.generator.config.virtual_focal_px
+    focal_px = synthesiser.config.virtual_focal_px
     monkeypatch.setattr("depthpose.web.depth.work_focal_px", lambda _: 100 * focal_px)
     app = make_app(FakestereoNet(nets[0].matcher, synthesiser), nets[1])
     files = {"image": "left.png", "camera": "camera.json"}

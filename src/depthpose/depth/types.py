@@ -35,12 +35,14 @@ class StereoTruth:
         depth_m: depth of the left image (camera z unless the dataset's protocol says otherwise).
         occluded: left pixels whose point the right view does not show: hidden there, or outside.
         right_disparity_px: disparity of the right image, positive like the left one's.
+        is_sky: left pixels that show the sky.
     """
 
     disparity_px: Float[Tensor, "h w"] | None = None
     depth_m: Float[Tensor, "h w"] | None = None
     occluded: Bool[Tensor, "h w"] | None = None
     right_disparity_px: Float[Tensor, "h w"] | None = None
+    is_sky: Bool[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

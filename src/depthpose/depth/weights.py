@@ -14,9 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.stereo.weights import KIND as PSMNET
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
-
-Generator = UNetGenerator | SelectionGenerator
+from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"
 _GENERATORS: dict[str, tuple[type, type]] = {

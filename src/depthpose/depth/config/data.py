@@ -135,7 +135,7 @@ class DegradeConfig:
     """Random changes of an input image alone: what carries synthetic images over to real ones."""
 
     colour: float = 0.35
-    """Exposure, contrast, saturation and gamma are each scaled by 1 +- this, channels by a third."""
+    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
 
     hue_share: float = 0.1
     """Share of images whose channels are exchanged."""

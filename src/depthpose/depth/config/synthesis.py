@@ -62,7 +62,7 @@ class SelectionConfig:
     """
 
     encoder_width: float = 1.0
-    """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights exist for 1."""
+    """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights are of 1."""
 
     widths: tuple[int, int, int, int] = (96, 64, 48, 32)
     """Channels of the decoder at strides 16, 8, 4 and 2."""

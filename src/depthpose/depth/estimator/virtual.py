@@ -81,9 +81,7 @@ def join_matches(one: Match, other: Match) -> Match:
     share = weight / (weight + one.confidence).clamp(min=1e-6)
     logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
     log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
-    return Match(
-        disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share)
-    )
+    return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
 
 
 def resized_match(match: Match, height: int, width: int) -> Match:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig, check_image_matches_camera, read_rig
@@ -45,6 +45,7 @@ class Frame:
         depth: 16-bit depth of the left image, metres x 256.
         disparity: disparity of the left image, 16-bit PNG (x 256) or PFM, hidden pixels too.
         disparity_noc: that of the pixels alone that both views see.
+        sky: 8-bit PNG of the left image, not 0 where it shows the sky.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Frame:
     depth: Path | None = None
     disparity: Path | None = None
     disparity_noc: Path | None = None
+    sky: Path | None = None
 
 
 def frame_input(frame: Frame) -> StereoInput:
@@ -79,10 +81,12 @@ def frame_truth(frame: Frame) -> StereoTruth:
     """
     depth_m = None if frame.depth is None else read_depth_png(frame.depth)
     disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
-    for path, values in ((frame.depth, depth_m), (frame.disparity, disparity_px)):
+    is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
+    parts = ((frame.depth, depth_m), (frame.disparity, disparity_px), (frame.sky, is_sky))
+    for path, values in parts:
         if path is not None and values is not None:
             _check_size(path, values, image_size(frame.left))
-    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m)
+    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
 
 
 def frame_rig(frame: Frame) -> StereoRig | None:
@@ -171,7 +175,7 @@ def _has_drawn_scan(frame: Frame) -> bool:
     return frame.style in ("plain", "camera") and frame.depth is not None
 
 
-def _check_size(path: Path, values: Float[Tensor, "*any h w"], size: tuple[int, int]) -> None:
+def _check_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
     height, width = values.shape[-2:]
     if (width, height) != size:
         raise InputError(

@@ -112,4 +112,3 @@ def _blurred(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h
         beside = torch.cat(before, axis) + torch.cat(after, axis)
         signal = signal * (1 - share) + beside * (share / 2)
     return signal
-

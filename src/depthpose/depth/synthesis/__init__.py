@@ -9,6 +9,7 @@ from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
     Drawn,
+    Generator,
     PaintingSynthesiser,
     SelectionSynthesiser,
     Synthesiser,
@@ -17,6 +18,7 @@ from depthpose.depth.synthesis.synthesiser import (
 
 __all__ = [
     "Drawn",
+    "Generator",
     "PaintingSynthesiser",
     "PatchDiscriminator",
     "PixelDiscriminator",

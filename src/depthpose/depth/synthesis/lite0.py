@@ -4,13 +4,13 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import (
     Checkpoint,
+    file_sha256,
     load_weights,
     read_checkpoint,
     read_published,
@@ -50,8 +50,8 @@ class Lite0Encoder(nn.Module):
         blocks: list[nn.Module] = []
         inputs, self._taps = stem, []
         self.channels: list[int] = []
-        for number, (count, kernel, stride, expansion, outputs) in enumerate(_STAGES):
-            outputs = _scaled(outputs, width)
+        for number, (count, kernel, stride, expansion, channels) in enumerate(_STAGES):
+            outputs = _scaled(channels, width)
             for place in range(count):
                 step = stride if place == 0 else 1
                 blocks.append(_InvertedResidual(inputs, outputs, kernel, step, expansion))
@@ -104,9 +104,7 @@ class _ConvNorm(nn.Module):
 class _InvertedResidual(nn.Module):
     """Widen, filter each channel alone, project (Sandler et al., CVPR 2018)."""
 
-    def __init__(
-        self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
         middle = inputs * expansion
         self.expand = _ConvNorm(inputs, middle, 1, 1) if expansion > 1 else None
@@ -147,8 +145,18 @@ def import_lite0(file: Path, out: Path) -> None:
     Raises:
         InputError: not a checkpoint of EfficientNet-Lite0.
     """
-    encoder = lite0_from_published(read_published(file))
-    facts = {"trained_on": "ImageNet", "licence": "Apache-2.0", "origin": Path(file).name}
+    state = read_published(file)
+    if not all(isinstance(value, Tensor) for value in state.values()):
+        raise InputError(
+            f"{file}: holds no tensors by name, so it is no EfficientNet-Lite0. Its entries are "
+            f"{', '.join(map(repr, list(state)[:5]))}."
+        )
+    encoder = lite0_from_published(state)
+    facts = {
+        "origin": f"imported from a file with sha256 {file_sha256(file)}",
+        "trained_on": "ImageNet",
+        "licence": "Apache-2.0",
+    }
     state = encoder.state_dict()
     save_checkpoint(out, Checkpoint(kind=KIND, config={}, state=state, facts=facts))
 

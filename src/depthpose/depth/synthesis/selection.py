@@ -43,7 +43,9 @@ class SelectionGenerator(nn.Module):
         inputs = (widths[0], *widths[:-1])
         self.decoder = nn.ModuleList(
             nn.Sequential(
-                nn.Conv2d(above + skip, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU()
+                nn.Conv2d(above + skip, width, 3, 1, 1, bias=False),
+                nn.BatchNorm2d(width),
+                nn.ReLU(),
             )
             for above, skip, width in zip(inputs, skips, widths, strict=True)
         )
@@ -91,6 +93,11 @@ class Selected:
     confidence: Float[Tensor, "b h w"]
 
     @property
+    def shift_px(self) -> Float[Tensor, "b h w"]:
+        """Disparity, and 0 in the sky [px]."""
+        return torch.where(self.is_sky, 0.0, self.disparity_px)
+
+    @property
     def is_sky(self) -> Bool[Tensor, "b h w"]:
         """Where the sky is likelier than not."""
         return self.sky > 0.5
@@ -119,9 +126,7 @@ def log_expectation(logits: Logits, planes: Planes) -> Float[Tensor, "b rows col
     return torch.einsum("bkhw,k->bhw", logits[:, 1:].float().softmax(1), planes.log())
 
 
-def shift_left(
-    left: Images, right_px: Float[Tensor, "b h w"]
-) -> Images:
+def shift_left(left: Images, right_px: Float[Tensor, "b h w"]) -> Images:
     """Draw the right view by one shift a pixel: ``left`` looked up at ``x + disparity``.
 
     Beyond the border the border repeats. A mixture of shifts has the lower L1, but ghosts, which
@@ -136,9 +141,7 @@ def shift_left(
     return F.grid_sample(left, grid.to(left.dtype), padding_mode="border", align_corners=False)
 
 
-def mix_shifts(
-    left: Images, logits: Logits, planes: Planes
-) -> Images:
+def mix_shifts(left: Images, logits: Logits, planes: Planes) -> Images:
     """Draw the right view as a mixture: the left image under each shift, weighed by its share.
 
     Logits are of the size of ``left``, and ``planes`` in its pixels. What a training draws, since

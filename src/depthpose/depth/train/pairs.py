@@ -36,7 +36,9 @@ class TrainingPairs:
     Args:
         config: which pairs, and how.
         seed: decides order and changes.
-        needs_truth: leave out frames without the truth that ``config.truth`` names.
+        needs_truth: read truth, and leave out frames without the kind that ``config.truth`` names.
+        is_mixed: take frames without truth, and frames without a right view, too. A left image
+            alone stands for both views.
         baseline_m: refuse pairs whose baseline is another (beyond 2 %).
 
     Attributes:
@@ -54,10 +56,11 @@ class TrainingPairs:
         seed: int,
         *,
         needs_truth: bool,
+        is_mixed: bool = False,
         baseline_m: float | None = None,
     ) -> None:
         self.config, self.seed = config, seed
-        self._places = _find_places(config, needs_truth=needs_truth)
+        self._places = _find_places(config, needs_truth=needs_truth, is_mixed=is_mixed)
         said = (f"{_name(place.source)}: {place.truth}" for place in self._places if place.truth)
         self.truths = tuple(dict.fromkeys(said))
         if baseline_m is not None:
@@ -138,24 +141,28 @@ def _read_pair(place: _Place) -> TrainingPair:
         made = source[index]
         given, rig = made.input, made.input.camera
         if kind is not None:
-            left_px, right_px = made.truth.disparity_px, made.truth.right_disparity_px
-    assert given.right is not None, "frames without a right view were left out"
-    unknown = torch.full_like(given.left[0], torch.nan)
-    left_px = unknown if left_px is None else left_px
-    right_px = right_disparity_from_left(left_px) if right_px is None else right_px
+            exact = (made.truth.disparity_px, made.truth.right_disparity_px)
+            left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
+    if left_px is None:
+        left_px = torch.full_like(given.left[0], torch.nan)
     focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
+    if given.right is None:
+        return TrainingPair(given.left, given.left, left_px, left_px, focal_px)
+    right_px = right_disparity_from_left(left_px) if right_px is None else right_px
     return TrainingPair(given.left, given.right, left_px, right_px, focal_px)
 
 
 def _truth_on_disk(
     dataset: Dataset, index: int, kind: TruthKind, rig: StereoRig | None
 ) -> Float[Tensor, "h w"]:
-    """Disparity of the left view by one kind of truth."""
+    """Disparity of the left view by one kind of truth; 0 in the sky, where that is known."""
     frame = dataset.frames[index]
     if kind == "disparity":
-        disparity_px = dataset.read_truth(index).disparity_px
-        assert disparity_px is not None, "frames without truth were left out"
-        return disparity_px
+        truth = dataset.read_truth(index)
+        assert truth.disparity_px is not None, "frames without truth were left out"
+        if truth.is_sky is None:
+            return truth.disparity_px
+        return torch.where(truth.is_sky, 0.0, truth.disparity_px)
     if rig is None:
         raise InputError(
             f"{frame.name}: has depth as its truth but no calibration of the pair, so it cannot "
@@ -167,7 +174,7 @@ def _truth_on_disk(
     return disparity_from_depth(depth_m, rig)
 
 
-def _find_places(config: PairsConfig, *, needs_truth: bool) -> list[_Place]:
+def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:
     if not config.folders and config.streets is None:
         raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
     excluded = set(config.exclude)
@@ -179,7 +186,8 @@ def _find_places(config: PairsConfig, *, needs_truth: bool) -> list[_Place]:
     for number, folder in enumerate(config.folders):
         dataset = open_dataset(Path(folder), config.split if number == 0 else None)
         excluded -= {frame.name for frame in dataset.frames}
-        found += _spread(_usable(dataset, config, needs_truth=needs_truth), config.limit)
+        usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+        found += _spread(usable, config.limit)
     if excluded:
         raise InputError(
             f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
@@ -188,22 +196,27 @@ def _find_places(config: PairsConfig, *, needs_truth: bool) -> list[_Place]:
     return found
 
 
-def _usable(dataset: Dataset, config: PairsConfig, *, needs_truth: bool) -> list[_Place]:
-    """Pairs of a folder that can be learnt from, all with one kind of truth if it is needed."""
+def _usable(
+    dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
+) -> list[_Place]:
+    """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
     there = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)
-        if frame.right is not None and frame.name not in config.exclude
+        if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }
     kind = _choose_truth(dataset.name, there.values(), config.truth) if needs_truth else None
-    found = [
-        _Place(dataset, index, kind)
-        for index, kinds in there.items()
-        if not needs_truth or kind in kinds
+    places = [
+        _Place(dataset, index, kind if kind in kinds else None) for index, kinds in there.items()
     ]
+    if is_mixed:  # an image alone without truth teaches nothing
+        found = [p for p in places if p.truth or dataset.frames[p.number].right is not None]
+    else:
+        found = [p for p in places if p.truth or not needs_truth]
     if not found:
-        what = "a right view and a truth" if needs_truth else "a right view"
-        raise InputError(f"{dataset.name}: no frame has {what}; nothing to train on.")
+        what = " or ".join if is_mixed else " and ".join
+        parts = ["a right view", "a truth"] if needs_truth or is_mixed else ["a right view"]
+        raise InputError(f"{dataset.name}: no frame has {what(parts)}; nothing to train on.")
     return found
 
 

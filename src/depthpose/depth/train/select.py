@@ -17,7 +17,6 @@ from depthpose.depth.train.config import SelectTraining
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select_pairs import SelectionSample
 
-
 _CAP_M = 80.0
 """Truth beyond this does not count, and no estimate lies beyond it, as in Eigen's protocol."""
 
@@ -84,7 +83,7 @@ class SelectTask:
 
     @torch.no_grad()
     def validate(self) -> Evidence:
-        """Depth of held-out left images; the first, what is drawn and its disparity as a picture."""
+        """Depth of held-out left images; of the first, drawn view and disparity as a picture."""
         if self.held_out is None:
             return Evidence()
         self.generator.eval()

@@ -1,5 +1,6 @@
 """Samples of the generator that selects: pairs and single images, synthetic and real, mixed."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,7 @@ from depthpose.core.loop import ticket_generator
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.degrade import degrade
+from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.train.pairs import TrainingPairs
 
 
@@ -36,43 +38,41 @@ class SelectionSample(NamedTuple):
 
 
 class SelectionSamples:
-    """Samples by ticket: a share of the tickets draws from ``more``, evenly spread.
+    """Samples by ticket: a share of the tickets draws from the second source, evenly spread.
 
     Args:
-        pairs: the pairs that set the length of an epoch.
-        more: other pairs, e.g. real ones beside synthetic ones.
-        more_share: share of the tickets that draws from ``more``.
+        sources: the pairs that set the length of an epoch; and perhaps others, e.g. real ones
+            beside synthetic ones.
+        more_share: share of the tickets that draws from the others.
         config: changes of the input alone.
         seed: decides the changes.
+
+    Attributes:
+        truths: which kind of truth each source gives.
     """
 
     def __init__(
-        self,
-        pairs: TrainingPairs,
-        more: TrainingPairs | None,
-        more_share: float,
-        config: DegradeConfig,
-        seed: int,
+        self, sources: Sequence[TrainingPairs], more_share: float, config: DegradeConfig, seed: int
     ) -> None:
-        self.pairs, self.more, self.config, self.seed = pairs, more, config, seed
-        self.more_share = 0.0 if more is None else more_share
+        self.sources, self.config, self.seed = sources, config, seed
+        self.more_share = more_share if len(sources) > 1 else 0.0
+        self.truths = tuple(said for source in sources for said in source.truths)
 
     def __len__(self) -> int:
-        return len(self.pairs)
+        return len(self.sources[0])
 
     def __getitem__(self, ticket: int) -> SelectionSample:
         """Make the sample of a ticket."""
         before, now = int(ticket * self.more_share), int((ticket + 1) * self.more_share)
-        if self.more is not None and now > before:
-            pair = self.more[before]
-        else:
-            pair = self.pairs[ticket - before]
+        pair = self.sources[1][before] if now > before else self.sources[0][ticket - before]
         seen = degrade(pair.left, self.config, ticket_generator(ticket, self.seed + 1))
         return as_sample(pair, seen)
 
 
 def as_sample(pair: TrainingPair, seen: Float[Tensor, "3 h w"]) -> SelectionSample:
-    """Make a sample of a pair; a right view that is not there is NaN."""
-    has_right = ~pair.right.isnan().any()
-    right = torch.where(has_right, pair.right, pair.left)
-    return SelectionSample(seen, pair.left, right, pair.left_px, pair.right_px, has_right)
+    """Make a sample of a pair; one image that stands for both views has no right one."""
+    left, right, left_px, right_px, _ = pair
+    has_right = torch.tensor(not torch.equal(left, right))
+    if not has_right:
+        right_px = right_disparity_from_left(left_px)
+    return SelectionSample(seen, left, right, left_px, right_px, has_right)
