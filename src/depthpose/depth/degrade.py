@@ -35,10 +35,10 @@ def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -
         image = _blurred(image, draw.between(0.3, config.blur_px))
     if draw.share(config.noise_share):
         noise = torch.randn(image.shape, generator=generator)
-        image = image + noise * draw.between(0, config.noise)
+        image = image + noise * draw.between(0.0, config.noise)
     image = image.clamp(0, 1)
     if draw.share(config.jpeg_share):
-        image = through_jpeg(image, int(draw.between(40, 95)))
+        image = through_jpeg(image, int(draw.between(40.0, 95.0)))
     return image
 
 
@@ -61,7 +61,7 @@ class _Draw:
         return low + (high - low) * float(torch.rand((), generator=self.generator))
 
     def share(self, share: float) -> bool:
-        return self.between(0, 1) < share
+        return self.between(0.0, 1.0) < share
 
 
 def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
@@ -79,14 +79,14 @@ def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
 
 def _veiled(image: Picture, draw: _Draw) -> Picture:
     """Lay haze over the image: a share of one light grey everywhere."""
-    return torch.lerp(image, torch.full_like(image, draw.between(0.5, 1)), draw.between(0, 0.4))
+    return torch.lerp(image, torch.full_like(image, draw.between(0.5, 1.0)), draw.between(0.0, 0.4))
 
 
 def _glaring(image: Picture, draw: _Draw) -> Picture:
     """Add light that fades from one place on: a low sun, a lamp."""
     height, width = image.shape[1:]
-    y = torch.linspace(0, 1, height)[:, None] - draw.between(0, 0.6)
-    x = (torch.linspace(0, 1, width) - draw.between(0, 1)) * width / height
+    y = torch.linspace(0, 1, height)[:, None] - draw.between(0.0, 0.6)
+    x = (torch.linspace(0, 1, width) - draw.between(0.0, 1.0)) * width / height
     reach = draw.between(0.2, 0.8)
     return image + draw.between(0.1, 0.6) * torch.exp(-(x**2 + y**2) / (2 * reach**2))
 
