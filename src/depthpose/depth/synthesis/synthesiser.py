@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from depthpose.core.arrays import check_image
 from depthpose.depth.synthesis.generator import UNetGenerator
 
 ROWS_SHARE = 0.03
@@ -30,7 +31,13 @@ class Synthesiser:
 
     @torch.no_grad()
     def synthesise(self, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Draw right views; images are RGB in [0, 1]."""
+        """Draw right views; images are RGB in [0, 1].
+
+        Raises:
+            InputError: an image is no such.
+        """
+        for image in left:
+            check_image(image, "the left image")
         if self.generator.config.test_mode == "batch" and len(left) > 1:
             # The statistics are those of one image: company would change them.
             return torch.cat([self.synthesise(image[None]) for image in left])
