@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
+from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.stereo import CallableMatcher, PSMNet
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
@@ -204,3 +206,60 @@ def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_pa
         assert alone.right is not None
         torch.testing.assert_close(together.right, alone.right, rtol=1e-4, atol=1e-5)
     assert net.estimate_many([]) == []
+
+
+def test_among_many_a_pair_is_matched_with_its_right_view(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
+    net = FakestereoNet.load(path)
+    left, right = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(0))
+    rig = camera(60, 40, 100.0, baseline_m=0.2)
+    alone = StereoInput(name="alone", left=left, right=None, camera=rig)
+    pair = StereoInput(name="pair", left=left, right=right, camera=rig)
+    many = net.estimate_many([alone, pair, pair, alone])
+    for given, found in zip([alone, pair, pair, alone], many, strict=True):
+        one = net.estimate_pair(given)
+        torch.testing.assert_close(found.disparity_px, one.disparity_px, rtol=1e-4, atol=1e-4)
+        assert (found.right is None) == (given.right is not None)
+
+
+@pytest.mark.parametrize("with_right", [False, True])
+def test_values_that_are_no_picture_are_refused(
+    generator: UNetGenerator, *, with_right: bool
+) -> None:
+    """An 8-bit picture as float gave metres: of the white that is left where all is above 1."""
+    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    image, rig = torch.rand(3, 40, 60), camera(60, 40, 100.0, baseline_m=0.2)
+    broken = {
+        r"must lie in \[0, 1\], got .*; divide 8-bit values by 255": (image * 255).round(),
+        r"must lie in \[0, 1\].*do not normalise": 2 * image - 1,
+        r"holds NaN": torch.where(image > 0.5, image, torch.nan),
+    }
+    for message, given in broken.items():
+        sees = StereoInput(
+            name="street", left=given, right=given.flip(-1) if with_right else None, camera=rig
+        )
+        for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+            with pytest.raises(InputError, match="street: the .*" + message):
+                estimate(sees)
+    slightly_above = image * 1.2 - 0.1  # as bicubic resizing leaves it
+    assert net.estimate(slightly_above, rig).depth_m is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.zeros((40, 60, 4), np.uint8), r"array of shape \(40, 60, 4\); give 8-bit RGB"),
+        (np.zeros((40, 60), np.uint8), r"array of shape \(40, 60\); give 8-bit RGB"),
+        (np.zeros((40, 60, 3), np.float32), "array of float32; give 8-bit RGB"),
+        (torch.zeros(4, 40, 60), r"must have shape \(3, H, W\), got \(4, 40, 60\)"),
+        (torch.zeros(3, 40, 60, dtype=torch.uint8), "must be float in"),
+        (torch.full((3, 40, 60), 127.0), "divide 8-bit values by 255"),
+        (None, "must be a tensor, got NoneType"),
+    ],
+)
+def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_tensor(given)

@@ -312,7 +312,13 @@ def test_a_split_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("eigen-train", 22600), ("eigen-val", 888), ("eigen-test", 697), ("eigen-benchmark", 652)],
+    [
+        ("eigen-train", 22600),
+        ("eigen-val", 888),
+        ("eigen-train-val", 23488),
+        ("eigen-test", 697),
+        ("eigen-benchmark", 652),
+    ],
 )
 def test_the_splits_have_their_published_sizes(name: str, count: int) -> None:
     split = read_split(name)
@@ -322,6 +328,7 @@ def test_the_splits_have_their_published_sizes(name: str, count: int) -> None:
 def test_the_splits_keep_their_published_facts() -> None:
     train, val, test = (set(read_split(f"eigen-{n}").frames) for n in ("train", "val", "test"))
     assert not train & val
+    assert set(read_split("eigen-train-val").frames) == train | val
     assert not {drive for drive, _ in train | val} & {drive for drive, _ in test}
     assert set(read_split("eigen-benchmark").frames) < test
     dates = Counter(drive[:10] for drive, _ in test)
@@ -367,6 +374,13 @@ def test_a_bad_list_is_refused(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "s.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_split(tmp_path / "s.txt")
+
+
+@pytest.mark.data
+def test_the_joined_list_of_others_is_recognised(real: Path, tmp_path: Path) -> None:
+    parts = [real / "depth/splits/eigen_full" / f"{name}_files.txt" for name in ("train", "val")]
+    write(tmp_path / "both.txt", "".join(part.read_text().rstrip() + "\n" for part in parts))
+    assert read_split(tmp_path / "both.txt").name == "eigen-train-val"
 
 
 def test_an_unknown_split_names_the_nearest() -> None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
@@ -98,7 +99,8 @@ class FakestereoNet:
         """Estimate depth of ``image``, alone or as the left one of a rectified pair.
 
         Args:
-            image: the image, the left one of a pair.
+            image: the image, the left one of a pair: a file, a tensor of RGB in [0, 1], or an
+                array of 8-bit RGB (of OpenCV's BGR, ``image[..., ::-1]``).
             camera: camera or rig, or its file of any format that is read. One image needs its
                 focal length, for the image is brought to the rig that the generator imitates; a
                 baseline is not looked at. A pair without camera gives disparity only.
@@ -140,15 +142,23 @@ class FakestereoNet:
 
     @torch.inference_mode()
     def estimate_many(self, images: Sequence[StereoInput]) -> list[DepthEstimate]:
-        """Estimate depth of images without right view; neighbours of one camera size go together.
+        """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
+
+        An input with a right view is matched with it, as :meth:`estimate_pair` does.
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
         found: list[DepthEstimate] = []
-        for _, group in groupby(images, self._virtual_size):
-            found += self._estimate_alone(list(group))
+        for size, group in groupby(images, self._size_alone):
+            alike = list(group)
+            is_alone = size is not None
+            found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
         return found
+
+    def _size_alone(self, image: StereoInput) -> tuple[int, int] | None:
+        """Size at the virtual rig; None for a pair."""
+        return self._virtual_size(image) if image.right is None else None
 
     def _virtual_size(self, image: StereoInput) -> tuple[int, int]:
         synthesiser, camera = self._usable_alone(image)
@@ -211,6 +221,7 @@ class FakestereoNet:
                 f"{image.name}: there is no right image, and these weights match pairs only; give "
                 "right=, or weights with a generator ('depthpose weights list')."
             )
+        check_image(image.left, f"{image.name}: the image")
         if image.camera is None:
             raise InputError(
                 f"{image.name}: metres from one image need its focal length. Give a camera: "

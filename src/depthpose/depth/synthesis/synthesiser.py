@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from depthpose.core.arrays import check_image
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import (
@@ -79,8 +80,12 @@ class SelectionSynthesiser:
 
     @torch.no_grad()
     def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
-        """Draw right views; images are RGB in [0, 1]."""
-        given = left.to(self.device, torch.float32)
+        """Draw right views; images are RGB in [0, 1].
+
+        Raises:
+            InputError: an image is no such.
+        """
+        given = _checked(left, self.device)
         seen, other = select_views(self.generator, given)
         parts = {
             "right": shift_left(given, other.shift_px),
@@ -109,11 +114,22 @@ class PaintingSynthesiser:
 
     @torch.no_grad()
     def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
-        """Draw right views; images are RGB in [0, 1]."""
+        """Draw right views; images are RGB in [0, 1].
+
+        Raises:
+            InputError: an image is no such.
+        """
+        given = _checked(left, self.device)
         # The statistics of test mode 'batch' are those of one image: company would change them.
-        groups = left.split(1) if self.config.test_mode == "batch" else [left]
-        drawn = [draw_right(self.generator, part.to(self.device, torch.float32)) for part in groups]
+        groups = given.split(1) if self.config.test_mode == "batch" else [given]
+        drawn = [draw_right(self.generator, part) for part in groups]
         return Drawn(right=torch.cat(drawn).to(left.device))
+
+
+def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tensor, "b 3 h w"]:
+    for image in left:
+        check_image(image, "the left image")
+    return left.to(device, torch.float32)
 
 
 def select_views(

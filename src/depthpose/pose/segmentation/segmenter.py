@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy import ndimage
 from torch import Tensor
 
-from depthpose.core.arrays import Image
+from depthpose.core.arrays import Image, check_image
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation.config import SegmentationConfig
@@ -71,7 +71,12 @@ class Segmenter:
         return self.weights.objects
 
     def segment(self, image: Image) -> Segmentation:
-        """Find the objects of an image of any size."""
+        """Find the objects of an image of any size, a tensor of RGB in [0, 1] (not OpenCV's BGR).
+
+        Raises:
+            InputError: it is no such image.
+        """
+        check_image(image, "the image")
         probability = class_probabilities(self._network, image)
         label = probability.argmax(0)
         config = self._network.config
