@@ -312,7 +312,13 @@ def test_a_split_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("eigen-train", 22600), ("eigen-val", 888), ("eigen-test", 697), ("eigen-benchmark", 652)],
+    [
+        ("eigen-train", 22600),
+        ("eigen-val", 888),
+        ("eigen-train-val", 23488),
+        ("eigen-test", 697),
+        ("eigen-benchmark", 652),
+    ],
 )
 def test_the_splits_have_their_published_sizes(name: str, count: int) -> None:
     split = read_split(name)
@@ -322,6 +328,7 @@ def test_the_splits_have_their_published_sizes(name: str, count: int) -> None:
 def test_the_splits_keep_their_published_facts() -> None:
     train, val, test = (set(read_split(f"eigen-{n}").frames) for n in ("train", "val", "test"))
     assert not train & val
+    assert set(read_split("eigen-train-val").frames) == train | val
     assert not {drive for drive, _ in train | val} & {drive for drive, _ in test}
     assert set(read_split("eigen-benchmark").frames) < test
     dates = Counter(drive[:10] for drive, _ in test)
@@ -352,6 +359,13 @@ def test_a_list_of_image_paths_is_read(tmp_path: Path) -> None:
     make_raw(tmp_path / "data")
     chosen = open_dataset(tmp_path / "data", tmp_path / "mine.txt")
     assert [frame.name for frame in chosen.frames] == ["2011_09_26_drive_0002_sync_0000000007"]
+
+
+def test_a_file_of_train_and_val_is_the_joined_split(tmp_path: Path) -> None:
+    frames = [f for part in ("val", "train") for f in read_split(f"eigen-{part}").frames]
+    lines = [f"{drive[:10]}/{drive} {number} l" for drive, number in frames]
+    (tmp_path / "both.txt").write_text("\n".join(lines))
+    assert read_split(tmp_path / "both.txt") == read_split("eigen-train-val")
 
 
 @pytest.mark.parametrize(

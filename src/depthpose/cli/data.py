@@ -25,8 +25,9 @@ def check(
 
     Args:
         path: the dataset's folder.
-        split: check only these frames: eigen-train, eigen-val, eigen-test, eigen-benchmark, or a
-            file of monodepth's or monodepth2's form; of a BOP dataset, one of its splits.
+        split: check only these frames: eigen-train, eigen-val, eigen-train-val, eigen-test,
+            eigen-benchmark, or a file of monodepth's or monodepth2's form; of a BOP dataset, one
+            of its splits.
         with_decoding: decode every image in full, which finds truncation; off reads headers only.
     """
     from tqdm import tqdm

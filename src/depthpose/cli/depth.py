@@ -183,7 +183,8 @@ def evaluate(
         train_without: names of frames to keep out of them.
         protocol: how prediction and truth are compared.
         cap: metres beyond which truth does not count; a row each.
-        split: eigen-test, eigen-val, eigen-train, eigen-benchmark, or a file of frames.
+        split: eigen-test, eigen-val, eigen-train, eigen-train-val, eigen-benchmark, or a file of
+            frames.
         holes: sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out
             (then the column 'coverage' says what share was measured).
         device: cpu, cuda, cuda:1, ...
