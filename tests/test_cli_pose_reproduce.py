@@ -4,52 +4,15 @@ import json
 from pathlib import Path
 
 import pytest
-import yaml
-from tests.pose.made_frames import draw_frame, made_models, moved, predictions_of
+from tests.pose.made_frames import made_models, moved, predictions_of
+from tests.pose.made_linemod import make_linemod
 from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
-from depthpose.core.files import read_image, write_depth_png, write_image
-from depthpose.pose.bop import BopDataset, open_bop
-from depthpose.pose.bop.dataset import read_instance_mask
-from depthpose.pose.bop.linemod import segnet_mask
-from depthpose.pose.bop.write import write_bop_models, write_mask
+from depthpose.core.files import read_image
+from depthpose.pose.bop import BopDataset
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.weights import write_pose_weights
-
-
-def make_linemod(folder: Path, frames: int = 3) -> BopDataset:
-    """Linemod_preprocessed as the thesis has it: a folder an object, lists, and predicted masks."""
-    home = write_bop_models(folder, made_models())
-    info = json.loads((home / "models_info.json").read_text())
-    (home / "models_info.json").unlink()
-    # As published: no name, no symmetry; eggbox is number 10.
-    kept = {int(n): {k: v for k, v in e.items() if k[:3] in ("dia", "min", "siz")}
-            for n, e in info.items()}  # fmt: skip
-    (home / "models_info.yml").write_text(yaml.safe_dump(kept))
-    for k, model in enumerate(made_models()):
-        (home / f"obj_{model.number:06d}.ply").rename(home / f"obj_{model.number:02d}.ply")
-        scene = folder / f"data/{model.number:02d}"
-        truths, cameras = {}, {}
-        for i in range(frames):
-            frame = draw_frame(i, made_models())
-            write_depth_png(scene / f"depth/{i:04d}.png", frame.depth_m, 0.001)
-            assert frame.rgb is not None
-            write_image(scene / f"rgb/{i:04d}.png", frame.rgb)
-            own = frame.objects[k]
-            write_mask(scene / f"mask/{i:04d}.png", own.visible)
-            pose = own.camera_from_model
-            truths[i] = [{"cam_R_m2c": pose.R.flatten().tolist(), "obj_id": model.number,
-                          "cam_t_m2c": (1000 * pose.t_m).tolist()}]  # fmt: skip
-            cameras[i] = {"cam_K": frame.K.flatten().tolist(), "depth_scale": 1.0}
-        (scene / "gt.yml").write_text(yaml.safe_dump(truths))
-        (scene / "info.yml").write_text(yaml.safe_dump(cameras))
-        (scene / "test.txt").write_text("0000\n0002\n")
-        (scene / "train.txt").write_text("0001\n")
-    data = open_bop(folder)
-    for instance in data.instances:
-        write_mask(segnet_mask(folder, instance), read_instance_mask(instance))
-    return data
 
 
 @pytest.fixture(scope="module")

@@ -361,6 +361,13 @@ def test_a_list_of_image_paths_is_read(tmp_path: Path) -> None:
     assert [frame.name for frame in chosen.frames] == ["2011_09_26_drive_0002_sync_0000000007"]
 
 
+def test_a_file_of_train_and_val_is_the_joined_split(tmp_path: Path) -> None:
+    frames = [f for part in ("val", "train") for f in read_split(f"eigen-{part}").frames]
+    lines = [f"{drive[:10]}/{drive} {number} l" for drive, number in frames]
+    (tmp_path / "both.txt").write_text("\n".join(lines))
+    assert read_split(tmp_path / "both.txt") == read_split("eigen-train-val")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -512,14 +512,6 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
     assert "Wall time" in head
 
 
-def test_the_thesis_config_is_the_published_network() -> None:
-    config = read_config(CONFIGS / "thesis.yaml", PoseTraining)
-    network = dataclasses.replace(config.network, with_bias=False)
-    assert sum(p.numel() for p in ResUNet(network).parameters()) == 8_774_168
-    rates = [config.adam.rate_at(epoch, 500) for epoch in (0, 99, 100, 250, 499)]
-    assert rates == [1e-4, 1e-4, 5e-5, 2.5e-5, 6.25e-6]
-
-
 @pytest.mark.parametrize(
     ("make", "said"),
     [

@@ -26,8 +26,8 @@ def check(
     Args:
         path: the dataset's folder.
         split: check only these frames: eigen-train, eigen-val, eigen-train-val, eigen-test,
-            eigen-benchmark, or a file of monodepth's or monodepth2's form; of a BOP dataset, one of
-            its splits.
+            eigen-benchmark, or a file of monodepth's or monodepth2's form; of a BOP dataset, one
+            of its splits.
         with_decoding: decode every image in full, which finds truncation; off reads headers only.
     """
     from tqdm import tqdm
@@ -249,7 +249,6 @@ def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> 
         rig=frame.rig,
         disparity_px=frame.disparity_px,
         occluded=frame.occluded,
-        is_sky=frame.is_sky,
         points=frame.lidar_points,
         camera_from_velodyne=camera_from_velodyne(),
     )

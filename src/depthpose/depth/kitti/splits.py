@@ -17,10 +17,9 @@ _SHIPPED = {
     "eigen-test": (697, "f4162df9d7bd431e9f2b87625769f686ea254df13ad904710e1258002522a78c"),
     "eigen-benchmark": (652, "00a9ea3d79fa9ff08884cc5297a6233968518128f6e8d561b90a1cda5b006b9a"),
 }
+# Lists that are others together; the thesis trains on this one (2.4.1).
 _JOINED = {"eigen-train-val": ("eigen-train", "eigen-val")}
-"""Splits of two lists: the 23,488 frames that the thesis trains on (2.4.1)."""
-_NAMES = (*_SHIPPED, *_JOINED)
-
+SPLIT_NAMES = (*_SHIPPED, *_JOINED)
 # Files that others ship under these names; the lists are the same.
 _MONODEPTH_SHA256 = {
     "5baf510a33fa2f81b97642d86deebc2b6da752cedbcf87f1c741b2f601f16782": "eigen-train",
@@ -56,19 +55,20 @@ def read_split(name: str | Path) -> Split:
     Raises:
         InputError: neither a name nor a file, or a line that cannot be understood.
     """
-    if str(name) in _NAMES:
-        return _named(str(name))
+    if str(name) in SPLIT_NAMES:
+        return _known(str(name))
     path = Path(name)
     try:
         is_there = path.is_file()
     except OSError:  # a name too long for the disk
         is_there = False
     if not is_there:
-        raise InputError(f"split {str(name)!r}: no such file; {nearest_name(str(name), _NAMES)}")
+        hint = nearest_name(str(name), SPLIT_NAMES)
+        raise InputError(f"split {str(name)!r}: no such file; {hint}")
     text = read_text(path)
     known = _MONODEPTH_SHA256.get(hashlib.sha256(text.encode()).hexdigest())
     if known is not None:
-        return _named(known)
+        return _shipped(known)
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
     frames = {_parse_line(path, i, line) for i, line in lines if line} - {None}
     if not frames:
@@ -76,7 +76,7 @@ def read_split(name: str | Path) -> Split:
             f"{path}: names no frame. Each line is 'DATE/DRIVE FRAME l' or two images."
         )
     listed = tuple(sorted(frame for frame in frames if frame is not None))
-    same = [key for key in _NAMES if _named(key).frames == listed]
+    same = [key for key in SPLIT_NAMES if _known(key).frames == listed]
     return Split(name=same[0] if same else path.name, frames=listed)
 
 
@@ -96,10 +96,11 @@ def _parse_line(path: Path, number: int, line: str) -> tuple[str, int] | None:
     return drives.pop(), numbers.pop()
 
 
-def _named(name: str) -> Split:
+@cache
+def _known(name: str) -> Split:
     if name not in _JOINED:
         return _shipped(name)
-    frames = (frame for part in _JOINED[name] for frame in _shipped(part).frames)
+    frames = {frame for part in _JOINED[name] for frame in _shipped(part).frames}
     return Split(name=name, frames=tuple(sorted(frames)))
 
 

@@ -1,0 +1,59 @@
+"""A small Linemod_preprocessed of made frames."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+from tests.pose.made_frames import draw_frame, made_models
+
+from depthpose.core.files import write_depth_png, write_image
+from depthpose.pose.bop import BopDataset, open_bop
+from depthpose.pose.bop.dataset import read_instance_mask
+from depthpose.pose.bop.linemod import segnet_mask
+from depthpose.pose.bop.write import write_bop_models, write_mask
+from depthpose.pose.types import ObjectModel
+
+
+def make_linemod(
+    folder: Path, models: Sequence[ObjectModel] | None = None, frames: int = 3
+) -> BopDataset:
+    """A folder an object, lists, and predicted masks; each frame shows the object and another.
+
+    As published: models have no name and no symmetry.
+    """
+    models = made_models() if models is None else models
+    home = write_bop_models(folder, models)
+    info = json.loads((home / "models_info.json").read_text())
+    (home / "models_info.json").unlink()
+    kept = {int(n): {k: v for k, v in e.items() if k[:3] in ("dia", "min", "siz")}
+            for n, e in info.items()}  # fmt: skip
+    (home / "models_info.yml").write_text(yaml.safe_dump(kept))
+    for k, model in enumerate(models):
+        (home / f"obj_{model.number:06d}.ply").rename(home / f"obj_{model.number:02d}.ply")
+        _make_scene(folder, [model, models[k - 1]], frames)
+    data = open_bop(folder)
+    for instance in data.instances:
+        write_mask(segnet_mask(folder, instance), read_instance_mask(instance))
+    return data
+
+
+def _make_scene(folder: Path, shown: Sequence[ObjectModel], frames: int) -> None:
+    number = shown[0].number
+    scene = folder / f"data/{number:02d}"
+    truths, cameras = {}, {}
+    for i in range(frames):
+        frame = draw_frame(i, shown)
+        write_depth_png(scene / f"depth/{i:04d}.png", frame.depth_m, 0.001)
+        assert frame.rgb is not None
+        write_image(scene / f"rgb/{i:04d}.png", frame.rgb)
+        own = frame.objects[0]
+        write_mask(scene / f"mask/{i:04d}.png", own.visible)
+        pose = own.camera_from_model
+        truths[i] = [{"cam_R_m2c": pose.R.flatten().tolist(), "obj_id": number,
+                      "cam_t_m2c": (1000 * pose.t_m).tolist()}]  # fmt: skip
+        cameras[i] = {"cam_K": frame.K.flatten().tolist(), "depth_scale": 1.0}
+    (scene / "gt.yml").write_text(yaml.safe_dump(truths))
+    (scene / "info.yml").write_text(yaml.safe_dump(cameras))
+    (scene / "test.txt").write_text("0000\n0002\n")
+    (scene / "train.txt").write_text("0001\n")
