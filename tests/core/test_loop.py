@@ -28,6 +28,7 @@ from depthpose.core.loop import (
     ticket_generator,
     train,
 )
+from depthpose.core.precision import PrecisionNotice, computes_bf16
 
 PROGRAM = Path(__file__).with_name("loop_task.py")
 
@@ -67,7 +68,15 @@ def interrupted(folder: Path, config: LoopConfig, after: int) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"ema_decay": 0.9}, {"accumulate": 2, "clip_norm": 0.1}, {"precision": "bf16"}],
+    [
+        {},
+        {"ema_decay": 0.9},
+        {"accumulate": 2, "clip_norm": 0.1},
+        pytest.param(
+            {"precision": "bf16"},
+            marks=pytest.mark.skipif(not computes_bf16("cpu"), reason="no arithmetic for bf16"),
+        ),
+    ],
 )
 def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, changes: dict[str, object]
@@ -81,6 +90,16 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
         for name in ("whole", "parts")
     )
     assert one == other
+
+
+def test_a_training_without_bf16_is_one_in_fp32_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = trained(tmp_path / "fp32", loop())
+    monkeypatch.setattr("depthpose.core.precision.computes_bf16", lambda _: False)
+    with pytest.warns(PrecisionNotice, match=r"no arithmetic for bf16 .*; fp32 is taken"):
+        task = trained(tmp_path / "bf16", loop(precision="bf16"))
+    assert_equal(weights(exact), weights(task))
 
 
 def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) -> None:

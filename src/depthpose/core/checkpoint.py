@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import atomic_write
 from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
 
@@ -25,7 +25,7 @@ _IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
 """Weights that stay out of the wheel."""
 
 
-class LicenceNotice(UserWarning):
+class LicenceNotice(Notice):
     """Weights whose terms bind whoever uses them."""
 
 

@@ -1,4 +1,4 @@
-"""The one error that bad input raises, and the nearest-name hint it often carries."""
+"""The one error that bad input raises, the notice that stops nothing, and the nearest name."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -21,6 +21,10 @@ class MissingExtraError(ImportError):
         super().__init__(
             f"{purpose} needs {package}, which is not installed: pip install 'depthpose[{extra}]'"
         )
+
+
+class Notice(UserWarning):
+    """Something to know that stops nothing; the command line prints it as one line."""
 
 
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
