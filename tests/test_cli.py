@@ -168,8 +168,8 @@ def test_without_bf16_one_line_is_said_and_the_record_says_fp32(
     pair_folder: Path, tmp_path: Path
 ) -> None:
     code = (
-        "import sys; from depthpose.core import precision; from depthpose.cli import main; "
-        "precision.computes_bf16 = lambda _: False; sys.exit(main(sys.argv[1:]))"
+        "import sys; from depthpose.core import devices; from depthpose.cli import main; "
+        "devices.computes_bf16 = lambda _: False; sys.exit(main(sys.argv[1:]))"
     )
     one = [str(pair_folder / side / "a.png") for side in ("left", "right")]
     words = ["depth", "match", *one, "--camera", str(pair_folder / "cam.json"), "--out"]

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
-from depthpose.core.precision import PrecisionNotice, computes_bf16
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import (
     Footprint,
@@ -101,7 +101,7 @@ def test_bf16_stays_near() -> None:
 
 
 def test_without_bf16_fp32_is_taken_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("depthpose.core.precision.computes_bf16", lambda _: False)
+    monkeypatch.setattr("depthpose.core.devices.computes_bf16", lambda _: False)
     network = random_network(SMALL)
     left, right = torch.rand(2, 3, 64, 96)
     with pytest.warns(PrecisionNotice, match=r"no arithmetic for bf16 .*; fp32 is taken"):

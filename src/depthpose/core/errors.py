@@ -39,6 +39,17 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
         raise MissingExtraError("opencv-python-headless", "opencv", purpose) from error
 
 
+def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
+    """Refuse a word that is none of the known ones.
+
+    Raises:
+        InputError: that is so; the nearest is said.
+    """
+    known = tuple(known)
+    if name not in known:
+        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), known)}")
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """Say which known name was probably meant, and list them all: the tail of an error message.
 

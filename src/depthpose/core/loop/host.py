@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
+from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.loop.config import LoopConfig
-from depthpose.core.precision import usable_precision
 
 _PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
 

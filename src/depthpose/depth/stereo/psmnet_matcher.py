@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError
-from depthpose.core.precision import usable_precision
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.stereo.inference import PSMNetInference
@@ -41,7 +41,7 @@ class PSMNetMatcher:
 
     def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
-        self._device = _usable_device(config.device)
+        self._device = usable_device(config.device)
         self.config = with_usable_precision(config)
         self.network_config = network.config
         self._inference = PSMNetInference(
@@ -190,14 +190,3 @@ def tile_change_px(matcher: PSMNetMatcher, left: Tensor, right: Tensor) -> float
     tiled = matcher.match(left, right).disparity_px
     whole = matcher.match_whole(left, right).disparity_px
     return float((tiled - whole).abs().mean())
-
-
-def _usable_device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(
-            f"device {name!r} cannot be used here ({str(error).splitlines()[0]}); take 'cpu'"
-        ) from error
-    return device

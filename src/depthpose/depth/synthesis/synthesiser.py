@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from depthpose.core.devices import usable_device
 from depthpose.depth.synthesis.generator import UNetGenerator
 
 ROWS_SHARE = 0.03
@@ -23,8 +24,8 @@ class Synthesiser:
     """
 
     def __init__(self, generator: UNetGenerator, device: torch.device | str = "cpu") -> None:
-        self.generator = generator.to(device).eval()
-        self.device = torch.device(device)
+        self.device = usable_device(device)
+        self.generator = generator.to(self.device).eval()
         if generator.config.test_mode == "batch":
             _keep_training(self.generator)
 

@@ -1,14 +1,30 @@
-"""Which arithmetic this machine computes in."""
+"""What this machine computes on, and in which arithmetic."""
 
 import warnings
 
 import torch
 
-from depthpose.core.errors import Notice
+from depthpose.core.errors import InputError, Notice
 
 
 class PrecisionNotice(Notice):
     """A precision was asked for that this machine does not compute in; another is taken."""
+
+
+def usable_device(name: str | torch.device) -> torch.device:
+    """Give the device of a name, such as ``cpu`` or ``cuda:1``.
+
+    Raises:
+        InputError: this machine has none of that name.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"device {str(name)!r} cannot be used here ({str(error).splitlines()[0]}); take 'cpu'"
+        ) from error
+    return device
 
 
 def computes_bf16(device: str | torch.device) -> bool:
