@@ -91,7 +91,7 @@ class LoopConfig:
     all of them until the discriminator has moved."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
-    """Arithmetic of the forward pass; fp16 needs a GPU."""
+    """Arithmetic of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
 
     clip_norm: float | None = None
     """Largest norm of an optimiser's gradient; None: as it is."""

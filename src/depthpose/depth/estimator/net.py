@@ -116,6 +116,11 @@ class FakestereoNet:
         left = as_tensor(image)
         if isinstance(camera, str | Path):
             camera = read_camera(Path(camera), (left.shape[2], left.shape[1]))
+        if camera is not None and not isinstance(camera, Camera):
+            raise InputError(
+                f"camera is a {type(camera).__name__}; give a Camera(width=, height=, K=), or a "
+                "StereoRig for metres from a pair, or its file"
+            )
         pair = StereoInput(
             name=chosen,
             left=left,

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from depthpose.core.arrays import check_image
+from depthpose.core.devices import usable_device
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import (
@@ -74,9 +75,9 @@ class SelectionSynthesiser:
     """Looks the right view up in the left one, and answers the left view's disparity too."""
 
     def __init__(self, generator: SelectionGenerator, device: torch.device | str = "cpu") -> None:
-        self.generator = generator.to(device).eval()
+        self.device = usable_device(device)
+        self.generator = generator.to(self.device).eval()
         self.config = generator.config
-        self.device = torch.device(device)
 
     @torch.no_grad()
     def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
@@ -106,9 +107,9 @@ class PaintingSynthesiser:
     """
 
     def __init__(self, generator: UNetGenerator, device: torch.device | str = "cpu") -> None:
-        self.generator = generator.to(device).eval()
+        self.device = usable_device(device)
+        self.generator = generator.to(self.device).eval()
         self.config = generator.config
-        self.device = torch.device(device)
         if generator.config.test_mode == "batch":
             _keep_training(self.generator)
 

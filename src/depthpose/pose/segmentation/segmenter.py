@@ -14,6 +14,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import Image, check_image
 from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.devices import usable_device
 from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation.config import SegmentationConfig
 from depthpose.pose.segmentation.network import FCN
@@ -51,7 +52,7 @@ class Segmenter:
 
     def __init__(self, weights: SegmentationWeights, device: torch.device | str = "cpu") -> None:
         self.weights = weights
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self._network = weights.network.eval().to(self.device)
 
     @classmethod
