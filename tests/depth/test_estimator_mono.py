@@ -1,5 +1,6 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,14 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.estimator.inputs import as_tensor
+from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
-from depthpose.depth.types import StereoInput
+from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
+from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.weights import write_depth_weights
 
 FOCAL_PX, BASELINE_M = 120.0, 0.5
@@ -230,7 +232,7 @@ def test_values_that_are_no_picture_are_refused(
     generator: UNetGenerator, *, with_right: bool
 ) -> None:
     """An 8-bit picture as float gave metres: of the white that is left where all is above 1."""
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image, rig = torch.rand(3, 40, 60), camera(60, 40, 100.0, baseline_m=0.2)
     broken = {
         r"must lie in \[0, 1\], got .*; divide 8-bit values by 255": (image * 255).round(),
@@ -263,3 +265,81 @@ def test_values_that_are_no_picture_are_refused(
 def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         as_tensor(given)
+
+
+SELECTION = SelectionConfig(
+    encoder_width=0.1,
+    widths=(4, 4, 4, 4),
+    planes=4,
+    disparity_px=(1.0, 8.0),
+    virtual_focal_px=FOCAL_PX,
+    virtual_baseline_m=BASELINE_M,
+)
+
+
+def sure_of(plane: int, answer: str = "own") -> SelectionGenerator:
+    """A network that says the same class of each pixel of both views: 0 is the sky, k a plane."""
+    config = dataclasses.replace(SELECTION, answer=answer)
+    network = SelectionGenerator(config).eval()
+    torch.nn.init.zeros_(network.head.weight)
+    with torch.no_grad():
+        network.head.bias.copy_(
+            20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
+        )
+    return network
+
+
+def constant_matcher(disparity_px: float) -> CallableMatcher:
+    return CallableMatcher(lambda left, _: torch.full(left.shape[1:], disparity_px))
+
+
+def test_the_selecting_generator_answers_depth_itself() -> None:
+    """Plane 3 is 4 px: no matcher is asked, and the drawn view is the image moved by 4 px."""
+    never = CallableMatcher(lambda _, __: pytest.fail("the matcher was asked"))
+    net = FakestereoNet(never, make_synthesiser(sure_of(3)))
+    image = torch.rand(3, 64, 96, generator=torch.Generator().manual_seed(0))
+    found = net.estimate(image, camera(96, 64, FOCAL_PX))
+    assert found.depth_m is not None
+    torch.testing.assert_close(
+        found.depth_m, torch.full((64, 96), FOCAL_PX * BASELINE_M / 4), rtol=1e-4, atol=0
+    )
+    assert found.right is not None
+    torch.testing.assert_close(found.right[..., :-4], image[..., 4:], rtol=0, atol=1e-3)
+    assert found.confidence is not None
+    assert float(found.confidence.min()) > 0.99
+    assert found.is_sky is not None
+    assert not bool(found.is_sky.any())
+
+
+@pytest.mark.parametrize("baseline_m", [None, 0.1])
+def test_the_sky_has_no_depth_and_a_disparity_next_to_nothing(baseline_m: float | None) -> None:
+    net = FakestereoNet(constant_matcher(3.0), make_synthesiser(sure_of(0)))
+    found = net.estimate(torch.rand(3, 64, 96), camera(96, 64, 2 * FOCAL_PX, baseline_m))
+    assert found.is_sky is not None
+    assert bool(found.is_sky.all())
+    assert found.depth_m is not None
+    assert bool(found.depth_m.isnan().all())
+    rig_m = BASELINE_M if baseline_m is None else baseline_m
+    expected = torch.full((64, 96), 2 * FOCAL_PX * rig_m / 10_000)
+    torch.testing.assert_close(found.disparity_px, expected, rtol=1e-4, atol=0)
+    assert found.confidence is not None
+    assert float(found.confidence.min()) > 0.99
+
+
+def test_the_matcher_and_both_are_one_word_away() -> None:
+    """A matcher without confidence adds nothing to the join; one that is as sure, the mean log."""
+    image, seen = torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX)
+    found = {
+        answer: FakestereoNet(constant_matcher(2.0), make_synthesiser(sure_of(3, answer)))
+        .estimate(image, seen)
+        .disparity_px.mean()
+        .item()
+        for answer in ("own", "matched", "joined")
+    }
+    assert found == pytest.approx({"own": 4.0, "matched": 2.0, "joined": 4.0}, rel=1e-3)
+    own = Match(disparity_px=torch.full((1, 2), 4.0), confidence=torch.ones(1, 2))
+    other = Match(
+        disparity_px=torch.tensor([[1.0, torch.nan]]), confidence=torch.tensor([[1.0, 1.0]])
+    )
+    joined = join_matches(own, other)
+    assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)

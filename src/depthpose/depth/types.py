@@ -74,8 +74,8 @@ class DepthEstimate:
     Attributes:
         depth_m: metres along the optical axis; NaN where disparity is invalid, and in the sky.
             None without a rig.
-        disparity_px: disparity that the depth was made from, at the size of the input; that of
-            a point at infinity in the sky.
+        disparity_px: disparity that the depth was made from, at the size of the input; in the sky
+            that of a point 10 km away.
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
         is_sky: where the image shows the sky, or None where the weights do not know it.

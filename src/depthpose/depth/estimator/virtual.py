@@ -10,6 +10,9 @@ from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth, resize_disparity
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
+SKY_M = 10_000.0
+"""What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
+
 
 def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
     """Rows and columns at which the camera's image has ``focal_px``, with square pixels."""
@@ -57,12 +60,13 @@ def from_virtual(
     if is_sky is not None:
         share = _resized_map(is_sky.float(), height, width)
         is_sky = share > 0.5
-        depth_m = torch.where(is_sky, torch.inf, depth_m)
-        disparity_px = torch.where(is_sky, 0.0, disparity_px)
+        depth_m = torch.where(is_sky, SKY_M, depth_m)
+        sky_px = float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M
+        disparity_px = torch.where(is_sky, sky_px, disparity_px)
     if isinstance(camera, StereoRig):
         disparity_px = disparity_from_depth(depth_m, camera)
     return DepthEstimate(
-        depth_m=torch.where(depth_m.isinf(), torch.nan, depth_m),
+        depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
         disparity_px=disparity_px,
         confidence=seen.confidence,
         right=resize_image(right, height, width),
