@@ -248,7 +248,10 @@ def test_it_is_tuned_through_the_matcher(pairs: PairsConfig, tmp_path: Path) -> 
 def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Path) -> None:
     zoom = dataclasses.replace(pairs.augment, scale=(1.0, 1.3))
     config = SelectTraining(
-        generator=TINY, pairs=dataclasses.replace(pairs, augment=zoom), loop=LOOP
+        generator=TINY,
+        with_fixed_start=False,
+        pairs=dataclasses.replace(pairs, augment=zoom),
+        loop=LOOP,
     )
     assert train_select(config, Run(folder=tmp_path)).is_file()
 
@@ -263,3 +266,9 @@ def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Pa
 def test_weights_that_are_none_are_refused(changes: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         SelectTraining(**changes)
+
+
+def test_fixed_layers_need_something_to_begin_with(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = SelectTraining(generator=TINY, pairs=pairs, loop=LOOP)
+    with pytest.raises(InputError, match="nothing says what they begin with: give --encoder"):
+        train_select(config, Run(folder=tmp_path))

@@ -79,6 +79,12 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
+    if config.with_fixed_start and config.encoder is None and config.start is None:
+        raise InputError(
+            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
+            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
+            "--start, or with_fixed_start: false with encoder_rate: 1.0."
+        )
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
