@@ -119,8 +119,9 @@ def _range_m(sample: StereoSample) -> tuple[float, float]:
 _STREET_TEXT = (
     "A made street, drawn on the spot from a seed that no training has seen; its depth is known "
     "exactly. Distances from 3 m (bright) to 80 m (dark), grey where there is none: the sky. "
-    "epe_px and d1_all measure disparity, the other columns depth, over all pixels nearer than "
-    "80 m, hidden ones too."
+    "No network here knows the sky: its depth below is wrong, and only from one image is the "
+    "confidence there lowered, by a rule of thumb. epe_px and d1_all measure disparity, the other "
+    "columns depth, over all pixels nearer than 80 m, hidden ones too."
 )
 _MOTORCYCLE_TEXT = (
     "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "

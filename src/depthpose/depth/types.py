@@ -72,7 +72,8 @@ class DepthEstimate:
     Attributes:
         depth_m: metres along the optical axis; NaN where disparity is invalid. None without a rig.
         disparity_px: disparity that the depth was made from, at the size of the input.
-        confidence: 0..1, or None.
+        confidence: 0..1, or None; from one image, lowered where it looks like sky, whose depth is
+            wrong.
         right: the synthesised right view, or None where a real one was given.
     """
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.depth.config import GeneratorConfig
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth, resize_disparity
+from depthpose.depth.estimator.sky import lower_in_sky
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 
@@ -42,7 +43,10 @@ def resize_image(
 def from_virtual(
     image: StereoInput, rig: GeneratorConfig, right: Tensor, match: Match
 ) -> DepthEstimate:
-    """Bring what was found at the virtual rig back to the image."""
+    """Bring what was found at the virtual rig back to the image.
+
+    No generator here knows the sky: the confidence there is lowered.
+    """
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
@@ -53,7 +57,7 @@ def from_virtual(
     return DepthEstimate(
         depth_m=depth_m,
         disparity_px=disparity_from_depth(depth_m, camera) if is_rig else seen.disparity_px,
-        confidence=seen.confidence,
+        confidence=lower_in_sky(seen.confidence, image.left),
         right=resize_image(right, height, width),
     )
 

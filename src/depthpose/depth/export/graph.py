@@ -13,6 +13,7 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.export import Graph, Value, network_model
 from depthpose.depth.config import GeneratorConfig
+from depthpose.depth.estimator.sky import BRIGHT, PLAIN, SHARE
 from depthpose.depth.export.network import SizelessPSMNet
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import IMAGENET_MEAN, IMAGENET_STD
@@ -57,7 +58,8 @@ def image_graph(weights: DepthWeights) -> Graph:
     focal_yx = np.array([rig.virtual_focal_px] * 2)
     found = [_resized_map(m, full) for m in _matched(left, right, focal_yx, matcher)]
     disparity_px = found[0] * _ratio(full, small)
-    _output_maps(graph, _depth(disparity_px, K, rig), disparity_px, found[1])
+    confidence = _lowered_in_sky(found[1], image)
+    _output_maps(graph, _depth(disparity_px, K, rig), disparity_px, confidence)
     graph.output("right", _resized_image(right, full), np.float32, _IMAGES)
     return graph
 
@@ -133,6 +135,17 @@ def _depth(disparity_px: Value, K: Value, rig: GeneratorConfig) -> Value:
     fx = K.op("Reshape", [-1]).op("Gather", 0).cast(np.float32)
     depth_m = (fx * np.float32(rig.virtual_baseline_m)) / disparity_px
     return disparity_px.op("Greater", np.float32(0)).op("Where", depth_m, np.float32(np.nan))
+
+
+def _lowered_in_sky(confidence: Value, image: Value) -> Value:
+    """What ``lower_in_sky`` does."""
+    value = image.op("ReduceMax", [1], keepdims=1)
+    most, least = (one.op("MaxPool", kernel_shape=[3, 3], pads=[1] * 4)
+                   for one in (value, value.op("Neg")))  # fmt: skip
+    is_dark = value.op("LessOrEqual", np.float32(BRIGHT))
+    is_other = is_dark.op("Or", (most + least).op("GreaterOrEqual", np.float32(PLAIN)))
+    is_sky = is_other.cast(np.float32).op("CumSum", 2).op("Equal", np.float32(0))
+    return is_sky.op("Squeeze", [1]).op("Where", confidence * np.float32(SHARE), confidence)
 
 
 def _output_maps(graph: Graph, *maps: Value | None) -> None:
