@@ -25,7 +25,7 @@ from depthpose.core.report import markdown_table
 from depthpose.depth.config import GeneratorConfig, MatcherConfig
 from depthpose.depth.estimator import FakestereoNet, focal_size, resize_image
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher
-from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
 
 HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
@@ -38,7 +38,7 @@ def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
     torch.manual_seed(0)
     generator = UNetGenerator(GeneratorConfig()).eval()
     return FakestereoNet(
-        PSMNetMatcher(PSMNet().eval(), config), Synthesiser(generator, config.device)
+        PSMNetMatcher(PSMNet().eval(), config), make_synthesiser(generator, config.device)
     )
 
 
@@ -94,12 +94,12 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
         memory = torch.cuda.max_memory_allocated()
     assert net.synthesiser is not None
     assert image.camera is not None
-    synthesise = net.synthesiser.synthesise
-    size = focal_size(image.camera, net.synthesiser.generator.config.virtual_focal_px)
+    draw = net.synthesiser.draw
+    size = focal_size(image.camera, net.synthesiser.config.virtual_focal_px)
     left = resize_image(image.left, *size)
-    right = synthesise(left[None])[0]
+    right = draw(left[None]).right[0]
     whole_s = seconds(lambda: net.estimate_pair(image), device)
-    drawing = count_flops(lambda: synthesise(left[None]))
+    drawing = count_flops(lambda: draw(left[None]))
     matching = matcher_flops(net, *size)
     peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
     return {
@@ -107,7 +107,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
         "precision": precision,
         "seconds": whole_s,
         "first_s": first,
-        "draw_s": seconds(lambda: synthesise(left[None]), device),
+        "draw_s": seconds(lambda: draw(left[None]), device),
         "match_s": seconds(lambda: net.matcher.match(left, right), device),
         "memory_mb": memory / 1e6,
         "draw_gflop": drawing / 1e9,

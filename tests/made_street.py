@@ -6,6 +6,7 @@ x right, y down, z forward, metres, origin at the left camera.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int64
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.files import write_disparity_png, write_image
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
 
@@ -276,3 +278,23 @@ def _hash(cell: Int64[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     for factor in (0x2545F491, 0x6C8E9CF5):
         mixed = ((mixed ^ (mixed >> 15)) * factor) & 0x7FFFFFFF
     return (mixed ^ (mixed >> 13)).double() / 0x7FFFFFFF
+
+
+def write_pairs(home: Path, scales: tuple[float, ...]) -> Path:
+    """Write a plain folder of pairs with disparity, one for each scale; give the folder."""
+    lines = []
+    for number, scale in enumerate(scales):
+        street = make_street(scale)
+        rig, truth = street.input.camera, street.truth.disparity_px
+        assert isinstance(rig, StereoRig)
+        assert street.input.right is not None
+        assert truth is not None
+        name = f"{number:02d}"
+        write_image(home / "left" / f"{name}.png", street.input.left)
+        write_image(home / "right" / f"{name}.png", street.input.right)
+        write_disparity_png(home / "disp_occ" / f"{name}.png", truth)
+        numbers = [rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m]
+        values = " ".join(str(float(n)) for n in numbers)
+        lines.append(f"{name} {rig.width} {rig.height} {values}")
+    (home / "calib.txt").write_text("\n".join(lines) + "\n")
+    return home

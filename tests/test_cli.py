@@ -164,6 +164,26 @@ def test_one_broken_pair_does_not_stop_the_others(
     assert not (tmp_path / "out/b.disparity_px.npy").exists()
 
 
+def test_without_bf16_one_line_is_said_and_the_record_says_fp32(
+    pair_folder: Path, tmp_path: Path
+) -> None:
+    code = (
+        "import sys; from depthpose.core import devices; from depthpose.cli import main; "
+        "devices.computes_bf16 = lambda _: False; sys.exit(main(sys.argv[1:]))"
+    )
+    one = [str(pair_folder / side / "a.png") for side in ("left", "right")]
+    words = ["depth", "match", *one, "--camera", str(pair_folder / "cam.json"), "--out"]
+    words += [str(tmp_path / "o"), "--weights", "default", "--precision", "bf16"]
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines() == [
+        "depthpose: this processor has no arithmetic for bf16 (AVX-512, AMX); fp32 is taken in its "
+        "place"
+    ]
+    assert json.loads((tmp_path / "o" / "run.json").read_text())["settings"]["precision"] == "fp32"
+
+
 def test_options_of_psmnet_are_refused_with_sgbm(
     pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
+from depthpose.depth.kitti import open_dataset, read_split
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
@@ -16,6 +17,25 @@ from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewT
 
 FOLDER = Path(__file__).parents[1] / "configs" / "depth"
 FILES = sorted(FOLDER.glob("*.yaml"))
+
+
+WHOLLY_KEPT_BACK = ("kitti2015_eval_drives", "kitti_raw_0056")
+"""Folders of samples whose frames are all of Eigen test drives."""
+KEPT_BACK = {
+    "kitti_object": ("000001", "000002", "000050", "001207", "001267", "001531", "001554"),
+    "kitti_object_more": (
+        "train_000007",
+        "train_000008",
+        "train_000009",
+        "train_000010",
+        "train_000013",
+    ),
+    "kitti_raw": (
+        *(f"2011_09_26_drive_9001_sync_{k:010d}" for k in (0, 1)),
+        *(f"2011_09_26_drive_0052_sync_{k:010d}" for k in (0, 4, 8, 12, 16, 20, 26, 30)),
+    ),
+}
+"""Frames of Eigen test drives beside others: no training may see them."""
 
 
 def stage_of(path: Path) -> str:
@@ -29,6 +49,35 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
     command = f"depthpose depth train {stage_of(path)} --config configs/depth/{path.name}"
     assert any(command in line for line in head)
     assert re.search("[Ww]all time|Published result|compact generator through", "\n".join(head))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_training_sees_a_frame_of_a_test_drive(path: Path) -> None:
+    config = read_config(path, STAGES[stage_of(path)][0])
+    for pairs in filter(None, (config.pairs, config.held_out)):
+        for folder in pairs.folders:
+            name = Path(folder).name
+            assert name not in WHOLLY_KEPT_BACK
+            assert set(KEPT_BACK.get(name, ())) <= set(pairs.exclude)
+
+
+@pytest.mark.data
+def test_the_frames_that_are_kept_back_are_those_of_the_samples(real: Path) -> None:
+    """A frame of another name would be left out of nothing."""
+    homes = {"kitti_object": "kitti_object", "kitti_raw": "kitti_raw"}
+    for name, frames in KEPT_BACK.items():
+        dataset = open_dataset(real / "depth" / homes.get(name, f"street_pairs/{name}"))
+        assert set(frames) <= {frame.name for frame in dataset.frames}
+    drives = {drive for drive, _ in read_split("eigen-test").frames}
+    for name in WHOLLY_KEPT_BACK:
+        assert _drives(real / "depth/street_pairs" / name / "index.txt") <= drives
+    seen = _drives(real / "depth/street_pairs/kitti2015_train_drives/index.txt")
+    assert len(seen) == 14
+    assert not seen & drives
+
+
+def _drives(index: Path) -> set[str]:
+    return set(re.findall(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync", index.read_text()))
 
 
 @pytest.mark.parametrize("name", ["view", "stereo", "finetune"])

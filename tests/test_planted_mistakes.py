@@ -13,7 +13,14 @@ from PIL import Image
 from tests.core.test_camera_rectified import pair
 from tests.pose.made_object import K, bracket, cloud_of, pose_at, view_of
 
-from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
+from depthpose.core.arrays import check_image
+from depthpose.core.camera import (
+    Camera,
+    StereoRig,
+    check_image_matches_camera,
+    read_camera,
+    suspicious_centre,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.depth.disparity import disparity_advice, disparity_from_depth
@@ -33,6 +40,7 @@ CAMERA: dict[str, Any] = {
     "depth_unit_m": 0.001,
 }
 SIZE = (640, 480)
+KITTI_K = [[721.5377, 0.0, 609.5593], [0.0, 721.5377, 172.854], [0.0, 0.0, 1.0]]
 PART = bracket()
 POSE = pose_at()
 
@@ -52,6 +60,12 @@ def camera(folder: Path, text: str = "", **changes: object) -> Camera:
     path = folder / "camera"
     path.write_text(text or json.dumps({**CAMERA, **changes}))
     return read_camera(path, SIZE)
+
+
+def doubts(K: list[list[float]], width: int, height: int) -> str | None:
+    """What the doctor says of a camera that names its size."""
+    matrix = torch.tensor(K, dtype=torch.float64)
+    return suspicious_centre(Camera(width=width, height=height, K=matrix))
 
 
 @cache
@@ -160,6 +174,21 @@ MISTAKES: dict[str, tuple[Work, Work, str]] = {
         lambda folder: camera(folder, "1000 1000 500 370"),
         lambda folder: camera(folder, "500 500 325 235"),
         "K looks like that of about 994x746. Multiply fx, fy, cx and cy by 0.644, or take the im",
+    ),
+    "K of KITTI's full size with a half-size image": (
+        lambda _: doubts(KITTI_K, 621, 188),
+        lambda _: doubts(KITTI_K, 1242, 375),
+        "K looks like that of about 1183x358. Multiply fx, fy, cx and cy by 0.525, or take the im",
+    ),
+    "principal point far off the centre": (
+        lambda _: doubts([[500, 0, 560], [0, 500, 240], [0, 0, 1]], 640, 480),
+        lambda _: doubts([[500, 0, 470], [0, 500, 240], [0, 0, 1]], 640, 480),
+        "lies at 88% of the width and 50% of the height of 640x480, more than a quarter off",
+    ),
+    "picture of 0 to 255 as floats": (
+        lambda _: check_image(255 * torch.rand(3, 9, 9), "street.png"),
+        lambda _: said_by(lambda: check_image(torch.rand(3, 9, 9), "street.png")),
+        "divide 8-bit values by 255",
     ),
     "camera of another size": (
         lambda folder: check_image_matches_camera(camera(folder), 1280, 960, "left.png"),

@@ -63,11 +63,12 @@ def weights(task: ToyTask) -> dict[str, Tensor]:
     return {f"{n}.{k}": t for n, m in task.modules.items() for k, t in m.state_dict().items()}
 
 
-def save_slowly(state: object, path: Path) -> None:
-    """Stand in for ``torch.save`` on a slow disk: a half file for a long time."""
-    del state
-    path.write_bytes(b"half")
-    time.sleep(60)
+def write_slowly(path: Path, data: bytes) -> None:
+    """Stand in for a slow disk: half a state for a long time."""
+    with path.open("wb") as file:
+        file.write(data[: len(data) // 2])
+        file.flush()
+        time.sleep(60)
 
 
 if __name__ == "__main__":
@@ -81,6 +82,6 @@ if __name__ == "__main__":
         device="cpu",
     )
     if sys.argv[6:] == ["slow disk"]:
-        torch.save = save_slowly
+        Path.write_bytes = write_slowly  # pyright: ignore[reportAttributeAccessIssue]
     toy = ToyTask(pause_s)
     train(toy, ToySamples(), config, folder, resume=True)

@@ -1,5 +1,6 @@
 import errno
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -115,3 +116,79 @@ def test_a_killed_writer_never_leaves_half_a_file(tmp_path: Path, delay_s: float
     content = target.read_bytes()
     assert len(content) == 10_000_000
     assert len(set(content)) == 1
+
+
+FULL_DISK = """
+import resource, signal, sys
+from dataclasses import dataclass
+from pathlib import Path
+import torch
+from onnx import helper, numpy_helper
+from depthpose.core.checkpoint import Checkpoint, save_checkpoint
+from depthpose.core.config import write_config
+from depthpose.core.errors import InputError
+from depthpose.core.export.freeze import Export, freeze
+from depthpose.core.files import (
+    Cloud, write_cloud, write_depth_png, write_image, write_map, write_video
+)
+from depthpose.core.loop import Journal
+from depthpose.core.loop.state import write_state
+from depthpose.core.report import Section, write_page, write_table
+from depthpose.core.run import claim_folder
+
+@dataclass(frozen=True)
+class Knobs:
+    text: str = 200_000 * "x"
+
+class Heavy:
+    def model(self, facts):
+        held = numpy_helper.from_array(noise["a"].numpy(), "a")
+        return helper.make_model(helper.make_graph([], "g", [], [], [held]))
+
+def log_for_ever(folder):
+    folder.mkdir(parents=True)
+    journal = Journal(folder, is_writer=True)
+    journal.open(0)
+    while True:
+        journal.log(1, {2_000 * "x": 1.0})
+
+root, noise, long = Path(sys.argv[1]), {"a": torch.randn(100_000)}, "x" * 200_000
+images = [torch.rand(3, 300, 300) for _ in range(9)]
+weights = Checkpoint(kind="k", config={}, state=noise)
+graph = Export(graph=Heavy, cases=list, limits={}, facts={})
+writers = {
+    "weights": lambda p: save_checkpoint(p / "w.safetensors", weights),
+    "state": lambda p: write_state(p, noise, keeps_last=True),
+    "run record": lambda p: claim_folder(p, {"a": long}),
+    "config": lambda p: write_config(p / "c.yaml", Knobs()),
+    "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),
+    "table": lambda p: write_table(p, [{"a": long}]),
+    "cloud": lambda p: write_cloud(p / "c.ply", Cloud(points=torch.rand(50_000, 3))),
+    "map": lambda p: write_map(p / "m.npy", images[0][0].repeat(2, 2)),
+    "picture": lambda p: write_image(p / "p.png", images[0]),
+    "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),
+    "avi": lambda p: write_video(p / "v.avi", images, 10.0),
+    "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
+    "graph": lambda p: freeze(p / "g.onnx", graph),
+    "journal": log_for_ever,
+}
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # what a full disk does, sooner
+for name, write in writers.items():
+    try:
+        write(root / name)
+        print(f"{name}: wrote it")
+    except InputError as error:
+        left = [path.name for path in root.rglob("*") if path.is_file()]
+        print(f"{name}: {error}; left: {left}")
+"""
+
+
+def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    *lines, of_journal = done.stdout.splitlines()
+    assert len(lines) == 13
+    for line in lines:
+        assert re.search(r"(cannot be written: File too large|disk is full).*left: \[\]$", line)
+    assert "metrics.jsonl: cannot be written: File too large" in of_journal

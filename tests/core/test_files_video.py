@@ -55,7 +55,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     [
         ("v.mov", moving_square(1), 10.0, r"\.mov is no writable video format; use \.mp4, \.avi"),
         ("v.mp4", moving_square(1), 0.0, "fps is 0, but a video has a positive rate"),
-        ("v.mp4", [], 10.0, "wrote nothing of 0 frames"),
+        ("v.mp4", [], 10.0, "wrote 0 of 0 frames"),
         ("v.mp4", moving_square(1) + moving_square(1, 80), 10.0, "frame 1 is 80x48, but the first"),
     ],
 )

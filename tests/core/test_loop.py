@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +15,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tests.core.loop_task import ToySamples, ToyTask, weights
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.devices import PrecisionNotice, computes_bf16
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import (
     AdamConfig,
     Evidence,
@@ -56,18 +59,26 @@ def assert_same_state(*folders: Path) -> None:
         assert_equal(one[network], other[network])
 
 
-def interrupted(folder: Path, config: LoopConfig, after: int) -> None:
+def interrupted(folder: Path, config: LoopConfig, after: int, **words: object) -> None:
     def stop(progress: Progress) -> None:
         if progress.step == after:
             os.kill(os.getpid(), signal.SIGTERM)
 
     with pytest.raises(Interrupted, match=r"stopped after step"):
-        trained(folder, config, on_step=stop)
+        trained(folder, config, on_step=stop, **words)
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"ema_decay": 0.9}, {"accumulate": 2, "clip_norm": 0.1}, {"precision": "bf16"}],
+    [
+        {},
+        {"ema_decay": 0.9},
+        {"accumulate": 2, "clip_norm": 0.1},
+        pytest.param(
+            {"precision": "bf16"},
+            marks=pytest.mark.skipif(not computes_bf16("cpu"), reason="no arithmetic for bf16"),
+        ),
+    ],
 )
 def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, changes: dict[str, object]
@@ -81,6 +92,16 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
         for name in ("whole", "parts")
     )
     assert one == other
+
+
+def test_a_training_without_bf16_is_one_in_fp32_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = trained(tmp_path / "fp32", loop())
+    monkeypatch.setattr("depthpose.core.devices.computes_bf16", lambda _: False)
+    with pytest.warns(PrecisionNotice, match=r"no arithmetic for bf16 .*; fp32 is taken"):
+        task = trained(tmp_path / "bf16", loop(precision="bf16"))
+    assert_equal(weights(exact), weights(task))
 
 
 def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) -> None:
@@ -160,6 +181,39 @@ def test_lines_after_the_state_are_dropped_on_resume(tmp_path: Path) -> None:
     assert steps == list(range(1, 13))
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "[1]",
+        "null",
+        '{"loss": 1.0}',
+        '{"step": "1"}',
+        '{"step": 1.5}',
+        '{"step": true}',
+        '{"step": 2, "loss": "low"}',
+        '{"step": 2, "loss": null}',
+        '{"step": 2, "loss": 1' + "0" * 400 + "}",
+        '{"step": 2, "loss": 1' + "0" * 5000 + "}",
+        "[" * 100_000,
+        '{"step": 1',
+    ],
+)
+def test_a_damaged_line_of_metrics_is_named(tmp_path: Path, line: str) -> None:
+    good = '{"step": 1, "loss": NaN}\n'
+    (tmp_path / "metrics.jsonl").write_text(f"{good}{line}\n{good}")
+    with pytest.raises(InputError, match=r"metrics\.jsonl: line 2 is no step .*Delete that line"):
+        read_metrics(tmp_path)
+    (tmp_path / "metrics.jsonl").write_text(good + line)  # a kill cuts the last one short
+    assert [row["step"] for row in read_metrics(tmp_path)] == [1]
+
+
+def test_metrics_that_are_no_text_are_named(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_bytes(b"\xff\xfe\n")
+    with pytest.raises(InputError, match=r"metrics\.jsonl: not UTF-8 text"):
+        read_metrics(tmp_path)
+
+
 def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
     path: list[Tensor] = []
     task = ToyTask()
@@ -205,15 +259,115 @@ def test_a_full_disk_keeps_the_last_state(tmp_path: Path, monkeypatch: pytest.Mo
     trained(tmp_path, loop(steps=4))
     before = (tmp_path / "state.pt").read_bytes()
 
-    def refuse(state: object, path: Path) -> None:
-        path.write_bytes(b"half")
+    def refuse(path: Path, _: bytes) -> None:
+        path.touch()
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(torch, "save", refuse)
+    monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(InputError, match="No space left"):
         trained(tmp_path, loop(steps=8), resume=True)
     assert (tmp_path / "state.pt").read_bytes() == before
     assert not list(tmp_path.glob(".part-*"))
+
+
+def step_of(state: Path) -> int:
+    return torch.load(state, weights_only=True)["step"]
+
+
+def test_the_last_two_states_are_kept(tmp_path: Path) -> None:
+    trained(tmp_path, loop())
+    assert step_of(tmp_path / "state.pt") == 12
+    assert step_of(tmp_path / "state.before.pt") == 8
+
+
+def flipped(state: Path) -> bytes:
+    """Flip one bit of a weight, over which torch reads in silence."""
+    data = bytearray(state.read_bytes())
+    weight = torch.load(state, weights_only=True)["modules"]["regressor"]["0.weight"]
+    data[data.index(weight.numpy().tobytes())] ^= 4
+    return bytes(data)
+
+
+DAMAGES: dict[str, Callable[[Path], bytes]] = {
+    "cut": lambda state: state.read_bytes()[:-100],
+    "empty": lambda _: b"",
+    "flipped": flipped,
+    "text": lambda _: b"no state",
+}
+
+
+@pytest.mark.parametrize("damage", [*DAMAGES, "gone"])
+def test_a_damaged_state_falls_back_to_the_one_before_with_a_line(
+    tmp_path: Path, damage: str
+) -> None:
+    whole = trained(tmp_path / "whole", loop())
+    interrupted(tmp_path / "parts", loop(), after=5)
+    last, before = (tmp_path / "parts" / name for name in ("state.pt", "state.before.pt"))
+    assert (step_of(last), step_of(before)) == (6, 4)
+    if damage == "gone":
+        last.unlink()
+    else:
+        last.write_bytes(DAMAGES[damage](last))  # the other name keeps its own bytes
+    with pytest.warns(Notice, match=r"goes on from state\.before\.pt, step 4") as said:
+        interrupted(tmp_path / "parts", loop(), after=5, resume=True)
+    assert "\n" not in str(said[0].message)
+    # What was damaged is gone, and the state that held is still there.
+    assert (step_of(last), step_of(before)) == (6, 4)
+    parts = trained(tmp_path / "parts", loop(), resume=True)
+    assert_equal(weights(whole), weights(parts))
+    assert (step_of(last), step_of(before)) == (12, 8)
+
+
+def test_a_disk_without_links_keeps_two_states_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(os, "link", refuse)
+    trained(tmp_path, loop())
+    assert (step_of(tmp_path / "state.pt"), step_of(tmp_path / "state.before.pt")) == (12, 8)
+
+
+def wider(state: dict[str, Any]) -> None:
+    state["modules"]["judge"]["weight"] = torch.zeros(1, 2)
+
+
+def moved(state: dict[str, Any]) -> None:
+    state["optimizers"]["judge"]["state"][0]["exp_avg"] = torch.zeros(7)
+
+
+def grouped(state: dict[str, Any]) -> None:
+    state["optimizers"]["judge"]["param_groups"][0]["params"] = [0]
+
+
+def averaged(state: dict[str, Any]) -> None:
+    state["average"]["judge"]["bias"] = torch.zeros(())
+
+
+UNFIT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "shape": (wider, r"judge: weight is \(1, 2\), not \(1, 1\); it is the state of another one"),
+    "optimiser": (moved, r"optimiser of judge: exp_avg of parameter 0 is \(7,\), not \(1, 1\)"),
+    "groups": (grouped, r"optimiser of judge: it moved groups of \[1\] parameters, not of \[2\]"),
+    "average": (averaged, r"average of judge: bias is \(\), not \(1,\)"),
+    "no module": (lambda s: s["modules"].pop("judge"), "not a readable state of this training"),
+    "no tensor": (lambda s: s["modules"]["judge"].pop("bias"), "judge: bias is missing"),
+    "no scaler": (lambda s: s.pop("scaler"), r"has no \['scaler'\], so it is no state"),
+    "step": (lambda s: s.update(step="x"), "its step is 'x', where a whole number belongs"),
+    "seconds": (lambda s: s.update(seconds=[]), "not a readable state of this training"),
+    "list": (lambda s: s.update(modules=[]), "not a readable state of this training"),
+}
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_the_state_of_another_training_is_explained(tmp_path: Path, name: str) -> None:
+    trained(tmp_path, loop(steps=2, ema_decay=0.9))
+    change, message = UNFIT[name]
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    change(state)
+    torch.save(state, tmp_path / "state.pt")
+    with pytest.raises(InputError, match=rf"state\.pt: .*{message}.*no state is left to go on"):
+        trained(tmp_path, loop(steps=2, ema_decay=0.9), resume=True)
 
 
 def test_a_loss_that_is_not_finite_stops_with_advice(tmp_path: Path) -> None:

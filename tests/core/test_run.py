@@ -33,6 +33,12 @@ def test_a_new_setting_counts_as_another(tmp_path: Path) -> None:
         claim_folder(tmp_path, {"a": 1, "b": 2})
 
 
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(InputError, match=r"out/run\.json: cannot be written"):
+        claim_folder(tmp_path / "out", {"a": 1})
+
+
 def test_a_folder_of_others_has_no_settings(tmp_path: Path) -> None:
     assert read_settings(tmp_path) is None
 

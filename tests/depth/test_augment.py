@@ -1,4 +1,6 @@
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 from tests.made_street import make_street
 from torch import Tensor
 
+from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import (
     TrainingPair,
@@ -14,10 +17,11 @@ from depthpose.depth.augment import (
     crop_pair,
     flip_and_swap,
     jitter_colors,
+    pad_pair,
     scale_pair,
 )
 from depthpose.depth.config import AugmentConfig
-from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.disparity import right_disparity_from_left, warp_right_to_left
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -47,12 +51,12 @@ def test_flip_and_swap_keeps_every_disparity(disparity_px: int) -> None:
     assert torch.equal(flipped.left_px, pair.right_px.flip(-1))
     assert photometric_error(flipped, flipped.left_px) < 1e-6
     for one, other in zip(flip_and_swap(flipped), pair, strict=True):
-        assert torch.equal(one, other)
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 
 
 def test_a_flip_without_a_swap_would_break_the_pair() -> None:
     pair = plane_pair(8)
-    broken = TrainingPair(*(part.flip(-1) for part in pair))
+    broken = TrainingPair(*(part.flip(-1) for part in pair[:4]))
     assert photometric_error(broken, broken.left_px) > 0.02
 
 
@@ -74,7 +78,7 @@ def test_flip_and_swap_of_a_street_keeps_left_and_right_consistent() -> None:
 @given(st.floats(0.4, 2.0), st.integers(1, 12))
 def test_scaling_scales_disparity_by_the_ratio_of_the_widths(scale: float, px: int) -> None:
     pair = plane_pair(px)
-    scaled = scale_pair(pair, scale, (1, 1))
+    scaled = scale_pair(pair, scale)
     ratio = scaled.left.shape[-1] / 120
     assert scaled.left_px.unique().tolist() == pytest.approx([px * ratio])
     assert abs(ratio - scale) <= 0.5 / 120 + 1e-9
@@ -84,15 +88,91 @@ def test_scaling_scales_disparity_by_the_ratio_of_the_widths(scale: float, px: i
 def test_scaling_never_mixes_known_with_unknown() -> None:
     pair = plane_pair(4)
     pair.left_px[::2] = torch.nan
-    scaled = scale_pair(pair, 0.7, (1, 1))
+    scaled = scale_pair(pair, 0.7)
     known = scaled.left_px[~scaled.left_px.isnan()]
     assert known.unique().tolist() == pytest.approx([4 * 84 / 120])
 
 
-def test_small_images_grow_to_the_crop() -> None:
-    scaled = scale_pair(plane_pair(4), 1.0, (80, 200))
-    assert scaled.left.shape[-2] >= 80
-    assert scaled.left.shape[-1] >= 200
+BASELINE_M = 0.5
+
+
+@functools.cache
+def street_pair() -> TrainingPair:
+    """A street whose depth is known exactly, with the focal length of its rig."""
+    street = make_street(0.2)
+    rig, truth = street.input.camera, street.truth
+    assert street.input.right is not None
+    assert isinstance(rig, StereoRig)
+    assert truth.disparity_px is not None
+    right_px = right_disparity_from_left(truth.disparity_px)
+    focal_px = rig.K[0, 0].float()
+    return TrainingPair(
+        street.input.left, street.input.right, truth.disparity_px, right_px, focal_px
+    )
+
+
+def depths_m(pair: TrainingPair) -> Tensor:
+    """Depth of all pixels of the left view that have truth, as one row."""
+    depth_m = pair.focal_px * BASELINE_M / pair.left_px
+    return depth_m[torch.isfinite(depth_m)]
+
+
+CHANGES: dict[str, Callable[[TrainingPair, torch.Generator], TrainingPair]] = {
+    "scaled": lambda pair, drawn: scale_pair(pair, 0.5 + float(torch.rand((), generator=drawn))),
+    "cropped": lambda pair, drawn: crop_pair(pair, (60, 150), drawn),
+    "flipped twice": lambda pair, _: flip_and_swap(flip_and_swap(pair)),
+    "recoloured": lambda pair, drawn: jitter_colors(pair, 0.3, drawn),
+    "padded": lambda pair, _: pad_pair(pair, (90, 300)),
+    "all, crop too wide": lambda pair, drawn: augment(
+        pair, AugmentConfig(crop_px=(60, 300), scale=(0.8, 1.3), flip_share=0.0), drawn
+    ),
+    "all, crop too high": lambda pair, drawn: augment(
+        pair, AugmentConfig(crop_px=(120, 100), scale=(0.8, 1.3), flip_share=0.0), drawn
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_stays_what_it_was(change: str, seed: int) -> None:
+    """Each depth after a change is one of before, and the views still agree with it."""
+    pair = street_pair()
+    changed = CHANGES[change](pair, generator(seed))
+    before, after = depths_m(pair).sort().values, depths_m(changed)
+    assert len(after) > 0.1 * len(before)
+    place = torch.searchsorted(before, after).clamp(1, len(before) - 1)
+    nearest = torch.minimum((before[place] - after).abs(), (before[place - 1] - after).abs())
+    assert float((nearest / after).max()) < 1e-5
+    error = (warp_right_to_left(changed.right, changed.left_px) - changed.left).abs()
+    assert float(error.nanmedian()) < 0.05
+
+
+def test_a_flip_keeps_the_depths_of_the_other_view() -> None:
+    pair = street_pair()
+    flipped = flip_and_swap(pair)
+    mirrored = pair._replace(left_px=pair.right_px)
+    assert torch.equal(depths_m(flipped).sort().values, depths_m(mirrored).sort().values)
+    assert torch.equal(flip_and_swap(flipped).focal_px, pair.focal_px)
+
+
+def test_a_pair_narrower_than_the_crop_keeps_its_focal_length() -> None:
+    """It is padded; enlarged to the crop it would have another focal length, and be cut."""
+    pair = street_pair()
+    height, width = pair.left.shape[-2:]
+    config = AugmentConfig(crop_px=(height, width + 70), jitter=0.0, flip_share=0.0)
+    made = augment(pair, config, generator())
+    assert torch.equal(made.focal_px, pair.focal_px)
+    torch.testing.assert_close(made.left[..., :width], pair.left)
+    torch.testing.assert_close(made.right[..., :width], pair.right)
+    assert float(made.left[..., width:].abs().max()) == 0
+    assert bool(made.left_px[:, width:].isnan().all())
+    assert bool(made.right_px[:, width:].isnan().all())
+
+
+def test_a_crop_that_would_be_mostly_black_is_refused() -> None:
+    with pytest.raises(InputError, match=r"40x120 .* less than half of a crop of 40x241"):
+        augment(plane_pair(), AugmentConfig(crop_px=(40, 241)), generator())
+    assert augment(plane_pair(), AugmentConfig(crop_px=(80, 240)), generator()).left.shape[1] == 80
 
 
 def test_a_crop_keeps_columns_together() -> None:

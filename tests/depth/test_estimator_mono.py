@@ -1,7 +1,9 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
+import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -10,12 +12,14 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
+from depthpose.depth.estimator.inputs import as_tensor
+from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import Synthesiser, UNetGenerator
-from depthpose.depth.types import StereoInput
+from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
+from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.weights import write_depth_weights
 
 FOCAL_PX, BASELINE_M = 120.0, 0.5
@@ -46,7 +50,7 @@ def by_brightness(left: Tensor, _: Tensor) -> Tensor:
 
 
 def test_depth_is_virtual_focal_times_baseline_over_disparity(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image = torch.full((3, 40, 60), 0.5)
     estimate = net.estimate(image, camera(60, 40, FOCAL_PX))
     assert estimate.depth_m is not None
@@ -61,7 +65,7 @@ def test_depth_is_virtual_focal_times_baseline_over_disparity(generator: UNetGen
 def test_another_size_of_the_same_view_gives_the_same_metres(
     generator: UNetGenerator, scale: float
 ) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     ramp = torch.linspace(0.2, 0.8, 120)[None, None].expand(3, 80, 120)
     width, height = round(120 * scale), round(80 * scale)
     whole = net.estimate(ramp, camera(120, 80, 2 * FOCAL_PX)).depth_m
@@ -74,7 +78,7 @@ def test_another_size_of_the_same_view_gives_the_same_metres(
 
 
 def test_the_users_baseline_changes_disparity_and_no_metre(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     image = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
     rig = camera(60, 40, 90.0, baseline_m=0.1)
     assert isinstance(rig, StereoRig)
@@ -89,7 +93,7 @@ def test_the_users_baseline_changes_disparity_and_no_metre(generator: UNetGenera
 
 
 def test_one_image_needs_a_focal_length(generator: UNetGenerator) -> None:
-    net = FakestereoNet(CallableMatcher(by_brightness), Synthesiser(generator))
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
     with pytest.raises(InputError, match="metres from one image need its focal length"):
         net.estimate(torch.rand(3, 8, 8), None)
 
@@ -204,3 +208,138 @@ def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_pa
         assert alone.right is not None
         torch.testing.assert_close(together.right, alone.right, rtol=1e-4, atol=1e-5)
     assert net.estimate_many([]) == []
+
+
+def test_among_many_a_pair_is_matched_with_its_right_view(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    path = tmp_path / "both.safetensors"
+    write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
+    net = FakestereoNet.load(path)
+    left, right = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(0))
+    rig = camera(60, 40, 100.0, baseline_m=0.2)
+    alone = StereoInput(name="alone", left=left, right=None, camera=rig)
+    pair = StereoInput(name="pair", left=left, right=right, camera=rig)
+    many = net.estimate_many([alone, pair, pair, alone])
+    for given, found in zip([alone, pair, pair, alone], many, strict=True):
+        one = net.estimate_pair(given)
+        torch.testing.assert_close(found.disparity_px, one.disparity_px, rtol=1e-4, atol=1e-4)
+        assert (found.right is None) == (given.right is not None)
+
+
+@pytest.mark.parametrize("with_right", [False, True])
+def test_values_that_are_no_picture_are_refused(
+    generator: UNetGenerator, *, with_right: bool
+) -> None:
+    """An 8-bit picture as float gave metres: of the white that is left where all is above 1."""
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    image, rig = torch.rand(3, 40, 60), camera(60, 40, 100.0, baseline_m=0.2)
+    broken = {
+        r"must lie in \[0, 1\], got .*; divide 8-bit values by 255": (image * 255).round(),
+        r"must lie in \[0, 1\].*do not normalise": 2 * image - 1,
+        r"holds NaN": torch.where(image > 0.5, image, torch.nan),
+    }
+    for message, given in broken.items():
+        sees = StereoInput(
+            name="street", left=given, right=given.flip(-1) if with_right else None, camera=rig
+        )
+        for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+            with pytest.raises(InputError, match="street: the .*" + message):
+                estimate(sees)
+    slightly_above = image * 1.2 - 0.1  # as bicubic resizing leaves it
+    assert net.estimate(slightly_above, rig).depth_m is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.zeros((40, 60, 4), np.uint8), r"array of shape \(40, 60, 4\); give 8-bit RGB"),
+        (np.zeros((40, 60), np.uint8), r"array of shape \(40, 60\); give 8-bit RGB"),
+        (np.zeros((40, 60, 3), np.float32), "array of float32; give 8-bit RGB"),
+        (torch.zeros(4, 40, 60), r"must have shape \(3, H, W\), got \(4, 40, 60\)"),
+        (torch.zeros(3, 40, 60, dtype=torch.uint8), "must be float in"),
+        (torch.full((3, 40, 60), 127.0), "divide 8-bit values by 255"),
+        (None, "must be a tensor, got NoneType"),
+    ],
+)
+def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        as_tensor(given)
+
+
+SELECTION = SelectionConfig(
+    encoder_width=0.1,
+    widths=(4, 4, 4, 4),
+    planes=4,
+    disparity_px=(1.0, 8.0),
+    virtual_focal_px=FOCAL_PX,
+    virtual_baseline_m=BASELINE_M,
+)
+
+
+def sure_of(plane: int, answer: str = "own") -> SelectionGenerator:
+    """A network that says the same class of each pixel of both views: 0 is the sky, k a plane."""
+    config = dataclasses.replace(SELECTION, answer=answer)
+    network = SelectionGenerator(config).eval()
+    torch.nn.init.zeros_(network.head.weight)
+    with torch.no_grad():
+        network.head.bias.copy_(
+            20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
+        )
+    return network
+
+
+def constant_matcher(disparity_px: float) -> CallableMatcher:
+    return CallableMatcher(lambda left, _: torch.full(left.shape[1:], disparity_px))
+
+
+def test_the_selecting_generator_answers_depth_itself() -> None:
+    """Plane 3 is 4 px: no matcher is asked, and the drawn view is the image moved by 4 px."""
+    never = CallableMatcher(lambda _, __: pytest.fail("the matcher was asked"))
+    net = FakestereoNet(never, make_synthesiser(sure_of(3)))
+    image = torch.rand(3, 64, 96, generator=torch.Generator().manual_seed(0))
+    found = net.estimate(image, camera(96, 64, FOCAL_PX))
+    assert found.depth_m is not None
+    torch.testing.assert_close(
+        found.depth_m, torch.full((64, 96), FOCAL_PX * BASELINE_M / 4), rtol=1e-4, atol=0
+    )
+    assert found.right is not None
+    torch.testing.assert_close(found.right[..., :-4], image[..., 4:], rtol=0, atol=1e-3)
+    assert found.confidence is not None
+    assert float(found.confidence.min()) > 0.99
+    assert found.is_sky is not None
+    assert not bool(found.is_sky.any())
+
+
+@pytest.mark.parametrize("baseline_m", [None, 0.1])
+def test_the_sky_has_no_depth_and_a_disparity_next_to_nothing(baseline_m: float | None) -> None:
+    net = FakestereoNet(constant_matcher(3.0), make_synthesiser(sure_of(0)))
+    found = net.estimate(torch.rand(3, 64, 96), camera(96, 64, 2 * FOCAL_PX, baseline_m))
+    assert found.is_sky is not None
+    assert bool(found.is_sky.all())
+    assert found.depth_m is not None
+    assert bool(found.depth_m.isnan().all())
+    rig_m = BASELINE_M if baseline_m is None else baseline_m
+    expected = torch.full((64, 96), 2 * FOCAL_PX * rig_m / 10_000)
+    torch.testing.assert_close(found.disparity_px, expected, rtol=1e-4, atol=0)
+    assert found.confidence is not None
+    assert float(found.confidence.min()) > 0.99
+
+
+def test_the_matcher_and_both_are_one_word_away() -> None:
+    """A matcher without confidence adds nothing to the join; one that is as sure, the mean log."""
+    image, seen = torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX)
+    found = {
+        answer: FakestereoNet(constant_matcher(2.0), make_synthesiser(sure_of(3, answer)))
+        .estimate(image, seen)
+        .disparity_px.mean()
+        .item()
+        for answer in ("own", "matched", "joined")
+    }
+    assert found == pytest.approx({"own": 4.0, "matched": 2.0, "joined": 4.0}, rel=1e-3)
+    own = Match(disparity_px=torch.full((1, 2), 4.0), confidence=torch.ones(1, 2))
+    other = Match(
+        disparity_px=torch.tensor([[1.0, torch.nan]]), confidence=torch.tensor([[1.0, 1.0]])
+    )
+    joined = join_matches(own, other)
+    assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)

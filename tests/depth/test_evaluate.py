@@ -97,6 +97,31 @@ def test_pixels_without_prediction_lower_the_coverage(pairs: Dataset, tmp_path: 
     assert row["epe_px"] == 0
 
 
+@pytest.mark.parametrize("nothing", [0.0, -3.0])
+def test_depth_of_zero_or_below_is_an_answer_and_a_wrong_one(
+    pairs: Dataset, tmp_path: Path, nothing: float
+) -> None:
+    """The published script clamps it to 0.001 m; left out, half a map scored as a whole one."""
+    for k, name in enumerate("abc"):
+        depth_m = 1.05 * depth_from_disparity(truth_px(k), rig())
+        spoilt_m = torch.where(torch.arange(W) < W // 2, nothing, depth_m)
+        write_map(tmp_path / "p" / f"{name}.depth_m.npy", spoilt_m)
+    for row in evaluate(pairs, tmp_path / "p", "eigen-improved").rows:
+        assert row["coverage"] == 1.0
+        assert row["abs_rel"] == pytest.approx((1 + 0.05) / 2, abs=2e-3)
+
+
+@pytest.mark.parametrize("protocol", ["eigen-improved", "eigen-improved-garg", "eigen-raw-camera"])
+def test_a_perfect_prediction_has_no_error_at_any_cap(
+    pairs: Dataset, tmp_path: Path, protocol: str
+) -> None:
+    """Truth beyond the cap does not count; counted, a clamped perfect prediction was wrong."""
+    folder = write_predictions(tmp_path / "p", lambda d: d)
+    rows = evaluate(pairs, folder, protocol, caps_m=(80.0, 15.0, 12.0)).rows
+    assert [row["abs_rel"] < 1e-3 for row in rows] == [True] * 3
+    assert rows[0]["pixels"] > rows[1]["pixels"] > rows[2]["pixels"]
+
+
 def test_a_frame_without_any_usable_pixel_is_said(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: torch.full_like(d, torch.nan))
     with pytest.raises(InputError, match="no pixel to compare"):

@@ -383,6 +383,13 @@ def test_a_bad_list_is_refused(text: str, message: str, tmp_path: Path) -> None:
         read_split(tmp_path / "s.txt")
 
 
+@pytest.mark.data
+def test_the_joined_list_of_others_is_recognised(real: Path, tmp_path: Path) -> None:
+    parts = [real / "depth/splits/eigen_full" / f"{name}_files.txt" for name in ("train", "val")]
+    write(tmp_path / "both.txt", "".join(part.read_text().rstrip() + "\n" for part in parts))
+    assert read_split(tmp_path / "both.txt").name == "eigen-train-val"
+
+
 def test_an_unknown_split_names_the_nearest() -> None:
     with pytest.raises(InputError, match="did you mean 'eigen-test'"):
         read_split("eigen_tst")

@@ -9,6 +9,9 @@ from depthpose.depth.losses import (
     disparity_loss,
     heads_loss,
     l1_loss,
+    log_disparity_loss,
+    plane_loss,
+    view_loss,
 )
 
 NAN = float("nan")
@@ -69,3 +72,46 @@ def test_no_truth_at_all_costs_nothing() -> None:
     loss = disparity_loss(found, torch.full((1, 1, 3), NAN), 96)
     loss.backward()
     assert float(loss.detach()) == 0
+
+
+def test_the_error_of_the_logarithm_counts_each_image_alike() -> None:
+    """Image 1 has one known pixel, off by a factor of e; image 2 has two, one off by e^2."""
+    truth = torch.tensor([[[2.0, NAN, 0.0]], [[2.0, 4.0, NAN]], [[NAN, NAN, 0.0]]])
+    found = torch.tensor([[[2.0, 9.0, 9.0]], [[2.0, 4.0, 9.0]], [[9.0, 9.0, 9.0]]]).log()
+    found[0, 0, 0] += 1
+    found[1, 0, 1] -= 2
+    assert float(log_disparity_loss(found, truth, (0.5, 50.0))) == pytest.approx((1 + 1) / 2)
+
+
+def test_truth_beyond_the_range_counts_as_its_end() -> None:
+    truth, found = torch.tensor([[[100.0]]]), torch.tensor([[[math.log(50.0)]]])
+    assert float(log_disparity_loss(found, truth, (0.5, 50.0))) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_cross_entropy_is_shared_between_two_planes() -> None:
+    planes = torch.tensor([1.0, 2.0, 4.0, 8.0])
+    shares = torch.tensor([0.1, 0.2, 0.3, 0.15, 0.25])  # sky, 1, 2, 4, 8 px
+    logits = shares.log()[None, :, None, None].expand(1, 5, 1, 4)
+    truth = torch.tensor([[[0.0, 2.0**1.5, NAN, 100.0]]])  # sky, between 2 and 4, unknown, far off
+    expected = [-math.log(0.1), -(math.log(0.3) + math.log(0.15)) / 2, -math.log(0.25)]
+    assert float(plane_loss(logits, truth, planes)) == pytest.approx(sum(expected) / 3, rel=1e-5)
+
+
+def test_a_view_that_is_right_costs_nothing() -> None:
+    views = torch.rand(2, 3, 4, 6, generator=torch.Generator().manual_seed(0))
+    assert view_loss(views, views).tolist() == [0.0, 0.0]
+    brighter = view_loss(views + 0.1, views)
+    torch.testing.assert_close(brighter, torch.full((2,), 0.1), rtol=1e-4, atol=0)
+
+
+def test_unknown_truth_gives_the_selecting_losses_no_nan() -> None:
+    truth = torch.tensor([[[NAN, 3.0]]])
+    found = torch.zeros(1, 1, 2, requires_grad=True)
+    logits = torch.zeros(1, 5, 1, 2, requires_grad=True)
+    loss = log_disparity_loss(found, truth, (0.5, 50.0))
+    loss = loss + plane_loss(logits, truth, torch.tensor([1.0, 2.0, 4.0, 8.0]))
+    loss.backward()
+    for part in (found, logits):
+        assert part.grad is not None
+        assert bool(part.grad.isfinite().all())
+        assert not bool(part.grad[..., 0].any())

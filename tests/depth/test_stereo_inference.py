@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import (
@@ -90,12 +91,24 @@ def test_slabs_of_any_height_give_one_answer_in_double_precision(rows: int) -> N
     assert float((disparity_px - expected_px).abs().max()) < 1e-9
 
 
+@pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
 def test_bf16_stays_near() -> None:
     network = random_network(SMALL)
     left, right = torch.rand(2, 3, 64, 96)
     found = PSMNetMatcher(network, MatcherConfig(precision="bf16")).match(left, right)
     assert found.disparity_px.dtype == torch.float32
     assert float((found.disparity_px - plain(network, left, right)).abs().mean()) < 0.3
+
+
+def test_without_bf16_fp32_is_taken_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("depthpose.core.devices.computes_bf16", lambda _: False)
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 64, 96)
+    with pytest.warns(PrecisionNotice, match=r"no arithmetic for bf16 .*; fp32 is taken"):
+        matcher = PSMNetMatcher(network, MatcherConfig(precision="bf16"))
+    assert matcher.config.precision == "fp32"
+    expected = PSMNetMatcher(network).match(left, right)
+    assert torch.equal(matcher.match(left, right).disparity_px, expected.disparity_px)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ NAN = float("nan")
         (GOOD - 1, GOOD, r"must lie in \[0, 1\], got -0.5"),
         (GOOD.to(torch.uint8), GOOD, "must be float in .*got torch.uint8; divide by 255"),
         (GOOD[0], GOOD, r"must have shape \(3, H, W\), got \(8, 10\)"),
-        (GOOD[None], GOOD, "match pairs one by one"),
+        (GOOD[None], GOOD, "give one image at a time"),
         (GOOD.permute(1, 2, 0), GOOD, "move channels first"),
         (torch.ones(4, 8, 10), GOOD, "drop alpha"),
         (GOOD.numpy(), GOOD, "left image must be a tensor, got ndarray"),

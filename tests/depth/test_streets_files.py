@@ -79,6 +79,7 @@ def test_one_date_has_one_calibration(tmp_path: Path) -> None:
             rig=frame.rig,
             disparity_px=frame.disparity_px,
             occluded=frame.occluded,
+            is_sky=frame.is_sky,
             points=None,
             camera_from_velodyne=camera_from_velodyne(),
         )

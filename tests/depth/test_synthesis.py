@@ -7,8 +7,8 @@ from depthpose.depth.config import GeneratorConfig
 from depthpose.depth.synthesis import (
     PatchDiscriminator,
     PixelDiscriminator,
-    Synthesiser,
     UNetGenerator,
+    make_synthesiser,
 )
 from depthpose.depth.synthesis.synthesiser import draw_right, pad_to_multiple
 
@@ -85,7 +85,7 @@ def test_sides_must_be_multiples() -> None:
 
 @pytest.mark.parametrize("size", [(16, 32), (5, 7), (1, 1), (33, 100)])
 def test_any_size_is_drawn_at_its_own_size(size: tuple[int, int]) -> None:
-    right = Synthesiser(small()).synthesise(torch.rand(1, 3, *size))[0]
+    right = make_synthesiser(small()).draw(torch.rand(1, 3, *size)).right[0]
     assert right.shape == (3, *size)
     assert float(right.min()) >= 0
     assert float(right.max()) <= 1
@@ -107,24 +107,24 @@ def test_drawing_is_differentiable_to_the_weights() -> None:
 
 
 def test_running_mode_is_deterministic_and_does_not_depend_on_neighbours() -> None:
-    drawer = Synthesiser(_warmed(small()))
+    drawer = make_synthesiser(_warmed(small()))
     one, other = torch.rand(2, 1, 3, 16, 32)
-    assert torch.equal(drawer.synthesise(one), drawer.synthesise(one))
-    both = drawer.synthesise(torch.cat([one, other]))
-    torch.testing.assert_close(both[:1], drawer.synthesise(one))
+    assert torch.equal(drawer.draw(one).right, drawer.draw(one).right)
+    both = drawer.draw(torch.cat([one, other])).right
+    torch.testing.assert_close(both[:1], drawer.draw(one).right)
 
 
 def test_batch_mode_uses_the_image_itself_and_keeps_the_statistics() -> None:
     network = _warmed(small(7, test_mode="batch"))
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    drawer = Synthesiser(network)
+    drawer = make_synthesiser(network)
     image = torch.rand(1, 3, 128, 256)
-    assert not torch.equal(drawer.synthesise(image), drawer.synthesise(image)), "dropout is on"
+    assert not torch.equal(drawer.draw(image).right, drawer.draw(image).right), "dropout is on"
     after = network.state_dict()
     assert before.keys() == after.keys()
     assert all(torch.equal(tensor, after[name]) for name, tensor in before.items())
-    running = Synthesiser(_warmed(small(7)))
-    assert not torch.equal(drawer.synthesise(image), running.synthesise(image))
+    running = make_synthesiser(_warmed(small(7)))
+    assert not torch.equal(drawer.draw(image).right, running.draw(image).right)
 
 
 def _warmed(network: UNetGenerator) -> UNetGenerator:

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.made_street import make_street
+from tests.made_street import make_street, write_pairs
 from torch import Tensor, nn
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_disparity_png, write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
@@ -45,23 +44,7 @@ LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A plain folder of three made pairs with disparity."""
-    home = tmp_path_factory.mktemp("pairs")
-    lines = []
-    for number, scale in enumerate((0.2, 0.2, 0.25)):
-        street = make_street(scale)
-        rig, truth = street.input.camera, street.truth.disparity_px
-        assert isinstance(rig, StereoRig)
-        assert street.input.right is not None
-        assert truth is not None
-        name = f"{number:02d}"
-        write_image(home / "left" / f"{name}.png", street.input.left)
-        write_image(home / "right" / f"{name}.png", street.input.right)
-        write_disparity_png(home / "disp_occ" / f"{name}.png", truth)
-        numbers = [rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m]
-        values = " ".join(str(float(n)) for n in numbers)
-        lines.append(f"{name} {rig.width} {rig.height} {values}")
-    (home / "calib.txt").write_text("\n".join(lines) + "\n")
-    return home
+    return write_pairs(tmp_path_factory.mktemp("pairs"), (0.2, 0.2, 0.25))
 
 
 @pytest.fixture

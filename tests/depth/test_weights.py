@@ -60,6 +60,7 @@ def test_half_precision_halves_the_file_and_keeps_three_digits(
     sizes = [(tmp_path / f"{n}.safetensors").stat().st_size for n in ("half", "full")]
     assert sizes[0] < 0.8 * sizes[1]
     read = read_generator(tmp_path / "half.safetensors")
+    assert isinstance(read, UNetGenerator)
     assert read.down[0].conv.weight.dtype == torch.float32  # pyright: ignore[reportAttributeAccessIssue]
     assert_same(read, generator, atol=1e-3)
 

@@ -163,6 +163,12 @@ def test_an_object_that_is_not_seen_has_no_mask() -> None:
     assert found.best("cat") is None
 
 
+def test_a_picture_of_other_values_than_0_to_1_is_refused() -> None:
+    weights = replace(tiny_weights(), network=Painter(2, TINY))
+    with pytest.raises(InputError, match=r"the image must lie in \[0, 1\], got 128 .. 128"):
+        Segmenter(weights).segment(torch.full((3, 48, 64), 128.0))
+
+
 def test_probabilities_add_up_to_one_and_the_network_runs_from_a_file(tmp_path: Path) -> None:
     bound = replace(tiny_weights(), facts={"terms": "For research alone."})
     write_segmentation(tmp_path / "w.safetensors", bound)

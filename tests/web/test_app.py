@@ -167,6 +167,17 @@ def test_depth_refuses_with_a_remedy(
     assert tempfile.gettempdir() not in text
 
 
+def test_a_damaged_file_is_named_and_nothing_of_ours_is_shown(
+    page: TestClient, samples: Path
+) -> None:
+    sent = {"image": ("street.png", b"no picture")}
+    status, text = refusal(page.post("/estimate/depth", files=sent, data={"focal_px": "500"}))
+    assert status == 400
+    assert text.startswith("street.png: not a readable picture")
+    assert "0x" not in text
+    assert "BytesIO" not in text
+
+
 def test_a_focal_length_that_asks_for_a_huge_picture_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,7 +210,7 @@ def test_the_matcher_may_want_a_larger_picture_than_the_generator(
 ) -> None:
     synthesiser = nets[0].synthesiser
     assert synthesiser is not None
-    focal_px = synthesiser.generator.config.virtual_focal_px
+    focal_px = synthesiser.config.virtual_focal_px
     monkeypatch.setattr("depthpose.web.depth.work_focal_px", lambda _: 100 * focal_px)
     app = make_app(FakestereoNet(nets[0].matcher, synthesiser), nets[1])
     files = {"image": "left.png", "camera": "camera.json"}

@@ -5,12 +5,14 @@ when it runs, so that every ``--help`` answers at once.
 """
 
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from inspect import cleandoc
 
 from depthpose import __version__
-from depthpose.core.errors import InputError, MissingExtraError, nearest_name
+from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
 
 COMMANDS = {
     "demo": (
@@ -31,6 +33,10 @@ COMMANDS = {
         "made frames of your CAD files on a table, in BOP's layout",
     ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
+    "data label": (
+        "data:label",
+        "truth for pairs that have none, by a matcher, where both views agree",
+    ),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
@@ -93,7 +99,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if name is None:
         return _explain(given)
     try:
-        return _run(name, rest)
+        with _notices_in_a_line():
+            return _run(name, rest)
     except (InputError, MissingExtraError) as error:
         print(f"depthpose: error: {error}", file=sys.stderr)
         return 2
@@ -101,6 +108,26 @@ def main(words: Sequence[str] | None = None) -> int:
         said = str(stop) or "interrupted"
         print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
         return 130
+
+
+@contextmanager
+def _notices_in_a_line() -> Iterator[None]:
+    """Show our notices without the file and line of the code that gives them."""
+    before = warnings.formatwarning
+
+    def shown(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int,
+        line: str | None = None,
+    ) -> str:  # fmt: skip
+        if issubclass(category, Notice):
+            return f"depthpose: {message}\n"
+        return before(message, category, filename, lineno, line)
+
+    warnings.formatwarning = shown
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 def _split_command(given: list[str]) -> tuple[str | None, list[str]]:

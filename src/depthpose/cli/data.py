@@ -95,6 +95,59 @@ def duplicates(
     return 1 if rows else 0
 
 
+def label(
+    path: tyro.conf.Positional[Path],
+    out: Path,
+    weights: str = "default",
+    device: str = "cpu",
+    max_difference_px: float = 1.0,
+    max_difference_share: float = 0.03,
+    min_confidence: float = 0.5,
+) -> int:
+    """Match pairs that have no truth both ways, and keep as truth what both views agree on.
+
+    What is written is a folder of pairs that every training takes. What comes of such labels is no
+    better than their matcher, and has its blind spots; a matcher that has seen evaluation frames
+    tells them on.
+
+        depthpose data label my-pairs --out my-pairs-labelled
+
+    Args:
+        path: a dataset with right views and calibration.
+        out: folder to write to.
+        weights: weights with a matcher, by name or file; the terms of theirs bind what comes of it.
+        device: cpu, cuda, cuda:1, ...
+        max_difference_px: largest difference of both views' disparities.
+        max_difference_share: the same as a share of the disparity; the larger limit holds.
+        min_confidence: least confidence of the matcher.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import file_sha256, find_weights
+    from depthpose.depth.config import MatcherConfig
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.kitti import open_dataset
+    from depthpose.depth.labels import LabelConfig, label_pairs
+
+    config = LabelConfig(
+        largest_difference_px=max_difference_px,
+        largest_share=max_difference_share,
+        least_confidence=min_confidence,
+    )
+    dataset = open_dataset(path)
+    settings = {
+        "dataset": dataset.name,
+        "weights_sha256": file_sha256(find_weights(weights)),
+        **asdict(config),
+    }
+    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
+    labelled = label_pairs(net, dataset, config, out, settings)
+    shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
+    known = f", {sum(shares) / len(shares):.0%} of their pixels are known" if shares else ""
+    print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
+    return 0
+
+
 def make_streets(
     out: Path,
     number: int = 100,

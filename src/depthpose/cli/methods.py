@@ -17,6 +17,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.floors import NearestImageFloor, RowDepthFloor
 from depthpose.depth.kitti import Dataset
 from depthpose.depth.predictions import Estimator
+from depthpose.depth.stereo import with_usable_precision
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
@@ -51,6 +52,7 @@ def weights_method(
     Raises:
         InputError: a matcher alone is asked to do without the right view.
     """
+    config = with_usable_precision(config)  # what is computed in is what is recorded
     path = find_weights(weights)
     kind = read_checkpoint(path).kind
     is_shown = kind == "psmnet" if with_right is None else with_right

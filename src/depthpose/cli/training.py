@@ -1,4 +1,4 @@
-"""``depthpose depth train view|stereo|finetune``."""
+"""``depthpose depth train view|select|stereo|finetune``."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ _LOOKED_AT = 20
 
 
 def train(
-    stage: tyro.conf.Positional[Literal["view", "stereo", "finetune"]],
+    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: Path,
     config: Path | None = None,
     data: tuple[str, ...] = (),
@@ -23,6 +23,7 @@ def train(
     generator: str | None = None,
     matcher: str | None = None,
     start: str | None = None,
+    encoder: str | None = None,
     steps: int | None = None,
     seed: int | None = None,
     device: Literal["auto", "cpu"] | None = None,
@@ -30,7 +31,10 @@ def train(
     resume: bool = False,
     view: str | None = None,
 ) -> int:
-    """Train the generator (view), the matcher (stereo), or the generator through it (finetune).
+    """Train a generator (view, select), the matcher (stereo), or the first through the second.
+
+    'view' trains the thesis's generator, which paints the right view; 'select' one that looks it
+    up in the left image and answers depth itself; 'finetune' either through the frozen matcher.
 
     A config holds every knob; the words below change what they name. The run folder keeps config,
     metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
@@ -48,7 +52,9 @@ def train(
             each 20, evenly taken, where the config says no other number.
         generator: finetune: weights of the generator to begin with.
         matcher: finetune: weights of the matcher, which is not changed.
-        start: view, stereo: weights to begin with.
+        start: view, select, stereo: weights to begin with.
+        encoder: select: weights of the encoder to begin with, of 'depthpose weights import
+            efficientnet-lite0'.
         steps: optimiser steps in place of the config's length.
         seed: decides initial weights, order, augmentation and dropout.
         device: auto takes what accelerate finds; cpu takes no GPU.
@@ -68,14 +74,18 @@ def train(
         loop = dataclasses.replace(loop, steps=steps, epochs=None)
     pairs = changed(chosen.pairs, folders=data or None)
     if held_out:
-        looked_at = chosen.held_out or PairsConfig(focal_px=pairs.focal_px, limit=_LOOKED_AT)
+        looked_at = chosen.held_out or PairsConfig(
+            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
+        )
         chosen = dataclasses.replace(
             chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
         )
-    words = {"generator": generator, "matcher": matcher, "start": start}
+    words = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
     knobs = {field.name: field.type for field in dataclasses.fields(kind)}
     for word, value in words.items():
-        if value is not None and (word not in knobs or (word != "start" and stage != "finetune")):
+        if value is not None and (
+            word not in knobs or (word in ("generator", "matcher") and stage != "finetune")
+        ):
             raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
     chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
     with progress_bar(view) as on_step:

@@ -56,7 +56,7 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18"]],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -70,7 +70,8 @@ def import_weights(
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
             MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors).
+            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an encoder that
+            'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample, which no file records:
@@ -87,6 +88,10 @@ def import_weights(
         from depthpose.pose.resnet import import_resnet18
 
         import_resnet18(file, out)
+    elif kind == "efficientnet-lite0":
+        from depthpose.depth.synthesis.lite0 import import_lite0
+
+        import_lite0(file, out)
     else:
         from depthpose.core.errors import InputError
         from depthpose.depth.stereo import import_psmnet

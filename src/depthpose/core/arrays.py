@@ -8,8 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from depthpose.core.errors import InputError
+
 Image = Float[Tensor, "3 h w"]
-"""RGB in [0, 1], float32."""
+"""RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
 Map = Float[Tensor, "h w"]
 """One number a pixel; its unit stands in the variable's name (``_m``, ``_px``). NaN: invalid."""
@@ -29,3 +31,39 @@ def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m 
     if len(rows) <= count:
         return rows
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]
+
+
+def check_image(image: object, name: str, slack: float = 0.5) -> Image:
+    """Give an image back, or refuse what is none, with a remedy.
+
+    Args:
+        image: what a caller gave.
+        name: what to call it.
+        slack: how far values may leave [0, 1], as bicubic resizing makes them.
+
+    Raises:
+        InputError: not a tensor, not ``(3, H, W)``, not float, empty, not finite or not in [0, 1].
+    """
+    if not isinstance(image, Tensor):
+        raise InputError(
+            f"{name} must be a tensor, got {type(image).__name__}; read files with "
+            f"core.files.read_image, or use torch.from_numpy"
+        )
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise InputError(
+            f"{name} must have shape (3, H, W), got {tuple(image.shape)}; move channels first, "
+            f"drop alpha, repeat grey three times, and give one image at a time"
+        )
+    if not image.is_floating_point():
+        raise InputError(f"{name} must be float in [0, 1], got {image.dtype}; divide by 255")
+    if not image.numel():
+        raise InputError(f"{name} is empty: shape {tuple(image.shape)}; give it pixels")
+    if not bool(torch.isfinite(image).all()):
+        raise InputError(f"{name} holds NaN or infinite values; replace or mask them first")
+    low, high = float(image.min()), float(image.max())
+    if low < -slack or high > 1 + slack:
+        raise InputError(
+            f"{name} must lie in [0, 1], got {low:.4g} .. {high:.4g}; divide 8-bit values by 255, "
+            f"and do not normalise: the network does"
+        )
+    return image

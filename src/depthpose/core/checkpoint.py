@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import atomic_write
+from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.files.disk import write_bytes
 from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
 
 SHIPPED = Path(__file__).parents[1] / "weights"
@@ -25,7 +25,7 @@ _IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
 """Weights that stay out of the wheel."""
 
 
-class LicenceNotice(UserWarning):
+class LicenceNotice(Notice):
     """Weights whose terms bind whoever uses them."""
 
 
@@ -54,9 +54,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         )
     metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
-    with atomic_write(path) as temporary:
-        save_file(state, temporary, metadata={**checkpoint.facts, **metadata})
-        temporary.chmod(0o644)  # safetensors makes files that nobody else may read
+    # Its own writer says of a full disk what only it understands.
+    write_bytes(path, save(state, metadata={**checkpoint.facts, **metadata}))
 
 
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
@@ -80,20 +79,25 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
     Raises:
         InputError: the first names that are missing, unexpected or of another shape.
     """
-    wanted = network.state_dict()
-    problems = [f"{name} is missing" for name in wanted.keys() - checkpoint.state.keys()]
-    problems += [f"{name} is unexpected" for name in checkpoint.state.keys() - wanted.keys()]
-    problems += [
-        f"{name} is {tuple(checkpoint.state[name].shape)}, not {tuple(tensor.shape)}"
-        for name, tensor in wanted.items()
-        if name in checkpoint.state and checkpoint.state[name].shape != tensor.shape
-    ]
+    problems = misfits(network.state_dict(), checkpoint.state)
     if problems:
         raise InputError(
             f"{source}: {len(problems)} tensors do not fit the network of its config: "
-            f"{'; '.join(sorted(problems)[:3])}. File and config belong to different versions."
+            f"{'; '.join(problems[:3])}. File and config belong to different versions."
         )
     network.load_state_dict(dict(checkpoint.state))
+
+
+def misfits(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
+    """Say in order of the names which tensors are missing, unexpected or of another shape."""
+    problems = [f"{name} is missing" for name in wanted.keys() - given.keys()]
+    problems += [f"{name} is unexpected" for name in given.keys() - wanted.keys()]
+    problems += [
+        f"{name} is {tuple(given[name].shape)}, not {tuple(tensor.shape)}"
+        for name, tensor in wanted.items()
+        if name in given and given[name].shape != tensor.shape
+    ]
+    return sorted(problems)
 
 
 def read_torch_file(path: Path) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""The one error that bad input raises, and the nearest-name hint it often carries."""
+"""The one error that bad input raises, the notice that stops nothing, and the nearest name."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -23,6 +23,10 @@ class MissingExtraError(ImportError):
         )
 
 
+class Notice(UserWarning):
+    """Something to know that stops nothing; the command line prints it as one line."""
+
+
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
     """Import OpenCV where it is used; its absence says which extra brings it.
 
@@ -33,6 +37,17 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
         return import_module("cv2")
     except ImportError as error:
         raise MissingExtraError("opencv-python-headless", "opencv", purpose) from error
+
+
+def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
+    """Refuse a word that is none of the known ones.
+
+    Raises:
+        InputError: that is so; the nearest is said.
+    """
+    known = tuple(known)
+    if name not in known:
+        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), known)}")
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

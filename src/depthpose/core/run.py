@@ -113,7 +113,6 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
     if record.exists():
         _refuse_other_settings(folder, read_json(record), dict(settings))
         return
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(record, {"settings": dict(settings), "environment": environment()})
 
 

@@ -12,28 +12,44 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig
 
 _LUMA = (0.299, 0.587, 0.114)
+_UNKNOWN = torch.tensor(torch.nan)
 
 
 class TrainingPair(NamedTuple):
-    """A pair on its way into a network: images in [0, 1], disparity [px] with NaN for unknown.
+    """A pair on its way into a network.
 
-    ``right_px`` is the disparity of the right view, counted positive as well: what is truth after
-    a flip.
+    Whatever is done to it, ``focal_px * baseline_m / left_px`` stays the depth of each pixel
+    (where the rig has two principal points, their difference is scaled as the focal length is).
+
+    Attributes:
+        left: RGB in [0, 1].
+        right: RGB in [0, 1], rectified, of the same size.
+        left_px: disparity of the left view [px], NaN for unknown.
+        right_px: disparity of the right view, counted positive as well: what is truth after a flip.
+        focal_px: focal length along the rows (fx) at this size; NaN for unknown.
     """
 
     left: Float[Tensor, "*b 3 h w"]
     right: Float[Tensor, "*b 3 h w"]
     left_px: Float[Tensor, "*b h w"]
     right_px: Float[Tensor, "*b h w"]
+    focal_px: Float[Tensor, "*b"] = _UNKNOWN
 
 
 def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generator) -> TrainingPair:
-    """Scale, crop, perhaps mirror, and change the colours of a pair (thesis, 2.4.2)."""
-    scaled = scale_pair(pair, _draw_scale(config, generator), config.crop_px)
-    cropped = crop_pair(scaled, config.crop_px, generator)
+    """Scale, crop, perhaps mirror, and change the colours of a pair (thesis, 2.4.2).
+
+    What is smaller than the crop is padded (:func:`pad_pair`): enlarged, it would be seen at
+    another focal length than the rest.
+
+    Raises:
+        InputError: the pair is smaller than half of the crop.
+    """
+    scaled = scale_pair(pair, _draw_scale(config, generator))
+    cropped = crop_pair(scaled, _common_size(scaled, config.crop_px), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
         cropped = flip_and_swap(cropped)
-    return jitter_colors(cropped, config.jitter, generator)
+    return pad_pair(jitter_colors(cropped, config.jitter, generator), config.crop_px)
 
 
 def flip_and_swap(pair: TrainingPair) -> TrainingPair:
@@ -41,18 +57,17 @@ def flip_and_swap(pair: TrainingPair) -> TrainingPair:
 
     Truth of the new left view is the mirrored truth of the old right one, or none.
     """
-    mirrored = [part.flip(-1) for part in (pair.right, pair.left, pair.right_px, pair.left_px)]
-    return TrainingPair(*mirrored)
+    left, right, left_px, right_px = (part.flip(-1) for part in pair[:4])
+    return TrainingPair(right, left, right_px, left_px, pair.focal_px)
 
 
-def scale_pair(pair: TrainingPair, scale: float, least_px: tuple[int, int]) -> TrainingPair:
-    """Resize a pair to ``scale`` of its size (but ``least_px`` rows and columns at least).
+def scale_pair(pair: TrainingPair, scale: float) -> TrainingPair:
+    """Resize a pair to ``scale`` of its size.
 
-    Both sides keep one ratio but for rounding; disparity is scaled by the ratio of the widths.
-    It is resized by nearest neighbour, so that known and unknown never mix.
+    Both sides keep one ratio but for rounding; disparity and focal length are scaled by the ratio
+    of the widths. Disparity is resized by nearest neighbour, so that known and unknown never mix.
     """
     height, width = pair.left.shape[-2:]
-    scale = max(scale, least_px[0] / height, least_px[1] / width)
     if scale == 1.0:
         return pair
     size = (max(math.floor(height * scale + 0.5), 1), max(math.floor(width * scale + 0.5), 1))
@@ -65,7 +80,7 @@ def scale_pair(pair: TrainingPair, scale: float, least_px: tuple[int, int]) -> T
         F.interpolate(m[None, None], size, mode="nearest-exact")[0, 0] * ratio
         for m in (pair.left_px, pair.right_px)
     ]
-    return TrainingPair(images[0], images[1], maps[0], maps[1])
+    return TrainingPair(images[0], images[1], maps[0], maps[1], pair.focal_px * ratio)
 
 
 def crop_pair(
@@ -85,8 +100,39 @@ def crop_pair(
         )
     top = int(torch.randint(height - rows + 1, (), generator=generator))
     first = int(torch.randint(width - columns + 1, (), generator=generator))
-    window = [part[..., top : top + rows, first : first + columns] for part in pair]
-    return TrainingPair(*window)
+    parts = (part[..., top : top + rows, first : first + columns] for part in pair[:4])
+    left, right, left_px, right_px = parts
+    return TrainingPair(left, right, left_px, right_px, pair.focal_px)
+
+
+def pad_pair(pair: TrainingPair, size_px: tuple[int, int]) -> TrainingPair:
+    """Fill a pair up to a size with black, without truth, on the right and below.
+
+    Rows and columns of the picture keep their numbers, so disparity and horizon stay where they
+    are. A mirrored border would have the negative of every disparity.
+
+    Raises:
+        InputError: more than half of the rows or of the columns would be black.
+    """
+    height, width = pair.left.shape[-2:]
+    rows, columns = size_px
+    if 2 * height < rows or 2 * width < columns:
+        raise InputError(
+            f"a pair of {height}x{width} (rows x columns) fills less than half of a crop of "
+            f"{rows}x{columns}; lower crop_px, or leave such pairs out"
+        )
+    beyond = (0, max(columns - width, 0), 0, max(rows - height, 0))
+    return pair._replace(
+        left=F.pad(pair.left, beyond),
+        right=F.pad(pair.right, beyond),
+        left_px=F.pad(pair.left_px, beyond, value=torch.nan),
+        right_px=F.pad(pair.right_px, beyond, value=torch.nan),
+    )
+
+
+def _common_size(pair: TrainingPair, crop_px: tuple[int, int]) -> tuple[int, int]:
+    height, width = pair.left.shape[-2:]
+    return min(height, crop_px[0]), min(width, crop_px[1])
 
 
 def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generator) -> TrainingPair:
@@ -97,7 +143,7 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
     left, right = pair.left * brightness, pair.right * brightness
     mean = (left.mean() + right.mean()) / 2  # one anchor, or the views would drift apart
     views = [_saturate((view - mean) * contrast + mean, saturation) for view in (left, right)]
-    return TrainingPair(views[0].clamp(0, 1), views[1].clamp(0, 1), pair.left_px, pair.right_px)
+    return pair._replace(left=views[0].clamp(0, 1), right=views[1].clamp(0, 1))
 
 
 def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 h w"]:

@@ -64,3 +64,56 @@ def heads_loss(
     """Sum the loss of PSMNet's three heads, the later the heavier."""
     losses = [disparity_loss(head, truth_px, max_px) for head in heads_px]
     return torch.stack([w * x for w, x in zip(HEAD_WEIGHTS, losses, strict=True)]).sum()
+
+
+def log_disparity_loss(
+    found_log_px: Float[Tensor, "b h w"],
+    truth_px: Float[Tensor, "b h w"],
+    range_px: tuple[float, float],
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of the logarithm of disparity: a relative error of depth.
+
+    Each image with truth counts the same, however sparse its truth is; truth outside ``range_px``
+    counts as its end. NaN and the sky (0) do not count.
+    """
+    is_known = truth_px > 0
+    truth = truth_px.nan_to_num(1.0).clamp(*range_px).log()
+    error = torch.where(is_known, (found_log_px - truth).abs(), 0.0)
+    counts = is_known.sum((1, 2))
+    means = error.sum((1, 2)) / counts.clamp(min=1)
+    return means.sum() / (counts > 0).sum().clamp(min=1)
+
+
+def plane_loss(
+    logits: Float[Tensor, "b classes rows columns"],
+    truth_px: Float[Tensor, "b rows columns"],
+    planes: Float[Tensor, " planes"],
+) -> Float[Tensor, ""]:
+    """Cross entropy of the classes sky (0) and planes (1, 2, ...), shared between two neighbours.
+
+    Args:
+        logits: class 0 is the sky.
+        truth_px: disparity; 0 in the sky, NaN where unknown.
+        planes: disparities, evenly spaced in their logarithm [px].
+    """
+    is_known, is_sky = truth_px >= 0, truth_px == 0
+    logs = planes.log()
+    place = (truth_px.nan_to_num(1.0).clamp(planes[0], planes[-1]).log() - logs[0]) / (
+        logs[1] - logs[0]
+    )
+    lower = place.floor().clamp(0, len(planes) - 2)
+    share = torch.where(is_sky, 0.0, place - lower)
+    first = torch.where(is_sky, 0, lower.long() + 1)[:, None]
+    scores = logits.float().log_softmax(1)
+    near, far = scores.gather(1, first)[:, 0], scores.gather(1, first + 1)[:, 0]
+    loss = -(near * (1 - share) + far * share)
+    return torch.where(is_known, loss, 0.0).sum() / is_known.sum().clamp(min=1)
+
+
+def view_loss(
+    drawn: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, " b"]:
+    """L1 of a drawn view and of its horizontal gradient, for each image."""
+    colour = (drawn - real).abs().mean((1, 2, 3))
+    gradient = ((drawn[..., 1:] - drawn[..., :-1]) - (real[..., 1:] - real[..., :-1])).abs()
+    return colour + gradient.mean((1, 2, 3))

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 
+SMALLEST_DEPTH_M = 1e-3
+"""Predicted depth of zero or below becomes this, as in the published script of the Eigen split."""
+
 
 @dataclass(frozen=True)
 class DepthErrors:

@@ -22,6 +22,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.run import claim_folder
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
+from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 
@@ -105,7 +106,8 @@ def read_disparity(folder: Path, name: str, camera: Camera | None) -> Float[Tens
     """Read one predicted disparity [px at its own width], ours or anybody's.
 
     ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; a ``NAME.depth_m.npy`` alone is turned
-    into disparity by the rig.
+    into disparity by the rig. NaN alone says that there is no answer: depth of zero or below is
+    the smallest of the protocol, as the published script takes it.
 
     Raises:
         InputError: neither file is there, or depth without a rig.
@@ -124,7 +126,8 @@ def read_disparity(folder: Path, name: str, camera: Camera | None) -> Float[Tens
     if not isinstance(camera, StereoRig):
         raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
     # The map may have a size of its own: its disparity is counted in its own pixels.
-    return disparity_from_depth(depth_m, camera) * (depth_m.shape[1] / camera.width)
+    least_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
+    return disparity_from_depth(least_m, camera) * (depth_m.shape[1] / camera.width)
 
 
 def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:

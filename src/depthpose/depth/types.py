@@ -35,12 +35,14 @@ class StereoTruth:
         depth_m: depth of the left image (camera z unless the dataset's protocol says otherwise).
         occluded: left pixels whose point the right view does not show: hidden there, or outside.
         right_disparity_px: disparity of the right image, positive like the left one's.
+        is_sky: left pixels that show the sky.
     """
 
     disparity_px: Float[Tensor, "h w"] | None = None
     depth_m: Float[Tensor, "h w"] | None = None
     occluded: Bool[Tensor, "h w"] | None = None
     right_disparity_px: Float[Tensor, "h w"] | None = None
+    is_sky: Bool[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,13 +72,17 @@ class DepthEstimate:
     """Depth of one left image.
 
     Attributes:
-        depth_m: metres along the optical axis; NaN where disparity is invalid. None without a rig.
-        disparity_px: disparity that the depth was made from, at the size of the input.
+        depth_m: metres along the optical axis; NaN where disparity is invalid, and in the sky.
+            None without a rig.
+        disparity_px: disparity that the depth was made from, at the size of the input; in the sky
+            that of a point 10 km away.
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
+        is_sky: where the image shows the sky, or None where the weights do not know it.
     """
 
     depth_m: Float[Tensor, "h w"] | None
     disparity_px: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None = None
     right: Float[Tensor, "3 h w"] | None = None
+    is_sky: Bool[Tensor, "h w"] | None = None

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,12 +11,19 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.stereo.weights import KIND as PSMNET
-from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
-GENERATOR, MATCHER, BOTH = "generator", PSMNET, "fakestereo"
+BOTH = "fakestereo"
+_GENERATORS: dict[str, tuple[type, type]] = {
+    "generator": (GeneratorConfig, UNetGenerator),
+    "selection": (SelectionConfig, SelectionGenerator),
+}
+_MATCHERS: dict[str, tuple[type, type]] = {PSMNET: (PSMNetConfig, PSMNet)}
+_NETWORKS = _GENERATORS | _MATCHERS
+"""Config and network of each kind of weights."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,7 +36,7 @@ class DepthWeights:
         facts: the card in short.
     """
 
-    generator: UNetGenerator | None
+    generator: Generator | None
     matcher: PSMNet | None
     facts: Mapping[str, str]
 
@@ -40,25 +48,28 @@ def read_depth_weights(path: Path) -> DepthWeights:
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = read_checkpoint(path)
-    if checkpoint.kind not in (GENERATOR, MATCHER, BOTH):
+    if checkpoint.kind not in (*_NETWORKS, BOTH):
         raise InputError(
-            f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes {GENERATOR!r}, "
-            f"{MATCHER!r} or {BOTH!r}."
+            f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
+            f"{', '.join(map(repr, _NETWORKS))} or {BOTH!r}."
         )
     parts = _split(checkpoint) if checkpoint.kind == BOTH else {checkpoint.kind: checkpoint}
-    generator = matcher = None
-    if GENERATOR in parts:
-        config = config_from_dict(parts[GENERATOR].config, GeneratorConfig, source=str(path))
-        generator = UNetGenerator(config).eval()
-        load_weights(generator, parts[GENERATOR], str(path))
-    if MATCHER in parts:
-        config = config_from_dict(parts[MATCHER].config, PSMNetConfig, source=str(path))
-        matcher = PSMNet(config).eval()
-        load_weights(matcher, parts[MATCHER], str(path))
-    return DepthWeights(generator=generator, matcher=matcher, facts=checkpoint.facts)
+    built = {kind: _build(part, str(path)) for kind, part in parts.items()}
+    return DepthWeights(
+        generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
+        matcher=next((built[kind] for kind in _MATCHERS if kind in built), None),
+        facts=checkpoint.facts,
+    )
 
 
-def read_generator(path: Path) -> UNetGenerator:
+def _build(part: Checkpoint, source: str) -> Any:  # noqa: ANN401 - any network of this package
+    kind_of_config, kind_of_network = _NETWORKS[part.kind]
+    network = kind_of_network(config_from_dict(part.config, kind_of_config, source=source)).eval()
+    load_weights(network, part, source)
+    return network
+
+
+def read_generator(path: Path) -> Generator:
     """Read the generator of a weights file.
 
     Raises:
@@ -85,7 +96,7 @@ def read_matcher(path: Path) -> PSMNet:
 def write_depth_weights(
     path: Path,
     *,
-    generator: UNetGenerator | None = None,
+    generator: Generator | None = None,
     matcher: PSMNet | None = None,
     facts: Mapping[str, str],
     with_half: bool = False,
@@ -99,9 +110,7 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
-    parts: dict[str, nn.Module] = {}
-    parts |= {} if generator is None else {GENERATOR: generator}
-    parts |= {} if matcher is None else {MATCHER: matcher}
+    parts = {_kind_of(part): part for part in (generator, matcher) if part is not None}
     assert parts, "a weights file holds a network at least"
     states = {name: _state(module, with_half=with_half) for name, module in parts.items()}
     configs = {name: config_to_dict(module.config) for name, module in parts.items()}
@@ -114,16 +123,20 @@ def write_depth_weights(
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
 
 
+def _kind_of(network: nn.Module) -> str:
+    return next(kind for kind, (_, made) in _NETWORKS.items() if isinstance(network, made))
+
+
 def _split(checkpoint: Checkpoint) -> dict[str, Checkpoint]:
+    """Take a file of several networks apart; its config names them."""
     parts: dict[str, Checkpoint] = {}
-    for kind in (GENERATOR, MATCHER):
+    for kind in (kind for kind in _NETWORKS if kind in checkpoint.config):
         state = {
             key.removeprefix(f"{kind}."): tensor
             for key, tensor in checkpoint.state.items()
             if key.startswith(f"{kind}.")
         }
-        config = checkpoint.config.get(kind, {})
-        parts[kind] = Checkpoint(kind=kind, config=config, state=state)
+        parts[kind] = Checkpoint(kind=kind, config=checkpoint.config[kind], state=state)
     return parts
 
 

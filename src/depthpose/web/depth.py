@@ -104,7 +104,7 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
     assert camera is not None
     wanted_px = [work_focal_px(net.matcher)]
     if pair.right is None and net.synthesiser is not None:
-        wanted_px.append(net.synthesiser.generator.config.virtual_focal_px)
+        wanted_px.append(net.synthesiser.config.virtual_focal_px)
     sizes = [focal_size(camera, focal_px) for focal_px in wanted_px if focal_px is not None]
     height, width = pair.left.shape[1:]
     if not sizes and height * width > _MOST_WORK_PIXELS:

@@ -1,6 +1,5 @@
 """What a browser sent: checked names and types, in a folder that lives as long as the request."""
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -10,7 +9,8 @@ from typing import Any
 
 from depthpose.core.camera import Camera, read_camera
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size
+from depthpose.core.files import image_size, write_json
+from depthpose.core.files.disk import write_bytes
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 MOST_PIXELS = 12_500_000
@@ -86,7 +86,7 @@ class Form:
             return read_camera(self.files["camera"], size)
         path = self.folder / _FIELDS
         # The same way as a file, so that the same mistakes are found.
-        path.write_text(json.dumps({k: v for k, v in keys.items() if v is not None}))
+        write_json(path, {k: v for k, v in keys.items() if v is not None})
         return read_camera(path)
 
     def results(self) -> Path:
@@ -134,6 +134,5 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
             f"{field}: {sent_name!r} is not {what}; this field takes {', '.join(suffixes)}"
         )
     kept = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
-    kept.parent.mkdir()
-    kept.write_bytes(data)
+    write_bytes(kept, data)
     return kept

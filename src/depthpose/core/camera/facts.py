@@ -31,6 +31,9 @@ _NO_DISTORTION = 1e-8
 _OFF_CENTRE = 0.1
 """Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
 _SAME_SHARE = 0.05
+"""By how much it may leave the centre differently in the two directions, at K's own resolution."""
+_QUARTER = 0.25
+"""Share of the size beyond which a point off the centre is doubted, whatever its direction."""
 _CORNER = 0.1
 
 
@@ -162,9 +165,10 @@ def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) ->
     refuse_outside(K, width, height)
     cx, cy = float(K[0, 2]), float(K[1, 2])
     across, down = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
-    if min(abs(across), abs(down)) < _OFF_CENTRE or abs(across - down) > _SAME_SHARE:
-        return
     scale = 1 + across + down
+    is_alike = abs(across - down) <= _SAME_SHARE * max(scale, 1)
+    if min(abs(across), abs(down)) < _OFF_CENTRE or not is_alike:
+        return
     if scale < _CORNER:
         raise InputError(
             f"the principal point ({cx:g}, {cy:g}) lies in the corner of the image; where nobody "
@@ -192,12 +196,23 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
 
 
 def suspicious_centre(camera: Camera) -> str | None:
-    """Say that a camera which names its size looks like one of another; None where it does not."""
+    """Say that a camera which names its size looks like one of another; None where it does not.
+
+    A point more than a quarter of the size off the centre is doubted too.
+    """
     try:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     except InputError as error:
         return str(error)
-    return None
+    cx, cy = float(camera.K[0, 2]), float(camera.K[1, 2])
+    across, down = (cx + 0.5) / camera.width, (cy + 0.5) / camera.height
+    if max(abs(across - 0.5), abs(down - 0.5)) <= _QUARTER:
+        return None
+    return (
+        f"the principal point ({cx:g}, {cy:g}) lies at {across:.0%} of the width and {down:.0%} of "
+        f"the height of {camera.width}x{camera.height}, more than a quarter off the centre: is K "
+        "of another size? Scale fx, fy, cx and cy as the image was; a crop may be so"
+    )
 
 
 def _distorted(facts: CameraFacts, size: Size | None) -> InputError:

@@ -85,10 +85,14 @@ def check_intrinsics(K: Tensor) -> None:
         InputError: the shape, the type or a value of ``K`` is wrong.
     """
     form = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+    if not isinstance(K, Tensor):
+        raise InputError(
+            f"K is a {type(K).__name__}, not a tensor; pass torch.tensor(K, dtype=torch.float64)"
+        )
     if tuple(K.shape) != (3, 3):
         raise InputError(f"K is {tuple(K.shape)}, not 3x3; write {form}")
     if K.dtype != torch.float64:
-        raise InputError(f"K is {K.dtype}, not float64; pass K.double()")
+        raise InputError(f"K is of {K.dtype}, not torch.float64; pass K.double()")
     rows = K.tolist()
     if not bool(K.isfinite().all()):
         raise InputError(f"K is {rows}, not finite; write {form}")

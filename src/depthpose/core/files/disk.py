@@ -1,6 +1,7 @@
 """Bytes from and to the disk: guarded reading, atomic writing."""
 
 import os
+import re
 import secrets
 import stat
 import warnings
@@ -49,6 +50,8 @@ def _refuse_irregular(path: AnyPath, status: os.stat_result) -> None:
         )
 
 
+_ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")
+"""What Python shows of an object in memory, which nobody else can look at."""
 _PART = ".part-"
 """Begins the names of files that are being written."""
 
@@ -67,8 +70,24 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # a decoder fed with random bytes may raise anything
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        text = _ADDRESS.sub("", f"{type(error).__name__}: {error}")
+        said = " ".join(text.split())[:200]
         raise InputError(f"{path}: not a readable {kind} ({said}); {remedy}") from error
+
+
+@contextmanager
+def refused_write(path: AnyPath) -> Iterator[None]:
+    """Turn what a disk refuses to take into an :class:`InputError`.
+
+    Encoders that hide the disk's own error (torch's, safetensors') write to memory first.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; "
+            "free the space, or choose another place"
+        ) from error
 
 
 @contextmanager
@@ -85,17 +104,13 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
     target = Path(path)
     part = target.with_name(f"{_PART}{secrets.token_hex(6)}{target.suffix}")
     try:
-        _refuse_to_replace(target)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        _sync(part)
-        part.replace(target)
-        _sync(target.parent)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror or error}; "
-            "free the space, or choose another place"
-        ) from error
+        with refused_write(path):
+            _refuse_to_replace(target)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            _sync(part)
+            part.replace(target)
+            _sync(target.parent)
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)

@@ -127,8 +127,23 @@ def _encode(
     finally:
         if writer is not None:
             writer.release()
-    if count == 0 or not part.is_file() or part.stat().st_size == 0:
-        raise InputError(f"{path}: the encoder wrote nothing of {count} frames; try .avi, or PNGs")
+    found = _count_frames(cv2, part)  # the encoder says nothing of a full disk
+    if count == 0 or found != count:
+        raise InputError(
+            f"{path}: the encoder wrote {found} of {count} frames; free the space if the disk is "
+            "full, else try .avi, or PNGs"
+        )
+    return count
+
+
+def _count_frames(cv2: Any, path: Path) -> int:  # noqa: ANN401
+    """Count the frames that can be read back."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return 0
+    capture, count = cv2.VideoCapture(str(path)), 0
+    while capture.isOpened() and capture.grab():
+        count += 1
+    capture.release()
     return count
 
 

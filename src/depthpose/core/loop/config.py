@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import nn
@@ -35,6 +35,9 @@ class AdamConfig:
     warmup_steps: int = 0
     """Steps over which the rate rises linearly from zero."""
 
+    weight_decay: float = 0.0
+    """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
+
     def __post_init__(self) -> None:
         """Refuse values that cannot train."""
         if not 0 < self.learning_rate < 1:
@@ -46,6 +49,8 @@ class AdamConfig:
                 f"halvings must be 1 or more and warmup_steps 0 or more, got {self.halvings} and "
                 f"{self.warmup_steps}"
             )
+        if self.weight_decay < 0:
+            raise InputError(f"weight_decay must be 0 or more, got {self.weight_decay}")
         if self.schedule not in ("constant", "constant-linear", "halving", "cosine"):
             raise InputError(
                 f"schedule must be constant, constant-linear, halving or cosine, "
@@ -86,7 +91,7 @@ class LoopConfig:
     all of them until the discriminator has moved."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
-    """Arithmetic of the forward pass; fp16 needs a GPU."""
+    """Arithmetic of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
 
     clip_norm: float | None = None
     """Largest norm of an optimiser's gradient; None: as it is."""
@@ -150,8 +155,17 @@ class LoopConfig:
         )
 
 
-def make_adam(parameters: Iterable[nn.Parameter], config: AdamConfig) -> torch.optim.Adam:
-    """Make the optimiser; the loop sets its learning rate before each step."""
+def make_adam(
+    parameters: Iterable[nn.Parameter] | list[dict[str, Any]], config: AdamConfig
+) -> torch.optim.Adam:
+    """Make the optimiser; the loop sets its learning rate before each step.
+
+    Args:
+        parameters: what it moves; or groups, whose ``rate`` is their share of the learning rate.
+        config: its knobs.
+    """
     betas = (config.beta1, config.beta2)
     # One pass over memory: a quarter of the time of torch's other two ways, on a CPU too.
-    return torch.optim.Adam(parameters, lr=config.learning_rate, betas=betas, fused=True)
+    kind = torch.optim.AdamW if config.weight_decay else torch.optim.Adam
+    decay = config.weight_decay
+    return kind(parameters, lr=config.learning_rate, betas=betas, weight_decay=decay, fused=True)

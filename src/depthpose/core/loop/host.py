@@ -8,6 +8,9 @@ from datetime import timedelta
 from types import FrameType
 from typing import Any
 
+import torch
+
+from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.loop.config import LoopConfig
 
@@ -16,6 +19,8 @@ _PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
 
 def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
     """Bring up accelerate with the device and precision of a config.
+
+    bf16 becomes fp32, with a notice, on a processor without it.
 
     Raises:
         MissingExtraError: accelerate is not installed.
@@ -30,10 +35,11 @@ def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is
     # A second training of this process may have another precision; accelerate keeps the first.
     AcceleratorState._reset_state()
     # The others wait while rank 0 looks at the held-out samples.
+    precision = usable_precision(config.precision, _device(config))
     patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
     accelerator = Accelerator(
         cpu=config.device == "cpu",
-        mixed_precision=_PRECISIONS[config.precision],
+        mixed_precision=_PRECISIONS[precision],
         kwargs_handlers=[patience],
     )
     if config.precision == "fp16" and accelerator.scaler is None:
@@ -41,6 +47,13 @@ def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is
             "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has too."
         )
     return accelerator
+
+
+def _device(config: LoopConfig) -> torch.device:
+    """Give what accelerate will choose."""
+    is_accelerated = config.device != "cpu" and torch.accelerator.is_available()
+    found = torch.accelerator.current_accelerator() if is_accelerated else None
+    return found or torch.device("cpu")
 
 
 def leave_signals_to_the_loop(_: int) -> None:

@@ -8,6 +8,7 @@
     pictures/          what validation drew
     tensorboard/       the same for TensorBoard
     state.pt           the last state: what ``resume`` reads
+    state.before.pt    the one before it, read where the last is damaged
 """
 
 import json
@@ -15,16 +16,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from depthpose.core.checkpoint import read_torch_file
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.files import atomic_write, remove_parts, write_image
+from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
+from depthpose.core.files.disk import refused_write
+from depthpose.core.loop.state import STATE, write_state
 from depthpose.core.loop.task import Evidence
 
-_STATE = "state.pt"
 _METRICS = "metrics.jsonl"
 _PICTURES = "pictures"
+_MOST = 2**63
+"""A whole number beyond is no count, and none that is shown."""
 
 
 class Journal:
@@ -34,6 +35,7 @@ class Journal:
         self.folder = folder
         self._is_writer = is_writer
         self._board: Any = None
+        self._has_good_last = True
 
     def open(self, step: int) -> None:
         """Begin at ``step``: what a kill left behind goes, lines of later steps and half files."""
@@ -49,16 +51,18 @@ class Journal:
             from torch.utils.tensorboard.writer import SummaryWriter
         except ImportError as error:
             raise MissingExtraError("tensorboard", "train", "training") from error
-        self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
+        with refused_write(self.folder):
+            self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
 
     def log(self, step: int, numbers: Mapping[str, float]) -> None:
         """Append one line of metrics."""
         if not self._is_writer:
             return
-        with (self.folder / _METRICS).open("a") as file:
-            file.write(json.dumps({"step": step, **numbers}) + "\n")
-        for name, value in numbers.items():
-            self._board.add_scalar(name, value, step)
+        with refused_write(self.folder / _METRICS):
+            with (self.folder / _METRICS).open("a") as file:
+                file.write(json.dumps({"step": step, **numbers}) + "\n")
+            for name, value in numbers.items():
+                self._board.add_scalar(name, value, step)
 
     def show(self, step: int, evidence: Evidence) -> None:
         """Write what validation found."""
@@ -68,47 +72,57 @@ class Journal:
             self.log(step, evidence.numbers)
         for name, picture in evidence.pictures.items():
             write_image(self.folder / _PICTURES / f"{step:07d}_{name}.png", picture)
-            self._board.add_image(name, picture, step)
+            with refused_write(self.folder):
+                self._board.add_image(name, picture, step)
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Write the state in place of the last one, all or nothing."""
+        """Write the last state, all or nothing; the one until now becomes the one before."""
         if self._is_writer:
-            with atomic_write(self.folder / _STATE) as part:
-                torch.save(dict(state), part)
+            write_state(self.folder, state, keeps_last=self._has_good_last)
+            self._has_good_last = True
+
+    def goes_on_from(self, state: Path) -> None:
+        """Let the next state not push out the one that the training goes on from."""
+        self._has_good_last = state.name == STATE
 
     def close(self) -> None:
         """Flush what TensorBoard holds back."""
         if self._board is not None:
-            self._board.close()
-
-
-def has_state(folder: Path) -> bool:
-    """Whether a run of this folder can be resumed."""
-    return (folder / _STATE).is_file()
-
-
-def read_state(folder: Path) -> Mapping[str, Any]:
-    """Read the state that :meth:`Journal.save` wrote.
-
-    Raises:
-        InputError: damaged, or not ours.
-    """
-    state = read_torch_file(folder / _STATE)
-    missing = {"step", "modules", "optimizers"} - set(state)
-    if missing:
-        raise InputError(f"{folder / _STATE}: has no {sorted(missing)}; it is no state of a run.")
-    return state
+            with refused_write(self.folder):
+                self._board.close()
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Read the metrics of a run; a last line that a kill cut short is left out."""
+    """Read the metrics of a run; a last line that a kill cut short is left out.
+
+    Raises:
+        InputError: another line is damaged: no step and numbers by name.
+    """
     path = folder / _METRICS
     if not path.is_file():
         return []
-    rows: list[dict[str, Any]] = []
-    for line in path.read_text().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
-    return rows
+    *lines, rest = read_text(path).split("\n")
+    rows = [_row(line) for line in lines]
+    if None in rows:
+        raise InputError(
+            f"{path}: line {rows.index(None) + 1} is no step with numbers. Delete that line, or "
+            "the file: it holds curves alone, and no training goes on from it."
+        )
+    last = _row(rest)
+    return [row for row in (*rows, last) if row is not None]
+
+
+def _row(line: str) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(row, dict) or not all(map(_is_number, row.values())):
+        return None
+    return row if isinstance(row.get("step"), int) else None
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return isinstance(value, float) or abs(value) < _MOST

@@ -19,7 +19,8 @@ from torch.utils.data import DataLoader
 from depthpose.core.errors import InputError
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.host import leave_signals_to_the_loop, make_accelerator, polite_stop
-from depthpose.core.loop.journal import Journal, has_state, read_state
+from depthpose.core.loop.journal import Journal
+from depthpose.core.loop.state import Parts, restore_last, saved_states
 from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
 
 
@@ -60,15 +61,17 @@ def train(
         samples: training samples by ticket.
         config: how long and how.
         folder: the run folder.
-        resume: go on from the folder's last state; the result is that of an uninterrupted run.
+        resume: go on from the folder's last state, or, where it is damaged, with a notice from the
+            one before; the result is that of an uninterrupted run.
         on_step: told after each step, in the main process.
 
     Returns:
         What it took, in seconds, together with the runs that it resumed.
 
     Raises:
-        InputError: nothing to train on, a folder with a state and no ``resume``, a precision that
-            this machine lacks, or a loss that is no longer finite.
+        InputError: nothing to train on, a folder with a state and no ``resume``, states that are
+            all damaged or of another network, a precision that this machine lacks, or a loss that
+            is no longer finite.
         Interrupted: asked to stop; the state is saved first.
     """
     if not len(samples):
@@ -95,7 +98,8 @@ class _Run:
     def start(self, *, resume: bool) -> None:
         """Bring everything to the device and, where asked, to the state of an earlier run."""
         folder = self.journal.folder
-        if has_state(folder) and not resume:
+        saved = saved_states(folder)
+        if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
         for module in self.task.modules.values():
             module.to(self.accelerator.device)
@@ -103,12 +107,14 @@ class _Run:
             name: self.accelerator.prepare(optimizer)
             for name, (optimizer, _) in self.task.optimizers.items()
         }
-        if not (resume and has_state(folder)):
+        if not saved:
             self._agree_on_weights()
         if self.config.ema_decay is not None:
             self.average = {name: _copied(m) for name, m in self.task.modules.items()}
-        if resume and has_state(folder):
-            self._restore(read_state(folder))
+        if saved:
+            path, self.step, seconds = restore_last(folder, self._parts())
+            self._began -= seconds
+            self.journal.goes_on_from(path)
         self.journal.open(self.step)
 
     @property
@@ -145,16 +151,15 @@ class _Run:
 
     def save(self) -> None:
         """Write the state, all or nothing."""
-        scaler = self.accelerator.scaler
-        self.journal.save(
-            {
-                "step": self.step,
-                "seconds": self.seconds,
-                "modules": {name: m.state_dict() for name, m in self.task.modules.items()},
-                "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
-                "scaler": {} if scaler is None else scaler.state_dict(),
-                "average": self.average,
-            }
+        now = {"step": self.step, "seconds": self.seconds}
+        self.journal.save({**now, **self._parts().state()})
+
+    def _parts(self) -> Parts:
+        return Parts(
+            modules=self.task.modules,
+            optimizers=self.optimizers,
+            scaler=self.accelerator.scaler,
+            average=self.average,
         )
 
     def _take_step(self, micro_batches: list[Any]) -> None:
@@ -190,7 +195,7 @@ class _Run:
         optimizer = self.optimizers[name]
         _, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
-            group["lr"] = adam.rate_at(self.step, self.steps)
+            group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
         parameters = _parameters(optimizer)
         if self.world > 1:
             self._average_gradients(parameters)
@@ -284,19 +289,6 @@ class _Run:
                     held.lerp_(tensor, 1 - decay)
                 else:
                     held.copy_(tensor)
-
-    def _restore(self, state: Any) -> None:  # noqa: ANN401
-        self.step = int(state["step"])
-        self._began -= float(state.get("seconds", 0.0))  # older states do not know it
-        for name, module in self.task.modules.items():
-            module.load_state_dict(state["modules"][name])
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
-        if self.accelerator.scaler is not None and state["scaler"]:
-            self.accelerator.scaler.load_state_dict(state["scaler"])
-        for name, held in self.average.items():
-            for key, tensor in state["average"][name].items():
-                held[key].copy_(tensor)
 
 
 class _Tickets:

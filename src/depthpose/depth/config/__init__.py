@@ -1,10 +1,13 @@
 """Every knob of the depth room: frozen dataclasses that refuse a value where it is born."""
 
 from depthpose.depth.config.data import AugmentConfig as AugmentConfig
+from depthpose.depth.config.data import DegradeConfig as DegradeConfig
 from depthpose.depth.config.data import PairsConfig as PairsConfig
 from depthpose.depth.config.data import StreetsConfig as StreetsConfig
+from depthpose.depth.config.data import TruthKind as TruthKind
 from depthpose.depth.config.matching import FloorName as FloorName
 from depthpose.depth.config.matching import MatcherConfig as MatcherConfig
 from depthpose.depth.config.matching import PSMNetConfig as PSMNetConfig
 from depthpose.depth.config.matching import SGBMConfig as SGBMConfig
 from depthpose.depth.config.synthesis import GeneratorConfig as GeneratorConfig
+from depthpose.depth.config.synthesis import SelectionConfig as SelectionConfig

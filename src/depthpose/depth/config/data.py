@@ -5,6 +5,10 @@ from typing import Literal
 
 from depthpose.core.errors import InputError
 
+TruthKind = Literal["scan", "annotated", "disparity"]
+"""scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
+(KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentConfig:
@@ -14,7 +18,8 @@ class AugmentConfig:
     """Rows and columns of the crop."""
 
     scale: tuple[float, float] = (1.0, 1.0)
-    """Range of the size at which a pair is seen; images that are too small for the crop grow."""
+    """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
+    on the right and below, never enlarged: another size would be another focal length."""
 
     jitter: float = 0.2
     """Brightness, contrast and saturation are each scaled by 1 +- this."""
@@ -100,6 +105,11 @@ class PairsConfig:
     exclude: tuple[str, ...] = ()
     """Names of frames to leave out."""
 
+    truth: TruthKind | None = None
+    """Which truth of the folders is learnt from, one kind alone; frames without it are left out.
+    None: the one kind that a folder has; a folder with several is refused. Streets that are made
+    while training have exact disparity, whatever this says."""
+
     limit: int | None = None
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
 
@@ -118,3 +128,49 @@ class PairsConfig:
             raise InputError(f"limit must be 1 pair or more, got {self.limit}")
         if self.focal_px is not None and self.focal_px <= 0:
             raise InputError(f"focal_px must be positive, got {self.focal_px}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradeConfig:
+    """Random changes of an input image alone: what carries synthetic images over to real ones."""
+
+    colour: float = 0.35
+    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+
+    hue_share: float = 0.1
+    """Share of images whose channels are exchanged."""
+
+    veil_share: float = 0.2
+    """Share of images under a veil of haze."""
+
+    glare_share: float = 0.2
+    """Share of images with a light in them."""
+
+    blur_share: float = 0.4
+    """Share of images that are blurred."""
+
+    blur_px: float = 1.2
+    """Largest standard deviation of the blur [px]."""
+
+    noise_share: float = 0.6
+    """Share of images with noise."""
+
+    noise: float = 0.04
+    """Largest standard deviation of the noise; white is 1."""
+
+    jpeg_share: float = 0.3
+    """Share of images that go through JPEG."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        for name in ("hue", "veil", "glare", "blur", "noise", "jpeg"):
+            share = getattr(self, f"{name}_share")
+            if not 0 <= share <= 1:
+                raise InputError(f"{name}_share must be from 0 to 1, got {share}")
+        if not 0 <= self.colour < 1:
+            raise InputError(f"colour must be in [0, 1), got {self.colour}")
+        if self.blur_px < 0.3 or self.noise < 0:
+            raise InputError(
+                f"blur_px must be 0.3 or more and noise 0 or more, got {self.blur_px} and "
+                f"{self.noise}"
+            )

@@ -61,7 +61,8 @@ class MatcherConfig:
     """Where to compute: cpu, cuda, cuda:1, ..."""
 
     precision: Literal["fp32", "bf16"] = "fp32"
-    """fp32 is exact; bf16 is faster and halves the memory, at some hundredths of a pixel."""
+    """fp32 is exact; bf16 is faster and halves the memory, at some hundredths of a pixel. A
+    processor without bf16 (AVX-512, AMX) takes fp32."""
 
     max_memory_bytes: int | None = None
     """Bound on the memory of activations, exact (no tiles); None: no bound."""

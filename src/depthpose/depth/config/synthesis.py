@@ -1,4 +1,4 @@
-"""Knobs of the view synthesis network."""
+"""Knobs of the two view synthesis networks: the one that paints, and the one that selects."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -40,11 +40,7 @@ class GeneratorConfig:
             raise InputError(f"levels must be 2 .. 10, got {self.levels}; take 8")
         if self.test_mode not in ("running", "batch"):
             raise InputError(f"test_mode must be 'running' or 'batch', got {self.test_mode!r}")
-        if self.virtual_focal_px <= 0 or self.virtual_baseline_m <= 0:
-            raise InputError(
-                f"the virtual rig needs a positive focal length and baseline, got "
-                f"{self.virtual_focal_px} px and {self.virtual_baseline_m} m"
-            )
+        _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -55,3 +51,64 @@ class GeneratorConfig:
     def side_multiple_px(self) -> int:
         """Both sides of an image are multiples of this [px]."""
         return 2**self.levels
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionConfig:
+    """Size and conventions of the network that selects the right view, and its rig.
+
+    It answers, for each pixel of either view, a distribution over disparities and the sky. As with
+    :class:`GeneratorConfig`, an image is brought to ``virtual_focal_px`` before.
+    """
+
+    encoder_width: float = 1.0
+    """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights are of 1."""
+
+    widths: tuple[int, int, int, int] = (96, 64, 48, 32)
+    """Channels of the decoder at strides 16, 8, 4 and 2."""
+
+    planes: int = 32
+    """Disparities that are told apart, evenly spaced in their logarithm."""
+
+    disparity_px: tuple[float, float] = (1.2, 88.0)
+    """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
+
+    answer: Literal["own", "matched", "joined"] = "own"
+    """Where depth comes from: the distribution of the left view; the matcher on left and drawn
+    right view; or both, weighed by their confidence."""
+
+    virtual_focal_px: float = 372.0
+    """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""
+
+    virtual_baseline_m: float = 0.5327
+    """Baseline of the imitated rig [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if not 0 < self.encoder_width <= 4:
+            raise InputError(f"encoder_width must be above 0, at most 4; got {self.encoder_width}")
+        if min(self.widths) < 1 or self.planes < 2:
+            raise InputError(
+                f"widths must be 1 or more channels and planes 2 or more, got {self.widths} and "
+                f"{self.planes}"
+            )
+        if not 0 < self.disparity_px[0] < self.disparity_px[1]:
+            raise InputError(
+                f"disparity_px must be a range of positive disparities, got {self.disparity_px}"
+            )
+        if self.answer not in ("own", "matched", "joined"):
+            raise InputError(f"answer must be own, matched or joined, got {self.answer!r}")
+        _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
+
+    @property
+    def side_multiple_px(self) -> int:
+        """Both sides of an image are multiples of this [px]."""
+        return 32
+
+
+def _check_rig(focal_px: float, baseline_m: float) -> None:
+    if focal_px <= 0 or baseline_m <= 0:
+        raise InputError(
+            f"the virtual rig needs a positive focal length and baseline, got {focal_px} px and "
+            f"{baseline_m} m"
+        )

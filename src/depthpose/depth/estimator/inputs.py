@@ -7,20 +7,23 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from depthpose.core.arrays import check_image
 from depthpose.core.camera import StereoRig, check_image_matches_camera, check_rectified
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.types import StereoInput
 
 Picture = str | Path | Float[Tensor, "3 _ _"] | UInt8[np.ndarray, "_ _ 3"]
-"""A file, a tensor of RGB in [0, 1], or an array of 8-bit RGB."""
+"""A file, a tensor of RGB in [0, 1], or an array of 8-bit RGB. The order of the channels cannot be
+told from the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
 
 
-def as_tensor(image: Picture) -> Float[Tensor, "3 h w"]:
-    """Read a picture, or bring it to RGB in [0, 1].
+def as_tensor(image: object) -> Float[Tensor, "3 h w"]:
+    """Read a :data:`Picture`, or bring it to RGB in [0, 1].
 
     Raises:
-        InputError: an array that is not 8-bit, or a file that cannot be read.
+        InputError: an array that is not 8-bit (H, W, 3), a tensor that is not (3, H, W) in
+            [0, 1], or a file that cannot be read.
     """
     match image:
         case str() | Path():
@@ -30,10 +33,15 @@ def as_tensor(image: Picture) -> Float[Tensor, "3 h w"]:
                 f"the image is an array of {image.dtype}; give 8-bit RGB (H, W, 3), or a tensor "
                 "(3, H, W) of float in [0, 1]"
             )
+        case np.ndarray() if image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(
+                f"the image is an array of shape {image.shape}; give 8-bit RGB (H, W, 3): drop "
+                "alpha, repeat grey three times"
+            )
         case np.ndarray():
             return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
         case _:
-            return image
+            return check_image(image, "the image")
 
 
 def refuse_unrectified(pair: StereoInput) -> None:
@@ -56,10 +64,13 @@ def usable_right(pair: StereoInput) -> Float[Tensor, "3 h w"]:
     """Give the right view of a pair that can be matched.
 
     Raises:
-        InputError: there is none, its size is another, or the camera has no baseline.
+        InputError: there is none, its size is another, the camera has no baseline, or an image
+            does not lie in [0, 1].
     """
     if pair.right is None:
         raise InputError(f"{pair.name}: there is no right image; give right=.")
+    check_image(pair.left, f"{pair.name}: the left image")
+    check_image(pair.right, f"{pair.name}: the right image")
     if pair.right.shape != pair.left.shape:
         left, right = pair.left.shape[1:], pair.right.shape[1:]
         raise InputError(

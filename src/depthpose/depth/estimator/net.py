@@ -8,21 +8,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, SGBMConfig
+from depthpose.depth.config import MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
 from depthpose.depth.estimator.virtual import (
     focal_size,
     from_virtual,
+    join_matches,
     resize_image,
     resized_match,
     square_camera,
 )
 from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
-from depthpose.depth.synthesis import Synthesiser
+from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights, read_depth_weights
 
@@ -83,7 +85,7 @@ class FakestereoNet:
         chosen = _choose_matcher(weights, found, matcher, own, config)
         if found is None or found.generator is None:
             return cls(chosen, terms=terms)
-        return cls(chosen, Synthesiser(found.generator, run.device), terms=terms)
+        return cls(chosen, make_synthesiser(found.generator, run.device), terms=terms)
 
     def estimate(
         self,
@@ -97,7 +99,8 @@ class FakestereoNet:
         """Estimate depth of ``image``, alone or as the left one of a rectified pair.
 
         Args:
-            image: the image, the left one of a pair.
+            image: the image, the left one of a pair: a file, a tensor of RGB in [0, 1], or an
+                array of 8-bit RGB (of OpenCV's BGR, ``image[..., ::-1]``).
             camera: camera or rig, or its file of any format that is read. One image needs its
                 focal length, for the image is brought to the rig that the generator imitates; a
                 baseline is not looked at. A pair without camera gives disparity only.
@@ -113,6 +116,11 @@ class FakestereoNet:
         left = as_tensor(image)
         if isinstance(camera, str | Path):
             camera = read_camera(Path(camera), (left.shape[2], left.shape[1]))
+        if camera is not None and not isinstance(camera, Camera):
+            raise InputError(
+                f"camera is a {type(camera).__name__}; give a Camera(width=, height=, K=), or a "
+                "StereoRig for metres from a pair, or its file"
+            )
         pair = StereoInput(
             name=chosen,
             left=left,
@@ -139,30 +147,56 @@ class FakestereoNet:
 
     @torch.inference_mode()
     def estimate_many(self, images: Sequence[StereoInput]) -> list[DepthEstimate]:
-        """Estimate depth of images without right view; neighbours of one camera size go together.
+        """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
+
+        An input with a right view is matched with it, as :meth:`estimate_pair` does.
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
         found: list[DepthEstimate] = []
-        for _, group in groupby(images, self._virtual_size):
-            found += self._estimate_alone(list(group))
+        for size, group in groupby(images, self._size_alone):
+            alike = list(group)
+            is_alone = size is not None
+            found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
         return found
+
+    def _size_alone(self, image: StereoInput) -> tuple[int, int] | None:
+        """Size at the virtual rig; None for a pair."""
+        return self._virtual_size(image) if image.right is None else None
 
     def _virtual_size(self, image: StereoInput) -> tuple[int, int]:
         synthesiser, camera = self._usable_alone(image)
-        return focal_size(camera, synthesiser.generator.config.virtual_focal_px)
+        return focal_size(camera, synthesiser.config.virtual_focal_px)
 
     def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
         synthesiser, _ = self._usable_alone(images[0])
-        rig = synthesiser.generator.config
+        rig = synthesiser.config
         size = self._virtual_size(images[0])
         left = torch.stack([resize_image(image.left, *size) for image in images])
-        right = synthesiser.synthesise(left)
-        matches = self._match_many(left, right, square_camera(size, rig.virtual_focal_px))
-        parts = zip(images, right, matches, strict=True)
-        return [from_virtual(image, rig, drawn, match) for image, drawn, match in parts]
+        drawn = synthesiser.draw(left)
+        matches = self._disparities(left, drawn, square_camera(size, rig.virtual_focal_px))
+        skies = [None] * len(images) if drawn.is_sky is None else drawn.is_sky
+        parts = zip(images, matches, drawn.right, skies, strict=True)
+        return [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
+
+    def _disparities(
+        self, left: Float[Tensor, "b 3 h w"], drawn: Drawn, camera: Camera
+    ) -> list[Match]:
+        """Take the generator's own disparity, the matcher's, or both, as its weights say."""
+        assert self.synthesiser is not None, "checked before"
+        config = self.synthesiser.config
+        answer = config.answer if isinstance(config, SelectionConfig) else "matched"
+        matched = [] if answer == "own" else self._match_many(left, drawn.right, camera)
+        if answer == "matched":
+            return matched
+        assert drawn.disparity_px is not None and drawn.confidence is not None  # noqa: PT018
+        parts = zip(drawn.disparity_px, drawn.confidence, strict=True)
+        own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
+        if answer == "own":
+            return own
+        return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
 
     def _match(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
         return self._match_many(left[None], right[None], camera)[0]
@@ -192,6 +226,7 @@ class FakestereoNet:
                 f"{image.name}: there is no right image, and these weights match pairs only; give "
                 "right=, or weights with a generator ('depthpose weights list')."
             )
+        check_image(image.left, f"{image.name}: the image")
         if image.camera is None:
             raise InputError(
                 f"{image.name}: metres from one image need its focal length. Give a camera: "

@@ -2,13 +2,16 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.depth.config import GeneratorConfig
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth, resize_disparity
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
+
+SKY_M = 10_000.0
+"""What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
 
 
 def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
@@ -40,7 +43,11 @@ def resize_image(
 
 
 def from_virtual(
-    image: StereoInput, rig: GeneratorConfig, right: Tensor, match: Match
+    image: StereoInput,
+    rig: GeneratorConfig | SelectionConfig,
+    match: Match,
+    right: Float[Tensor, "3 _ _"],
+    is_sky: Bool[Tensor, "_ _"] | None,
 ) -> DepthEstimate:
     """Bring what was found at the virtual rig back to the image."""
     camera = image.camera
@@ -49,26 +56,50 @@ def from_virtual(
     seen = resized_match(match, height, width)
     imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
     depth_m = depth_from_disparity(seen.disparity_px, imitated)
-    is_rig = isinstance(camera, StereoRig)
+    disparity_px = seen.disparity_px
+    if is_sky is not None:
+        share = _resized_map(is_sky.float(), height, width)
+        is_sky = share > 0.5
+        depth_m = torch.where(is_sky, SKY_M, depth_m)
+        sky_px = float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M
+        disparity_px = torch.where(is_sky, sky_px, disparity_px)
+    if isinstance(camera, StereoRig):
+        disparity_px = disparity_from_depth(depth_m, camera)
     return DepthEstimate(
-        depth_m=depth_m,
-        disparity_px=disparity_from_depth(depth_m, camera) if is_rig else seen.disparity_px,
+        depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
+        disparity_px=disparity_px,
         confidence=seen.confidence,
         right=resize_image(right, height, width),
+        is_sky=is_sky,
     )
+
+
+def join_matches(one: Match, other: Match) -> Match:
+    """Take the mean of two disparities in the logarithm, weighed by their confidence.
+
+    Where ``other`` has no answer, or no confidence, ``one`` stands.
+    """
+    assert one.confidence is not None
+    weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
+    weight = torch.where(other.disparity_px > 0, weight, 0.0)
+    share = weight / (weight + one.confidence).clamp(min=1e-6)
+    logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
+    log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
+    return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
 
 
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
+    sure = match.confidence
     return Match(
         disparity_px=resize_disparity(match.disparity_px, height, width),
-        confidence=_resized_map(match.confidence, height, width),
+        confidence=None if sure is None else _resized_map(sure, height, width),
     )
 
 
 def _resized_map(
-    values: Float[Tensor, "_ _"] | None, height: int, width: int
-) -> Float[Tensor, "{height} {width}"] | None:
-    if values is None or values.shape == (height, width):
+    values: Float[Tensor, "_ _"], height: int, width: int
+) -> Float[Tensor, "{height} {width}"]:
+    if values.shape == (height, width):
         return values
     return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]

@@ -18,7 +18,7 @@ from depthpose.depth.disparity import (
 )
 from depthpose.depth.evaluate.protocols import Protocol, find_protocol, has_truth
 from depthpose.depth.kitti import Dataset, Frame, lidar_truth
-from depthpose.depth.metrics import garg_crop, view_errors
+from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, view_errors
 from depthpose.depth.predictions import (
     has_prediction,
     read_confidence,
@@ -26,8 +26,6 @@ from depthpose.depth.predictions import (
     read_drawn_view,
 )
 from depthpose.depth.types import DepthEstimate
-
-SMALLEST_DEPTH_M = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,9 +113,9 @@ def compare_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Compared:
     """Choose the true metres that count, and clamp the predicted ones."""
     assert isinstance(prepared.camera, StereoRig)
     truth = prepared.truth
-    counts = truth > (SMALLEST_DEPTH_M if rule.with_crop_and_cap else 0.0)
-    if rule.with_crop_and_cap:
-        counts &= (truth < cap_m) & garg_crop(*truth.shape)
+    counts = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
+    if rule.with_crop:
+        counts &= garg_crop(*truth.shape)
     return Compared(
         predicted=clamped_depth(prepared.disparity_px, prepared.camera, cap_m),
         truth=torch.where(counts, truth, torch.nan),

@@ -11,41 +11,44 @@ from depthpose.depth.kitti import Frame, has_lidar
 class Protocol:
     """How a prediction is held against the truth.
 
+    In all protocols of depth truth counts between 0.001 m and the cap, and predictions are clamped
+    to that range.
+
     Attributes:
         summary: one line for people.
         truth: ``velodyne_x`` and ``camera_z`` project one LiDAR scan; ``depth`` and ``disparity``
             read the truth that the dataset ships.
-        with_crop_and_cap: only truth inside the crop of Garg et al. and nearer than the cap counts.
+        with_crop: only truth inside the crop of Garg et al. counts.
     """
 
     summary: str
     truth: Literal["velodyne_x", "camera_z", "depth", "disparity"]
-    with_crop_and_cap: bool
+    with_crop: bool
 
 
 PROTOCOLS = {
     "eigen-raw": Protocol(
         summary="one LiDAR scan, depth = LiDAR x, Garg crop: monodepth's, and the thesis's",
         truth="velodyne_x",
-        with_crop_and_cap=True,
+        with_crop=True,
     ),
     "eigen-raw-camera": Protocol(
-        summary="the same with depth = camera z", truth="camera_z", with_crop_and_cap=True
+        summary="the same with depth = camera z", truth="camera_z", with_crop=True
     ),
     "eigen-improved": Protocol(
         summary="annotated depth maps, no crop: monodepth2's",
         truth="depth",
-        with_crop_and_cap=False,
+        with_crop=False,
     ),
     "eigen-improved-garg": Protocol(
         summary="annotated depth maps, Garg crop: BTS's, AdaBins'",
         truth="depth",
-        with_crop_and_cap=True,
+        with_crop=True,
     ),
     "kitti-2015": Protocol(
         summary="disparity: EPE and D1 (> 3 px and > 5 %), all pixels and those both views see",
         truth="disparity",
-        with_crop_and_cap=False,
+        with_crop=False,
     ),
 }
 

@@ -14,7 +14,7 @@ from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
 from depthpose.depth.stereo import PSMNetMatcher
-from depthpose.depth.synthesis import Synthesiser
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights
 
@@ -71,7 +71,7 @@ def _rig_facts(weights: DepthWeights) -> dict[str, float]:
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None and weights.matcher is not None  # noqa: PT018
-    net = FakestereoNet(PSMNetMatcher(weights.matcher), Synthesiser(weights.generator))
+    net = FakestereoNet(PSMNetMatcher(weights.matcher), make_synthesiser(weights.generator))
     for size in _SIZES:
         images, _ = _scenes(*size)
         camera = _camera(size, weights.generator.config.virtual_focal_px)

@@ -14,6 +14,7 @@ from depthpose.depth.kitti.duplicates import shrink as shrink
 from depthpose.depth.kitti.frames import Frame as Frame
 from depthpose.depth.kitti.frames import has_lidar as has_lidar
 from depthpose.depth.kitti.frames import kitti_calibration as kitti_calibration
+from depthpose.depth.kitti.frames import known_truths as known_truths
 from depthpose.depth.kitti.frames import lidar_truth as lidar_truth
 from depthpose.depth.kitti.frames import read_disparity as read_disparity
 from depthpose.depth.kitti.lidar import project_lidar as project_lidar

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig, check_image_matches_camera, read_rig
@@ -17,6 +17,7 @@ from depthpose.core.files import (
     read_map,
     read_points_bin,
 )
+from depthpose.depth.config import TruthKind
 from depthpose.depth.kitti.calibration import (
     KittiCalibration,
     read_middlebury_calibration,
@@ -44,6 +45,7 @@ class Frame:
         depth: 16-bit depth of the left image, metres x 256.
         disparity: disparity of the left image, 16-bit PNG (x 256) or PFM, hidden pixels too.
         disparity_noc: that of the pixels alone that both views see.
+        sky: 8-bit PNG of the left image, not 0 where it shows the sky.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Frame:
     depth: Path | None = None
     disparity: Path | None = None
     disparity_noc: Path | None = None
+    sky: Path | None = None
 
 
 def frame_input(frame: Frame) -> StereoInput:
@@ -78,10 +81,12 @@ def frame_truth(frame: Frame) -> StereoTruth:
     """
     depth_m = None if frame.depth is None else read_depth_png(frame.depth)
     disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
-    for path, values in ((frame.depth, depth_m), (frame.disparity, disparity_px)):
+    is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
+    parts = ((frame.depth, depth_m), (frame.disparity, disparity_px), (frame.sky, is_sky))
+    for path, values in parts:
         if path is not None and values is not None:
             _check_size(path, values, image_size(frame.left))
-    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m)
+    return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
 
 
 def frame_rig(frame: Frame) -> StereoRig | None:
@@ -124,6 +129,17 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return read(frame.calibration, width, height)
 
 
+def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
+    """Say which kinds of truth a frame has."""
+    is_annotated = frame.depth is not None and not _has_drawn_scan(frame)
+    kinds: dict[TruthKind, bool] = {
+        "scan": has_lidar(frame, "camera_z"),
+        "annotated": is_annotated,
+        "disparity": frame.disparity is not None,
+    }
+    return tuple(kind for kind, is_there in kinds.items() if is_there)
+
+
 def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
     """Whether :func:`lidar_truth` has something to draw."""
     return frame.velodyne is not None or (depth == "camera_z" and _has_drawn_scan(frame))
@@ -139,7 +155,9 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
     if frame.velodyne is None and frame.depth is not None and has_lidar(frame, depth):
-        return read_depth_png(frame.depth)
+        depth_m = read_depth_png(frame.depth)
+        _check_size(frame.depth, depth_m, image_size(frame.left))
+        return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
     pixels_from_velodyne = kitti_calibration(frame).pixels_from_velodyne
@@ -157,7 +175,7 @@ def _has_drawn_scan(frame: Frame) -> bool:
     return frame.style in ("plain", "camera") and frame.depth is not None
 
 
-def _check_size(path: Path, values: Float[Tensor, "*any h w"], size: tuple[int, int]) -> None:
+def _check_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
     height, width = values.shape[-2:]
     if (width, height) != size:
         raise InputError(

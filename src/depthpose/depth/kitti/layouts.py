@@ -58,6 +58,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
                 depth=_existing(annotated / f"{left.stem}.png"),
                 disparity=_existing(drive / "disp_occ" / f"{left.stem}.png"),
                 disparity_noc=_existing(drive / "disp_noc" / f"{left.stem}.png"),
+                sky=_existing(drive / "sky" / f"{left.stem}.png"),
             )
 
 

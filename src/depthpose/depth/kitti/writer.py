@@ -23,6 +23,7 @@ class RawFrame:
         rig: the cameras.
         disparity_px: of the left image; NaN where unknown.
         occluded: left pixels that the right view does not show.
+        is_sky: left pixels that show the sky.
         points: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None.
         camera_from_velodyne: from the LiDAR to the left camera.
     """
@@ -32,6 +33,7 @@ class RawFrame:
     rig: StereoRig
     disparity_px: Float[Tensor, "h w"]
     occluded: Bool[Tensor, "h w"]
+    is_sky: Bool[Tensor, "h w"]
     points: Float[Tensor, "n 4"] | None
     camera_from_velodyne: Float64[np.ndarray, "4 4"]
 
@@ -46,7 +48,7 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
 
     ``image_02/data``, ``image_03/data`` and ``velodyne_points/data`` are KITTI's own folders;
     disparity, which KITTI raw has not, goes beside them into ``disp_occ`` (all pixels) and
-    ``disp_noc`` (those that both views show), as 16-bit PNG x 256.
+    ``disp_noc`` (those that both views show), as 16-bit PNG x 256, and the sky into ``sky``.
 
     Args:
         folder: the dataset's root.
@@ -65,6 +67,7 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     if frame.points is not None:
         with atomic_write(home / "velodyne_points/data" / f"{name}.bin") as part:
             part.write_bytes(frame.points.float().contiguous().numpy().astype("<f4").tobytes())
+    write_image(home / "sky" / f"{name}.png", frame.is_sky.float().expand(3, -1, -1))
     seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)
     write_disparity_png(home / "disp_noc" / f"{name}.png", seen_by_both)
     write_disparity_png(_disparity_file(folder, drive, number), frame.disparity_px)

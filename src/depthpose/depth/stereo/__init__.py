@@ -8,6 +8,7 @@ from depthpose.depth.stereo.psmnet_matcher import (
     PSMNetMatcher,
     normalise,
     tile_change_px,
+    with_usable_precision,
 )
 from depthpose.depth.stereo.published import psmnet_from_published
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
@@ -28,4 +29,5 @@ __all__ = [
     "normalise",
     "psmnet_from_published",
     "tile_change_px",
+    "with_usable_precision",
 ]

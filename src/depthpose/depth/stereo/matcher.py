@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from depthpose.core.arrays import check_image
 from depthpose.core.errors import InputError
 from depthpose.depth.types import Match
 
@@ -79,41 +80,11 @@ def check_pair(left: object, right: object) -> None:
         InputError: not tensors, not ``(3, H, W)``, not float, empty, of two sizes, not finite or
             not in [0, 1].
     """
-    first, second = _checked("left", left), _checked("right", right)
+    first, second = check_image(left, "left image", 1e-3), check_image(right, "right image", 1e-3)
     if first.shape != second.shape:
         raise InputError(
             f"left image is {_size(first)} and right image {_size(second)}; a rectified pair has "
             f"one size: crop or resize both alike"
-        )
-
-
-def _checked(name: str, image: object) -> Tensor:
-    if not isinstance(image, Tensor):
-        raise InputError(
-            f"{name} image must be a tensor, got {type(image).__name__}; read files with "
-            f"core.files.read_image, or use torch.from_numpy"
-        )
-    if image.ndim != 3 or image.shape[0] != 3:
-        raise InputError(
-            f"{name} image must have shape (3, H, W), got {tuple(image.shape)}; move channels "
-            f"first, drop alpha, repeat grey three times, and match pairs one by one"
-        )
-    if not image.is_floating_point():
-        raise InputError(f"{name} image must be float in [0, 1], got {image.dtype}; divide by 255")
-    if not image.numel():
-        raise InputError(f"{name} image is empty: shape {tuple(image.shape)}; give it pixels")
-    _check_range(name, image)
-    return image
-
-
-def _check_range(name: str, image: Tensor) -> None:
-    if not bool(torch.isfinite(image).all()):
-        raise InputError(f"{name} image holds NaN or infinite values; replace or mask them first")
-    low, high = float(image.min()), float(image.max())
-    if low < -1e-3 or high > 1 + 1e-3:
-        raise InputError(
-            f"{name} image must lie in [0, 1], got {low:.4g} .. {high:.4g}; divide 8-bit values by "
-            f"255 and do not normalise: the matcher does"
         )
 
 

@@ -1,12 +1,14 @@
 """PSMNet as a matcher: images of any size in, disparity and confidence out."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import left_right_difference_px
@@ -30,16 +32,18 @@ AGREEMENT_PX = 3.0
 class PSMNetMatcher:
     """The network with the world around it: normalisation, padding, device, memory.
 
-    The weights are copied: training ``network`` further does not change this matcher.
+    The weights are copied: training ``network`` further does not change this matcher. Where the
+    processor has no bf16, ``config`` says fp32 in its place.
 
     Raises:
         InputError: the device does not exist on this machine.
     """
 
     def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
-        self.config = config or MatcherConfig()
+        config = config or MatcherConfig()
+        self._device = usable_device(config.device)
+        self.config = with_usable_precision(config)
         self.network_config = network.config
-        self._device = _usable_device(self.config.device)
         self._inference = PSMNetInference(
             network,
             DTYPES[self.config.precision],
@@ -140,6 +144,12 @@ def _moved(match: Match, device: torch.device) -> Match:
     return Match(disparity_px=match.disparity_px.to(device), confidence=confidence)
 
 
+def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
+    """Give a config whose precision its device computes in; says so where it is another."""
+    is_bf16 = usable_precision(config.precision, config.device) == "bf16"
+    return replace(config, precision="bf16" if is_bf16 else "fp32")
+
+
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
     """RGB in [0, 1] to what the network was trained on: ImageNet's mean 0 and deviation 1."""
     mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
@@ -180,14 +190,3 @@ def tile_change_px(matcher: PSMNetMatcher, left: Tensor, right: Tensor) -> float
     tiled = matcher.match(left, right).disparity_px
     whole = matcher.match_whole(left, right).disparity_px
     return float((tiled - whole).abs().mean())
-
-
-def _usable_device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(
-            f"device {name!r} cannot be used here ({str(error).splitlines()[0]}); take 'cpu'"
-        ) from error
-    return device

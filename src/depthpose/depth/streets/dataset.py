@@ -38,5 +38,6 @@ class Streets:
                 depth_m=frame.depth_m,
                 occluded=frame.occluded,
                 right_disparity_px=frame.right_disparity_px,
+                is_sky=frame.is_sky,
             ),
         )

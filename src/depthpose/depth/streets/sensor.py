@@ -1,14 +1,14 @@
 """From light to a picture: exposure, glare, blur, noise, tone, 8 bits, JPEG."""
 
 from dataclasses import dataclass
-from io import BytesIO
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
+
+from depthpose.depth.degrade import through_jpeg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h 
     signal = (signal - sensor.black) / (1 - sensor.black)
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
-    return picture if sensor.jpeg_quality is None else _jpeg(picture, sensor.jpeg_quality)
+    return picture if sensor.jpeg_quality is None else through_jpeg(picture, sensor.jpeg_quality)
 
 
 def _vignette(signal: Float[Tensor, "3 h w"], loss: float) -> Float[Tensor, "h w"]:
@@ -112,11 +112,3 @@ def _blurred(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h
         beside = torch.cat(before, axis) + torch.cat(after, axis)
         signal = signal * (1 - share) + beside * (share / 2)
     return signal
-
-
-def _jpeg(picture: Float[Tensor, "3 h w"], quality: int) -> Float[Tensor, "3 h w"]:
-    pixels = (picture.permute(1, 2, 0) * 255).round().byte().numpy()
-    file = BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
-    decoded = np.array(Image.open(file), np.float32) / 255
-    return torch.from_numpy(decoded).permute(2, 0, 1).contiguous()

@@ -1,4 +1,4 @@
-"""Left image to right image: U-Net generator, patch and pixel discriminators (pix2pix)."""
+"""Left image to right image: a U-Net that paints (pix2pix), a network that selects (Deep3D)."""
 
 from depthpose.depth.synthesis.discriminators import (
     PatchDiscriminator,
@@ -6,12 +6,26 @@ from depthpose.depth.synthesis.discriminators import (
     make_discriminator,
 )
 from depthpose.depth.synthesis.generator import UNetGenerator
-from depthpose.depth.synthesis.synthesiser import Synthesiser
+from depthpose.depth.synthesis.selection import SelectionGenerator
+from depthpose.depth.synthesis.synthesiser import (
+    Drawn,
+    Generator,
+    PaintingSynthesiser,
+    SelectionSynthesiser,
+    Synthesiser,
+    make_synthesiser,
+)
 
 __all__ = [
+    "Drawn",
+    "Generator",
+    "PaintingSynthesiser",
     "PatchDiscriminator",
     "PixelDiscriminator",
+    "SelectionGenerator",
+    "SelectionSynthesiser",
     "Synthesiser",
     "UNetGenerator",
     "make_discriminator",
+    "make_synthesiser",
 ]

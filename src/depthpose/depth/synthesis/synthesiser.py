@@ -1,11 +1,27 @@
-"""The generator with the world around it: any size, [0, 1], test-time norm."""
+"""The generators with the world around them: any size, [0, 1], test-time norm."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from depthpose.core.arrays import check_image
+from depthpose.core.devices import usable_device
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.synthesis.generator import UNetGenerator
+from depthpose.depth.synthesis.selection import (
+    Selected,
+    SelectionGenerator,
+    find_filled,
+    select,
+    shift_left,
+)
+
+Generator = UNetGenerator | SelectionGenerator
+"""A network that draws right views."""
 
 ROWS_SHARE = 0.03
 """Rows are stretched by this at most: no disparity depends on them."""
@@ -14,8 +30,76 @@ COLUMNS_SHARE = 0.01
 """Columns are stretched by this at most: depth is off by as much."""
 
 
-class Synthesiser:
-    """Draws the right view of images of any size.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """What a generator answers for left images.
+
+    Attributes:
+        right: the right views, RGB in [0, 1].
+        disparity_px: the generator's own disparity of the left view, finite in the sky too; None
+            where it has none.
+        confidence: 0 (guess) to 1 (sure) of that.
+        is_sky: where the left view shows the sky.
+        is_filled: pixels of the right view that the left image does not show.
+    """
+
+    right: Float[Tensor, "b 3 h w"]
+    disparity_px: Float[Tensor, "b h w"] | None = None
+    confidence: Float[Tensor, "b h w"] | None = None
+    is_sky: Bool[Tensor, "b h w"] | None = None
+    is_filled: Bool[Tensor, "b h w"] | None = None
+
+
+@runtime_checkable
+class Synthesiser(Protocol):
+    """Draws the right view of images of any size, as one rig would have seen it."""
+
+    @property
+    def config(self) -> GeneratorConfig | SelectionConfig:
+        """The network's knobs, and its rig."""
+        ...
+
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+        """Draw right views; images are RGB in [0, 1]."""
+        ...
+
+
+def make_synthesiser(generator: Generator, device: torch.device | str = "cpu") -> Synthesiser:
+    """Put a generator of either kind to use."""
+    if isinstance(generator, SelectionGenerator):
+        return SelectionSynthesiser(generator, device)
+    return PaintingSynthesiser(generator, device)
+
+
+class SelectionSynthesiser:
+    """Looks the right view up in the left one, and answers the left view's disparity too."""
+
+    def __init__(self, generator: SelectionGenerator, device: torch.device | str = "cpu") -> None:
+        self.device = usable_device(device)
+        self.generator = generator.to(self.device).eval()
+        self.config = generator.config
+
+    @torch.no_grad()
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+        """Draw right views; images are RGB in [0, 1].
+
+        Raises:
+            InputError: an image is no such.
+        """
+        given = _checked(left, self.device)
+        seen, other = select_views(self.generator, given)
+        parts = {
+            "right": shift_left(given, other.shift_px),
+            "disparity_px": seen.disparity_px,
+            "confidence": seen.confidence,
+            "is_sky": seen.is_sky,
+            "is_filled": find_filled(seen.shift_px, other.shift_px),
+        }
+        return Drawn(**{name: part.to(left.device) for name, part in parts.items()})
+
+
+class PaintingSynthesiser:
+    """Paints the right view of images of any size with pix2pix's U-Net.
 
     Norm and dropout follow ``config.test_mode``, which the weights record: ``running`` uses the
     statistics of training and no dropout; ``batch`` those of the image itself, as pix2pix tests,
@@ -23,29 +107,62 @@ class Synthesiser:
     """
 
     def __init__(self, generator: UNetGenerator, device: torch.device | str = "cpu") -> None:
-        self.generator = generator.to(device).eval()
-        self.device = torch.device(device)
+        self.device = usable_device(device)
+        self.generator = generator.to(self.device).eval()
+        self.config = generator.config
         if generator.config.test_mode == "batch":
             _keep_training(self.generator)
 
     @torch.no_grad()
-    def synthesise(self, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Draw right views; images are RGB in [0, 1]."""
-        if self.generator.config.test_mode == "batch" and len(left) > 1:
-            # The statistics are those of one image: company would change them.
-            return torch.cat([self.synthesise(image[None]) for image in left])
-        return draw_right(self.generator, left.to(self.device, torch.float32)).to(left.device)
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+        """Draw right views; images are RGB in [0, 1].
+
+        Raises:
+            InputError: an image is no such.
+        """
+        given = _checked(left, self.device)
+        # The statistics of test mode 'batch' are those of one image: company would change them.
+        groups = given.split(1) if self.config.test_mode == "batch" else [given]
+        drawn = [draw_right(self.generator, part) for part in groups]
+        return Drawn(right=torch.cat(drawn).to(left.device))
 
 
-def draw_right(
-    generator: UNetGenerator, left: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, "b 3 h w"]:
+def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tensor, "b 3 h w"]:
+    for image in left:
+        check_image(image, "the left image")
+    return left.to(device, torch.float32)
+
+
+def select_views(
+    generator: SelectionGenerator, left: Float[Tensor, "b 3 h w"]
+) -> tuple[Selected, Selected]:
+    """Answer disparity, sky and confidence of the left and of the right view; gradients flow.
+
+    Args:
+        generator: the network.
+        left: images of any size, RGB in [0, 1].
+    """
+    height, width = left.shape[-2:]
+    multiple = generator.config.side_multiple_px
+    # Even, since logits stand for two rows and two columns.
+    rows = _even(_near_multiple(height, multiple, ROWS_SHARE))
+    columns = _even(_near_multiple(width, multiple, COLUMNS_SHARE))
+    padded = pad_to_multiple(_resized(left, rows, columns), multiple)
+    kept = (logits[..., : rows // 2, : columns // 2] for logits in generator(padded))
+    scale = width / columns
+    first, second = (select(part, generator.planes * scale, (height, width)) for part in kept)
+    return first, second
+
+
+def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
     """Draw right views of any size, RGB in [0, 1]; gradients flow.
 
     Sides close to a multiple of what the network takes are resized to it, others padded by
     reflection. Mirrored rows move the horizon's place in the image, which tells the ground's depth:
     193 rows padded to 256, where 192 were trained, drew views of 15 % too little disparity.
     """
+    if isinstance(generator, SelectionGenerator):
+        return shift_left(left, select_views(generator, left)[1].shift_px)
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
     rows = _near_multiple(height, multiple, ROWS_SHARE)
@@ -58,6 +175,10 @@ def draw_right(
 def _near_multiple(side_px: int, multiple: int, share: float) -> int:
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
+
+
+def _even(side_px: int) -> int:
+    return max(side_px // 2 * 2, 2)
 
 
 def _resized(

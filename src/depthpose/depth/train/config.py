@@ -3,8 +3,15 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
-from depthpose.depth.config import GeneratorConfig, PairsConfig, PSMNetConfig
+from depthpose.depth.config import (
+    DegradeConfig,
+    GeneratorConfig,
+    PairsConfig,
+    PSMNetConfig,
+    SelectionConfig,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +54,81 @@ class ViewTraining:
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=200.0))
     """How long."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectTraining:
+    """Stage 1 of the generator that selects, in place of :class:`ViewTraining`."""
+
+    generator: SelectionConfig = field(default_factory=SelectionConfig)
+    """The network that is trained."""
+
+    encoder: str | None = None
+    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0')."""
+
+    start: str | None = None
+    """Weights of the whole generator to begin with (or a whole set)."""
+
+    with_fixed_start: bool = True
+    """Keep the encoder's first layers and its batch norm statistics: right for ImageNet's weights,
+    wrong for an encoder that begins at random."""
+
+    encoder_rate: float = 0.3
+    """Learning rate of the encoder as a share of the decoder's."""
+
+    disparity_loss: Literal["log", "pixel"] = "log"
+    """Error of disparity's logarithm, or of disparity in shares of the largest."""
+
+    plane_weight: float = 0.2
+    """Weight of the cross entropy over sky and disparities."""
+
+    right_share: float = 0.5
+    """Weight of the right view's disparity against the left one's."""
+
+    view_weight: float = 1.0
+    """Weight of the drawn right view, where there is a real one."""
+
+    adam: AdamConfig = field(
+        default_factory=lambda: AdamConfig(
+            learning_rate=1e-3, schedule="cosine", warmup_steps=100, weight_decay=1e-2
+        )
+    )
+    """The optimiser."""
+
+    pairs: PairsConfig = field(default_factory=PairsConfig)
+    """Training pairs; frames without truth or without a right view teach what they can."""
+
+    more: PairsConfig | None = None
+    """Other pairs to mix in, e.g. real ones beside synthetic ones."""
+
+    more_share: float = 0.5
+    """Share of the samples that come from ``more``."""
+
+    degrade: DegradeConfig = field(default_factory=DegradeConfig)
+    """Changes of the input image alone."""
+
+    held_out: PairsConfig | None = None
+    """Pairs that validation looks at."""
+
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(steps=20_000, batch_size=8, clip_norm=5.0)
+    )
+    """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse weights and shares that are none."""
+        shares = {"more_share": self.more_share, "encoder_rate": self.encoder_rate}
+        for name, value in shares.items():
+            if not 0 <= value <= 1:
+                raise InputError(f"{name} must be from 0 to 1, got {value}")
+        weights = {
+            "plane_weight": self.plane_weight,
+            "right_share": self.right_share,
+            "view_weight": self.view_weight,
+        }
+        for name, value in weights.items():
+            if value < 0:
+                raise InputError(f"{name} must be 0 or more, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.losses import disparity_loss, l1_loss
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import normalise
-from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.synthesis import Generator
 from depthpose.depth.synthesis.synthesiser import draw_right
 from depthpose.depth.train.config import FinetuneTraining
 from depthpose.depth.train.pairs import TrainingPairs
@@ -25,7 +25,7 @@ class FinetuneTask:
 
     def __init__(
         self,
-        generator: UNetGenerator,
+        generator: Generator,
         matcher: PSMNet,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
@@ -40,7 +40,7 @@ class FinetuneTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Turn]:
         """One turn: draw, match, compare with the truth."""
-        drawn = (self.generator(2 * batch.left - 1) + 1) / 2
+        drawn = draw_right(self.generator, batch.left)
         (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         reach = self.matcher.config.max_disparity_px
         found_px = found_px.float()

@@ -1,25 +1,33 @@
 """Pairs, on disk or made, as training samples by ticket."""
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.loop import shuffled_index, ticket_generator
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
-from depthpose.depth.config import PairsConfig
+from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
-from depthpose.depth.kitti import Dataset, open_dataset
-from depthpose.depth.kitti.frames import Frame, lidar_truth
+from depthpose.depth.kitti import Dataset, known_truths, lidar_truth, open_dataset
 from depthpose.depth.streets import Streets, kitti_rig, street_rig
-from depthpose.depth.types import StereoSample
 
 BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""
+
+
+class _Place(NamedTuple):
+    """Where a pair comes from: a source, its number there, and the truth that is read."""
+
+    source: Dataset | Streets
+    number: int
+    truth: TruthKind | None
 
 
 class TrainingPairs:
@@ -28,12 +36,18 @@ class TrainingPairs:
     Args:
         config: which pairs, and how.
         seed: decides order and changes.
-        needs_truth: leave out frames without disparity or depth.
+        needs_truth: read truth, and leave out frames without the kind that ``config.truth`` names.
+        is_mixed: take frames without truth, and frames without a right view, too. A left image
+            alone stands for both views.
         baseline_m: refuse pairs whose baseline is another (beyond 2 %).
 
+    Attributes:
+        truths: which kind of truth each source gives, ``NAME: KIND``; empty where none is needed.
+
     Raises:
-        InputError: no folder, no usable pair, an excluded frame that is not there, or a pair
-            without calibration where the focal length or depth needs one.
+        InputError: no folder, a folder without a usable pair, or with several kinds of truth of
+            which none is chosen, an excluded frame that is not there, or a pair without
+            calibration where the focal length or depth needs one.
     """
 
     def __init__(
@@ -42,17 +56,19 @@ class TrainingPairs:
         seed: int,
         *,
         needs_truth: bool,
+        is_mixed: bool = False,
         baseline_m: float | None = None,
     ) -> None:
         self.config, self.seed = config, seed
-        self._frames = _find_frames(config, needs_truth=needs_truth)
-        self._needs_truth = needs_truth
+        self._places = _find_places(config, needs_truth=needs_truth, is_mixed=is_mixed)
+        said = (f"{_name(place.source)}: {place.truth}" for place in self._places if place.truth)
+        self.truths = tuple(dict.fromkeys(said))
         if baseline_m is not None:
             self._check_baselines(baseline_m)
-        self._cache: dict[int, tuple[Tensor, ...]] = {}
+        self._cache: dict[int, TrainingPair] = {}
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._places)
 
     def __getitem__(self, ticket: int) -> TrainingPair:
         """Make the sample of a ticket."""
@@ -66,32 +82,25 @@ class TrainingPairs:
         if index not in self._cache:
             pair = self._read(index)
             views = [(view * 255).round().to(torch.uint8) for view in (pair.left, pair.right)]
-            self._cache[index] = (*views, pair.left_px, pair.right_px)
-        left, right, left_px, right_px = self._cache[index]
-        return TrainingPair(left.float() / 255, right.float() / 255, left_px, right_px)
+            self._cache[index] = pair._replace(left=views[0], right=views[1])
+        kept = self._cache[index]
+        return kept._replace(left=kept.left.float() / 255, right=kept.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
-        dataset, place = self._frames[index]
-        sample = dataset[place]
-        given, rig = sample.input, sample.input.camera
-        assert given.right is not None, "frames without a right view were left out"
-        left_px = right_px = torch.full_like(given.left[0], torch.nan)
-        if self._needs_truth:
-            left_px = _truth_disparity(sample)
-            if left_px is None and isinstance(dataset, Dataset):
-                left_px = _scanned_disparity(dataset.frames[place], rig)
-            assert left_px is not None, "frames without truth were left out"
-            right_px = sample.truth.right_disparity_px
-            right_px = right_disparity_from_left(left_px) if right_px is None else right_px
-        pair = TrainingPair(given.left, given.right, left_px, right_px)
-        if self.config.focal_px is None:
+        pair = _read_pair(self._places[index])
+        wanted_px = self.config.focal_px
+        if wanted_px is None:
             return pair
-        if rig is None:
+        if bool(pair.focal_px.isnan()):
             raise InputError(
-                f"{given.name}: has no calibration, so it cannot be brought to a focal "
-                f"length of {self.config.focal_px} px; add one, exclude it, or leave focal_px out"
+                f"{self._frame_name(index)}: has no calibration, so it cannot be brought to a "
+                f"focal length of {wanted_px} px; add one, exclude it, or leave focal_px out"
             )
-        return scale_pair(pair, self.config.focal_px / float(rig.K[0, 0]), (1, 1))
+        return scale_pair(pair, wanted_px / float(pair.focal_px))
+
+    def _frame_name(self, index: int) -> str:
+        source, place, _ = self._places[index]
+        return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
 
     def _check_baselines(self, wanted_m: float) -> None:
         """Look at every rig before any work: a pair of another one would teach other metres."""
@@ -109,76 +118,130 @@ class TrainingPairs:
                 )
 
     def _rigs(self) -> Iterator[tuple[str, StereoRig | None]]:
-        for dataset, place in self._frames:
-            if isinstance(dataset, Dataset):
-                yield dataset.frames[place].name, dataset.read_rig(place)
-            elif dataset.config.rigs != "kitti":
-                yield f"street {place}", street_rig(dataset.config, place)[0]
+        for number, (source, place, _) in enumerate(self._places):
+            if isinstance(source, Dataset):
+                yield self._frame_name(number), source.read_rig(place)
+            elif source.config.rigs != "kitti":
+                yield self._frame_name(number), street_rig(source.config, place)[0]
         made = self.config.streets
         if made is not None and made.rigs == "kitti":  # five rigs, and perhaps millions of streets
             yield from ((f"street with KITTI's rig {n}", kitti_rig(n)) for n in range(5))
 
 
-def _truth_disparity(sample: StereoSample) -> Float[Tensor, "h w"] | None:
-    """Disparity that the dataset knows, or that follows from depth."""
-    truth, rig = sample.truth, sample.input.camera
-    if truth.disparity_px is not None:
-        return truth.disparity_px
-    if truth.depth_m is not None and isinstance(rig, StereoRig):
-        return disparity_from_depth(truth.depth_m, rig)
-    return None
+def _read_pair(place: _Place) -> TrainingPair:
+    """Read a pair as it is, and its truth where one is asked for."""
+    source, index, kind = place
+    left_px = right_px = None
+    if isinstance(source, Dataset):
+        given = source.read_input(index)
+        rig = given.camera if isinstance(given.camera, StereoRig) else None
+        if kind is not None:
+            left_px = _truth_on_disk(source, index, kind, rig)
+    else:
+        made = source[index]
+        given, rig = made.input, made.input.camera
+        if kind is not None:
+            exact = (made.truth.disparity_px, made.truth.right_disparity_px)
+            left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
+    if left_px is None:
+        left_px = torch.full_like(given.left[0], torch.nan)
+    focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
+    if given.right is None:
+        return TrainingPair(given.left, given.left, left_px, left_px, focal_px)
+    right_px = right_disparity_from_left(left_px) if right_px is None else right_px
+    return TrainingPair(given.left, given.right, left_px, right_px, focal_px)
 
 
-def _scanned_disparity(frame: Frame, rig: Camera | None) -> Float[Tensor, "h w"] | None:
-    """Disparity of the LiDAR points alone."""
-    if frame.velodyne is None:
-        return None
-    if not isinstance(rig, StereoRig):
+def _truth_on_disk(
+    dataset: Dataset, index: int, kind: TruthKind, rig: StereoRig | None
+) -> Float[Tensor, "h w"]:
+    """Disparity of the left view by one kind of truth; 0 in the sky, where that is known."""
+    frame = dataset.frames[index]
+    if kind == "disparity":
+        truth = dataset.read_truth(index)
+        assert truth.disparity_px is not None, "frames without truth were left out"
+        if truth.is_sky is None:
+            return truth.disparity_px
+        return torch.where(truth.is_sky, 0.0, truth.disparity_px)
+    if rig is None:
         raise InputError(
-            f"{frame.name}: has a LiDAR scan but no calibration, so it is no truth; add the "
-            "calibration, or exclude the frame"
+            f"{frame.name}: has depth as its truth but no calibration of the pair, so it cannot "
+            "become disparity; add the calibration, or exclude the frame"
         )
-    return disparity_from_depth(lidar_truth(frame, "camera_z"), rig)
+    is_scan = kind == "scan"
+    depth_m = lidar_truth(frame, "camera_z") if is_scan else dataset.read_truth(index).depth_m
+    assert depth_m is not None, "frames without truth were left out"
+    return disparity_from_depth(depth_m, rig)
 
 
-def _find_frames(config: PairsConfig, *, needs_truth: bool) -> list[tuple[Dataset | Streets, int]]:
+def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[_Place]:
     if not config.folders and config.streets is None:
         raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
     excluded = set(config.exclude)
-    found: list[tuple[Dataset | Streets, int]] = []
+    found: list[_Place] = []
     if config.streets is not None:
         made = Streets(config.streets)
-        places = [(made, place) for place in range(len(made))]
-        found += places if config.limit is None else _spread(places, config.limit)
+        exact: TruthKind | None = "disparity" if needs_truth else None
+        found += _spread([_Place(made, index, exact) for index in range(len(made))], config.limit)
     for number, folder in enumerate(config.folders):
         dataset = open_dataset(Path(folder), config.split if number == 0 else None)
-        usable: list[tuple[Dataset | Streets, int]] = [
-            (dataset, place)
-            for place, frame in enumerate(dataset.frames)
-            if frame.name not in config.exclude and _is_usable(frame, needs_truth=needs_truth)
-        ]
         excluded -= {frame.name for frame in dataset.frames}
-        found += usable if config.limit is None else _spread(usable, config.limit)
+        usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+        found += _spread(usable, config.limit)
     if excluded:
         raise InputError(
             f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
             "train on what should be left out"
         )
-    if not found:
-        what = "a right view and a truth" if needs_truth else "a right view"
-        raise InputError(f"{', '.join(config.folders)}: no frame has {what}; nothing to train on.")
     return found
 
 
-def _is_usable(frame: Frame, *, needs_truth: bool) -> bool:
-    has_truth = frame.disparity or frame.depth or frame.velodyne
-    return frame.right is not None and bool(has_truth or not needs_truth)
+def _usable(
+    dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
+) -> list[_Place]:
+    """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
+    there = {
+        index: known_truths(frame)
+        for index, frame in enumerate(dataset.frames)
+        if (frame.right is not None or is_mixed) and frame.name not in config.exclude
+    }
+    kind = _choose_truth(dataset.name, there.values(), config.truth) if needs_truth else None
+    places = [
+        _Place(dataset, index, kind if kind in kinds else None) for index, kinds in there.items()
+    ]
+    if is_mixed:  # an image alone without truth teaches nothing
+        found = [p for p in places if p.truth or dataset.frames[p.number].right is not None]
+    else:
+        found = [p for p in places if p.truth or not needs_truth]
+    if not found:
+        what = " or ".join if is_mixed else " and ".join
+        parts = ["a right view", "a truth"] if needs_truth or is_mixed else ["a right view"]
+        raise InputError(f"{dataset.name}: no frame has {what(parts)}; nothing to train on.")
+    return found
 
 
-def _spread(
-    items: Sequence[tuple[Dataset | Streets, int]], count: int
-) -> list[tuple[Dataset | Streets, int]]:
+def _choose_truth(
+    name: str, kinds: Iterable[Sequence[TruthKind]], wanted: TruthKind | None
+) -> TruthKind | None:
+    """One kind of truth for all frames of a folder."""
+    counts: Counter[TruthKind] = Counter(kind for of_frame in kinds for kind in of_frame)
+    said = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
+    if wanted is not None and counts and wanted not in counts:
+        raise InputError(f"{name}: no frame has truth: {wanted}; there is {said}")
+    if wanted is None and len(counts) > 1:
+        raise InputError(
+            f"{name}: has several kinds of truth ({said}), and one kind alone is learnt from; set "
+            f"truth in pairs (or held_out) of the config to one of {', '.join(counts)}"
+        )
+    return wanted or next(iter(counts), None)
+
+
+def _name(source: Dataset | Streets) -> str:
+    return source.name if isinstance(source, Dataset) else "made streets"
+
+
+def _spread(items: Sequence[_Place], count: int | None) -> list[_Place]:
     """Take ``count`` items at equal distances: neighbours in a drive look alike."""
-    if count >= len(items):
+    if count is None or count >= len(items):
         return list(items)
     return [items[round(k * (len(items) - 1) / max(count - 1, 1))] for k in range(count)]

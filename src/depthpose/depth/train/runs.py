@@ -12,23 +12,33 @@ from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, Progress, Task, held_out_text, leave_card, train
 from depthpose.core.run import claim_folder, find_shard
-from depthpose.depth.config import GeneratorConfig, PairsConfig
+from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
-from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
+from depthpose.depth.synthesis.lite0 import read_lite0
+from depthpose.depth.train.config import (
+    FinetuneTraining,
+    SelectTraining,
+    StereoTraining,
+    ViewTraining,
+)
 from depthpose.depth.train.finetune import FinetuneTask
 from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.select import SelectTask
+from depthpose.depth.train.select_pairs import SelectionSamples
 from depthpose.depth.train.stereo import StereoTask
 from depthpose.depth.train.view import ViewTask
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Knobs of the loop that change no weight: a resumed run may have others."""
-_BEGINS_WITH = ("start", "generator", "matcher")
+_BEGINS_WITH = ("start", "encoder", "generator", "matcher")
 """Knobs that may name weights."""
 _MEASURED = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
+    "select": "Depth from left images that were held out: mean relative error (abs_rel), share "
+    "within 25 % (d1), share of the sky that is missed.",
     "stereo": "Disparity of pairs that were held out: mean error (px), and the share of "
     "pixels off by more than 3 px and 5 % (d1).",
     "finetune": "Disparity from left images that were held out, by the drawn right view: "
@@ -67,6 +77,35 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     return _leave(run, "view", facts, seconds, generator=generator)
 
 
+def train_select(config: SelectTraining, run: Run) -> Path:
+    """Train the generator that selects; give its weights file."""
+    torch.manual_seed(config.loop.seed)
+    rig = config.generator
+    config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
+    if config.more is not None:
+        config = replace(config, more=_at_virtual_focal(config.more, rig))
+    sources = [
+        TrainingPairs(
+            pairs,
+            config.loop.seed,
+            needs_truth=True,
+            is_mixed=True,
+            baseline_m=rig.virtual_baseline_m,
+        )
+        for pairs in (config.pairs, config.more)
+        if pairs is not None
+    ]
+    samples = SelectionSamples(sources, config.more_share, config.degrade, config.loop.seed)
+    generator = SelectionGenerator(rig)
+    if config.encoder is not None:
+        generator.encoder.load_state_dict(read_lite0(find_weights(config.encoder)).state_dict())
+    if config.start is not None:
+        _start_from(generator, read_generator(find_weights(config.start)), config.start)
+    held_out = _held_out(config.held_out, needs_truth=True)
+    facts, seconds = _walk(SelectTask(generator, config, held_out), samples, config, run)
+    return _leave(run, "select", facts, seconds, generator=generator)
+
+
 def train_stereo(config: StereoTraining, run: Run) -> Path:
     """Train the matcher; give its weights file."""
     _refuse_wrong_gradients(config)
@@ -102,6 +141,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
 
 STAGES = {
     "view": (ViewTraining, train_view),
+    "select": (SelectTraining, train_select),
     "stereo": (StereoTraining, train_stereo),
     "finetune": (FinetuneTraining, train_finetune),
 }
@@ -110,7 +150,7 @@ STAGES = {
 
 def _walk(
     task: Task,
-    pairs: TrainingPairs,
+    pairs: TrainingPairs | SelectionSamples,
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
@@ -121,7 +161,9 @@ def _walk(
     named = {knob: name for knob in _BEGINS_WITH if isinstance(name := settings.get(knob), str)}
     for knob, name in named.items():
         settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
-    facts = _facts(config, tuple(named.values()))
+    if pairs.truths:
+        settings["truth"] = list(pairs.truths)
+    facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
     claim_folder(run.folder, settings)
     write_config(run.folder / "config.yaml", config)
@@ -129,14 +171,23 @@ def _walk(
     return facts, seconds
 
 
-def _facts(config: Any, began_with: Sequence[str]) -> dict[str, str]:  # noqa: ANN401
+def _facts(
+    config: Any,  # noqa: ANN401
+    truths: Sequence[str],
+    began_with: Sequence[str],
+) -> dict[str, str]:
     """Say what the card says before anything is measured; terms of what it begins with bind it."""
-    data = [Path(folder).name for folder in config.pairs.folders]
+    sources = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
+    data = [Path(folder).name for pairs in sources for folder in pairs.folders]
+    if any(pairs.streets for pairs in sources):
+        data.append("made streets")
     facts = {
-        "trained_on": ", ".join([*data, *(["made streets"] if config.pairs.streets else [])]),
+        "trained_on": ", ".join(data),
         "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
+    if truths:
+        facts["truth"] = ", ".join(truths)
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
     return bound_facts(facts, began_with)
@@ -148,7 +199,7 @@ def _leave(
     facts: Mapping[str, str],
     seconds: float,
     *,
-    generator: UNetGenerator | None = None,
+    generator: Generator | None = None,
     matcher: PSMNet | None = None,
 ) -> Path:
     """Write the weights and their card."""
@@ -162,15 +213,21 @@ def _leave(
     return path
 
 
-def _at_virtual_focal(pairs: PairsConfig, generator: GeneratorConfig) -> PairsConfig:
-    """Bring the pairs to the rig that the generator imitates, and refuse what would leave it."""
+def _at_virtual_focal(
+    pairs: PairsConfig, generator: GeneratorConfig | SelectionConfig
+) -> PairsConfig:
+    """Bring the pairs to the rig that the generator imitates, and refuse what would leave it.
+
+    The generator that selects may see them larger: it answers pixels of the image before it, and
+    these grow with the image. One that paints knows its own rig alone.
+    """
     focal_px = generator.virtual_focal_px
     if pairs.focal_px not in (None, focal_px):
         raise InputError(
             f"pairs.focal_px is {pairs.focal_px}, but the generator imitates a rig of {focal_px} "
             "px (virtual_focal_px); leave pairs.focal_px out"
         )
-    if pairs.augment.scale != (1.0, 1.0):
+    if pairs.augment.scale != (1.0, 1.0) and not isinstance(generator, SelectionConfig):
         raise InputError(
             f"augment.scale is {pairs.augment.scale}: another size is another focal length, and "
             "the generator imitates one; leave it out"
@@ -193,9 +250,7 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
         )
 
 
-def _start_from(
-    network: UNetGenerator | PSMNet, found: UNetGenerator | PSMNet, source: str
-) -> None:
+def _start_from(network: Generator | PSMNet, found: Generator | PSMNet, source: str) -> None:
     """Copy weights whose config is the network's own.
 
     Raises:

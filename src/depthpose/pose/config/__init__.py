@@ -5,7 +5,6 @@ from depthpose.pose.config.estimate import RefusalConfig as RefusalConfig
 from depthpose.pose.config.evaluation import DiameterTable as DiameterTable
 from depthpose.pose.config.evaluation import EvaluationConfig as EvaluationConfig
 from depthpose.pose.config.evaluation import SymmetryRule as SymmetryRule
-from depthpose.pose.config.geometry import METRES as METRES
 from depthpose.pose.config.geometry import CloudConfig as CloudConfig
 from depthpose.pose.config.geometry import IcpConfig as IcpConfig
 from depthpose.pose.config.geometry import InlierTest as InlierTest
@@ -13,6 +12,7 @@ from depthpose.pose.config.geometry import MeshConfig as MeshConfig
 from depthpose.pose.config.geometry import Unit as Unit
 from depthpose.pose.config.geometry import VotingConfig as VotingConfig
 from depthpose.pose.config.geometry import VotingMethod as VotingMethod
+from depthpose.pose.config.geometry import metres_of as metres_of
 from depthpose.pose.config.objects import ObjectsConfig as ObjectsConfig
 from depthpose.pose.config.objects import SensorConfig as SensorConfig
 from depthpose.pose.config.objects import SensorKind as SensorKind

@@ -1,9 +1,9 @@
 """Every knob of the pose room's measures."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 
 DiameterTable = Literal["bop", "pvnet"]
 SymmetryRule = Literal["declared", "all"]
@@ -28,7 +28,9 @@ class EvaluationConfig:
     """How far a surface may lie behind the measured one and count as visible (ITODD: 0.005)."""
 
     def __post_init__(self) -> None:
-        """Refuse a tolerance that is none."""
+        """Refuse other words, and a tolerance that is none."""
+        refuse_unknown("diameters", self.diameters, get_args(DiameterTable))
+        refuse_unknown("adds", self.adds, get_args(SymmetryRule))
         if not 0 < self.vsd_delta_m < 1:
             raise InputError(
                 f"vsd_delta_m is {self.vsd_delta_m}, but it is a positive part of a metre; BOP "

@@ -1,9 +1,9 @@
 """Every knob of the pose room's geometry: frozen dataclasses that refuse a value at birth."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 
 Unit = Literal["m", "mm"]
 """Unit of a model or cloud file."""
@@ -13,6 +13,16 @@ InlierTest = Literal["angle", "distance"]
 
 METRES: dict[str, float] = {"m": 1.0, "mm": 0.001}
 """Metres a unit."""
+
+
+def metres_of(unit: str) -> float:
+    """Give the metres of a unit.
+
+    Raises:
+        InputError: another word than ``m`` and ``mm``.
+    """
+    refuse_unknown("unit", unit, METRES)
+    return METRES[unit]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +129,8 @@ class VotingConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
+        refuse_unknown("method", self.method, get_args(VotingMethod))
+        refuse_unknown("inlier_test", self.inlier_test, get_args(InlierTest))
         if self.hypotheses < 1:
             raise InputError(f"hypotheses is {self.hypotheses}, but one pair at least is tried; "
                              "take 128")  # fmt: skip

@@ -21,7 +21,7 @@ from depthpose.core.camera.model import check_intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
 from depthpose.pose.bop import mask_from_rle, read_mask
-from depthpose.pose.config import METRES, Unit
+from depthpose.pose.config import Unit, metres_of
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput
 
@@ -47,7 +47,9 @@ def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInp
             f"{name}: the cloud is of shape {tuple(points.shape)}; give points as rows of x, y and "
             "z: (n, 3)"
         )
-    return CloudInput(name=name, points_m=(points.double() * METRES[unit]).float(), object=object)
+    return CloudInput(
+        name=name, points_m=(points.double() * metres_of(unit)).float(), object=object
+    )
 
 
 def view_input(
@@ -116,7 +118,7 @@ def _values(depth: AnyArray, name: str) -> Shaped[Tensor, "h w"]:
 def _metres(
     values: Shaped[Tensor, "h w"], said_m: float | None, unit: Unit | None, name: str
 ) -> Float[Tensor, "h w"]:
-    given_m = None if unit is None else METRES[unit]
+    given_m = None if unit is None else metres_of(unit)
     if values.is_floating_point():
         return torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
     if given_m is not None and said_m is not None and given_m != said_m:
@@ -165,6 +167,11 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller holds
     if isinstance(values, Tensor):
         return values.detach().cpu()
     array = np.asarray(values)
+    if array.dtype.kind not in "biufc":
+        raise InputError(
+            f"a {type(values).__name__} where numbers belong; give a tensor or array of numbers, "
+            "or a file's path (of a camera: a Camera, its file or its matrix K)"
+        )
     if array.dtype == np.uint16:
         array = array.astype(np.int32)  # torch computes little with uint16
     return torch.from_numpy(np.ascontiguousarray(array))

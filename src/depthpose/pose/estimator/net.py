@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
@@ -53,7 +54,7 @@ class GeoPoseNet:
                 "these weights regress a depth image and cast no votes; load them as "
                 "DepthImageRegressor"
             )
-        self._network = weights.network.to(self.config.device).eval()
+        self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
         self._surfaces: dict[int, Surface] = {}
 

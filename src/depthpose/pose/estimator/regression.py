@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
@@ -37,7 +38,7 @@ class DepthImageRegressor:
             )
         self.config = EstimateConfig() if config is None else config
         self.weights = weights
-        self._network = weights.network.to(self.config.device).eval()
+        self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
         self._surfaces: dict[int, Surface] = {}
 

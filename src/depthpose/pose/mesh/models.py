@@ -14,7 +14,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
-from depthpose.pose.config import METRES, MeshConfig, Unit
+from depthpose.pose.config import MeshConfig, Unit, metres_of
 from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
 from depthpose.pose.types import ObjectModel, Symmetries
 
@@ -52,7 +52,7 @@ def read_model(
         InputError: the file is missing, damaged or of another format, holds no extent or faces
             without area, or is so large or small that the unit must be another.
     """
-    scale = METRES[unit]
+    scale = metres_of(unit)
     vertices, faces = read_geometry(path)
     vertices_m = torch.from_numpy(vertices) * scale
     _refuse_unit(path, vertices_m, unit)

@@ -14,7 +14,7 @@ import torch
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import METRES, MeshConfig
+from depthpose.pose.config import MeshConfig, metres_of
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
@@ -36,7 +36,7 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
         raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
     vertices, faces = PARTS[name]()
     return make_model(
-        torch.from_numpy(vertices) * METRES["mm"],
+        torch.from_numpy(vertices) * metres_of("mm"),
         torch.from_numpy(faces),
         name=name,
         number=number,

@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Int64
 from scipy import ndimage
 from torch import Tensor
 
-from depthpose.core.arrays import Image
+from depthpose.core.arrays import Image, check_image
 from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.devices import usable_device
 from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation.config import SegmentationConfig
 from depthpose.pose.segmentation.network import FCN
@@ -51,7 +52,7 @@ class Segmenter:
 
     def __init__(self, weights: SegmentationWeights, device: torch.device | str = "cpu") -> None:
         self.weights = weights
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self._network = weights.network.eval().to(self.device)
 
     @classmethod
@@ -71,7 +72,12 @@ class Segmenter:
         return self.weights.objects
 
     def segment(self, image: Image) -> Segmentation:
-        """Find the objects of an image of any size."""
+        """Find the objects of an image of any size, a tensor of RGB in [0, 1] (not OpenCV's BGR).
+
+        Raises:
+            InputError: it is no such image.
+        """
+        check_image(image, "the image")
         probability = class_probabilities(self._network, image)
         label = probability.argmax(0)
         config = self._network.config

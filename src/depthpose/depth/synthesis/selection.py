@@ -1,0 +1,174 @@
+"""The generator that selects: each pixel of the right view is looked up in the left image.
+
+It answers distributions over disparities (Xie et al., Deep3D, ECCV 2016; Luo et al., Single View
+Stereo Matching, CVPR 2018): of the right view, which says where to look, and of the left view,
+which is depth already. Class 0 is the sky, whose disparity is zero.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import SelectionConfig
+from depthpose.depth.synthesis.lite0 import Lite0Encoder
+
+Images = Float[Tensor, "b 3 h w"]
+Logits = Float[Tensor, "b classes rows columns"]
+Planes = Float[Tensor, " planes"]
+
+_SURE_RATIO = 1.15
+"""Disparities within this ratio of the answer count as the answer."""
+
+
+class SelectionGenerator(nn.Module):
+    """EfficientNet-Lite0, a decoder with skips, and two softmaxes over disparities and the sky.
+
+    Takes RGB in [0, 1], sides multiples of 32. Logits come at stride 2: class 0 is the sky, class
+    k the disparity ``planes[k - 1]`` [px at the input's width].
+    """
+
+    planes: Tensor
+
+    def __init__(self, config: SelectionConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or SelectionConfig()
+        self.encoder = Lite0Encoder(self.config.encoder_width)
+        widths, skips = self.config.widths, self.encoder.channels[-2::-1]
+        self.top = nn.Conv2d(self.encoder.channels[-1], widths[0], 1)
+        inputs = (widths[0], *widths[:-1])
+        self.decoder = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(above + skip, width, 3, 1, 1, bias=False),
+                nn.BatchNorm2d(width),
+                nn.ReLU(),
+            )
+            for above, skip, width in zip(inputs, skips, widths, strict=True)
+        )
+        self.head = nn.Conv2d(widths[-1], 2 * (self.config.planes + 1), 1)
+        self.register_buffer("planes", make_planes(self.config), persistent=False)
+
+    def forward(self, image: Images) -> tuple[Logits, Logits]:
+        """Answer the logits of the left and of the right view.
+
+        Raises:
+            InputError: a side is no multiple of 32.
+        """
+        if image.shape[-2] % 32 or image.shape[-1] % 32:
+            raise InputError(
+                "the selecting generator takes sides that are multiples of 32 px, got "
+                f"{image.shape[-2]}x{image.shape[-1]}; pad them, as its synthesiser does"
+            )
+        *skips, deepest = self.encoder(image)
+        x = self.top(deepest)
+        for level, skip in zip(self.decoder, reversed(skips), strict=True):
+            x = level(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+        left, right = self.head(x).chunk(2, 1)
+        return left, right
+
+
+def make_planes(config: SelectionConfig) -> Planes:
+    """Give the disparities that are told apart [px], evenly spaced in their logarithm."""
+    low, high = config.disparity_px
+    return torch.linspace(math.log(low), math.log(high), config.planes).exp()
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """What the distributions say of one view, at the size of the image.
+
+    Attributes:
+        disparity_px: the expectation in the logarithm, sky left out.
+        sky: probability of the sky.
+        confidence: probability of what lies within 15 % of the disparity; where the sky is
+            likelier than not, the probability of the sky.
+    """
+
+    disparity_px: Float[Tensor, "b h w"]
+    sky: Float[Tensor, "b h w"]
+    confidence: Float[Tensor, "b h w"]
+
+    @property
+    def shift_px(self) -> Float[Tensor, "b h w"]:
+        """Disparity, and 0 in the sky [px]."""
+        return torch.where(self.is_sky, 0.0, self.disparity_px)
+
+    @property
+    def is_sky(self) -> Bool[Tensor, "b h w"]:
+        """Where the sky is likelier than not."""
+        return self.sky > 0.5
+
+
+def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
+    """Read disparity, sky and confidence off logits, and bring them to ``size``."""
+    logits = logits.float()
+    sky = logits.softmax(1)[:, :1]
+    shares = logits[:, 1:].softmax(1)
+    log_px = log_expectation(logits, planes)[:, None]
+    is_near = (planes.log()[:, None, None] - log_px).abs() <= math.log(_SURE_RATIO)
+    sure = (shares * is_near).sum(1, keepdim=True)
+    log_px, sky, sure = (
+        F.interpolate(part, size, mode="bilinear", align_corners=False)[:, 0]
+        for part in (log_px, sky, sure)
+    )
+    return Selected(log_px.exp(), sky, torch.where(sky > 0.5, sky, sure * (1 - sky)))
+
+
+def log_expectation(logits: Logits, planes: Planes) -> Float[Tensor, "b rows columns"]:
+    """Give the mean of the logarithm of disparity [log px], sky left out.
+
+    The mean of disparity itself is drawn to the near: one plane at 88 px outweighs many at 2 px.
+    """
+    return torch.einsum("bkhw,k->bhw", logits[:, 1:].float().softmax(1), planes.log())
+
+
+def shift_left(left: Images, right_px: Float[Tensor, "b h w"]) -> Images:
+    """Draw the right view by one shift a pixel: ``left`` looked up at ``x + disparity``.
+
+    Beyond the border the border repeats. A mixture of shifts has the lower L1, but ghosts, which
+    no matcher can match.
+    """
+    height, width = left.shape[-2:]
+    columns = torch.arange(width, device=left.device) + right_px
+    rows = torch.arange(height, device=left.device)[:, None].expand(height, width)
+    grid = torch.stack(
+        [(2 * columns + 1) / width - 1, ((2 * rows + 1) / height - 1).expand_as(columns)], -1
+    )
+    return F.grid_sample(left, grid.to(left.dtype), padding_mode="border", align_corners=False)
+
+
+def mix_shifts(left: Images, logits: Logits, planes: Planes) -> Images:
+    """Draw the right view as a mixture: the left image under each shift, weighed by its share.
+
+    Logits are of the size of ``left``, and ``planes`` in its pixels. What a training draws, since
+    every shift gets a gradient.
+    """
+    width = left.shape[-1]
+    reach = math.ceil(float(planes[-1])) + 1
+    padded = F.pad(left, (0, reach, 0, 0), mode="replicate")
+    shares = logits.softmax(1)
+    drawn = shares[:, :1] * left
+    for number, shift in enumerate(planes.tolist(), 1):
+        whole = math.floor(shift)
+        part = shift - whole
+        near, far = padded[..., whole : whole + width], padded[..., whole + 1 : whole + 1 + width]
+        drawn = drawn + shares[:, number : number + 1] * torch.lerp(near, far, part)
+    return drawn
+
+
+def find_filled(
+    left_px: Float[Tensor, "b h w"], right_px: Float[Tensor, "b h w"], tolerance: float = 0.15
+) -> Bool[Tensor, "b h w"]:
+    """Mark pixels of the right view that the left image does not show, so that they are made up.
+
+    Such a pixel looks up a left pixel that is nearer than the pixel itself (by ``tolerance``), or
+    lies beyond the border.
+    """
+    width = right_px.shape[-1]
+    columns = torch.arange(width, device=right_px.device) + right_px
+    looked_up = shift_left(left_px[:, None].expand(-1, 3, -1, -1), right_px)[:, 0]
+    return (looked_up > right_px * (1 + tolerance) + 0.5) | (columns > width - 0.5)

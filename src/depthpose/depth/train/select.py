@@ -1,0 +1,128 @@
+"""Stage 1 of the generator that selects: disparity where there is truth, the view where a pair."""
+
+from collections.abc import Iterator
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.draw import draw_disparity
+from depthpose.core.loop import Evidence, Turn, make_adam
+from depthpose.depth.losses import log_disparity_loss, plane_loss, view_loss
+from depthpose.depth.synthesis import SelectionGenerator
+from depthpose.depth.synthesis.selection import log_expectation, mix_shifts
+from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
+from depthpose.depth.train.config import SelectTraining
+from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.select_pairs import SelectionSample
+
+_CAP_M = 80.0
+"""Truth beyond this does not count, and no estimate lies beyond it, as in Eigen's protocol."""
+
+
+class SelectTask:
+    """Relative error and cross entropy of both views' disparity, L1 of the drawn right view."""
+
+    def __init__(
+        self, generator: SelectionGenerator, config: SelectTraining, held_out: TrainingPairs | None
+    ) -> None:
+        self.config, self.held_out = config, held_out
+        self.generator = generator
+        if config.with_fixed_start:
+            generator.encoder.freeze_early()
+        self.modules: dict[str, nn.Module] = {"generator": generator}
+        self._train()
+        self.optimizers = {"generator": (make_adam(self._groups(), config.adam), config.adam)}
+
+    def _groups(self) -> list[dict[str, object]]:
+        encoder = [p for p in self.generator.encoder.parameters() if p.requires_grad]
+        rest = [
+            p for name, p in self.generator.named_parameters() if not name.startswith("encoder.")
+        ]
+        return [{"params": encoder, "rate": self.config.encoder_rate}, {"params": rest}]
+
+    def _train(self) -> None:
+        self.generator.train()
+        if self.config.with_fixed_start:
+            self.generator.encoder.keep_statistics()
+
+    def step(self, batch: SelectionSample) -> Iterator[Turn]:
+        """One turn: say where everything is, draw the right view, compare."""
+        planes = self.generator.planes
+        left, right = self.generator(batch.seen)
+        losses = [self._truth_loss(left, batch.left_px), self._truth_loss(right, batch.right_px)]
+        loss = losses[0] + self.config.right_share * losses[1]
+        facts = {"left": losses[0].detach(), "right": losses[1].detach()}
+        if self.config.view_weight:
+            small = [F.avg_pool2d(view, 2) for view in (batch.left, batch.right)]
+            drawn = mix_shifts(small[0], right.float(), planes / 2)
+            views = view_loss(drawn, small[1])
+            view = (views * batch.has_right).sum() / batch.has_right.sum().clamp(min=1)
+            loss = loss + self.config.view_weight * view
+            facts["view"] = view.detach()
+        yield Turn("generator", loss, facts)
+
+    def _truth_loss(
+        self, logits: Float[Tensor, "b k rows columns"], truth_px: Float[Tensor, "b h w"]
+    ) -> Float[Tensor, ""]:
+        """Punish wrong disparity of one view."""
+        planes, range_px = self.generator.planes, self.generator.config.disparity_px
+        log_px = log_expectation(logits, planes)[:, None]
+        log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
+        if self.config.disparity_loss == "log":
+            loss = log_disparity_loss(log_px[:, 0], truth_px, range_px)
+        else:
+            loss = _pixel_loss(log_px[:, 0].exp(), truth_px, range_px[1])
+        if not self.config.plane_weight:
+            return loss
+        # The nearest point of the four pixels that a logit stands for; unknown is -1.
+        coarse = F.max_pool2d(truth_px.nan_to_num(-1.0)[:, None], 2)[:, 0]
+        coarse = torch.where(coarse < 0, torch.nan, coarse)
+        return loss + self.config.plane_weight * plane_loss(logits, coarse, planes)
+
+    @torch.no_grad()
+    def validate(self) -> Evidence:
+        """Depth of held-out left images; of the first, drawn view and disparity as a picture."""
+        if self.held_out is None:
+            return Evidence()
+        self.generator.eval()
+        device = next(self.generator.parameters()).device
+        evidence = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
+        self._train()
+        return evidence
+
+
+def _pixel_loss(
+    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], most_px: float
+) -> Float[Tensor, ""]:
+    """Mean absolute disparity error over the pixels with truth, relative to the largest."""
+    is_known = truth_px > 0
+    error = torch.where(is_known, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
+    return error.sum() / is_known.sum().clamp(min=1) / most_px
+
+
+def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> Evidence:
+    """Relative error of depth (AbsRel), share within 25 % (d1), share of the sky that is missed."""
+    rig = synthesiser.config
+    far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
+    errors, within, missed, pictures = [], [], [], {}
+    for index in range(len(held_out)):
+        pair = held_out.read(index)
+        drawn = synthesiser.draw(pair.left[None])
+        assert drawn.disparity_px is not None and drawn.is_sky is not None  # noqa: PT018
+        is_sky = drawn.is_sky[0]
+        found_px = torch.where(is_sky, 0.0, drawn.disparity_px[0]).clamp(min=far_px)
+        if index == 0:
+            views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
+            pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
+        is_known, is_true_sky = pair.left_px >= far_px, pair.left_px == 0
+        if bool(is_known.any()):
+            ratio = pair.left_px[is_known] / found_px[is_known]
+            errors.append(float((ratio - 1).abs().mean()))
+            within.append(float((torch.maximum(ratio, 1 / ratio) < 1.25).float().mean()))
+        if bool(is_true_sky.any()):
+            missed.append(float((~is_sky[is_true_sky]).float().mean()))
+    numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
+    means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
+    return Evidence(numbers=means, pictures=pictures)

@@ -1,0 +1,206 @@
+"""The generator that selects: its distributions, the views drawn of them, its encoder."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import SelectionConfig
+from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
+from depthpose.depth.synthesis.lite0 import Lite0Encoder, import_lite0, read_lite0
+from depthpose.depth.synthesis.selection import (
+    find_filled,
+    log_expectation,
+    make_planes,
+    mix_shifts,
+    select,
+    shift_left,
+)
+from depthpose.depth.synthesis.synthesiser import draw_right
+
+TINY = SelectionConfig(
+    encoder_width=0.1,
+    widths=(8, 8, 8, 8),
+    planes=6,
+    disparity_px=(1.0, 32.0),
+    virtual_focal_px=130.0,
+)
+PLANES = torch.tensor([1.0, 2.0, 4.0, 8.0])
+
+
+def tiny(seed: int = 0) -> SelectionGenerator:
+    torch.manual_seed(seed)
+    return SelectionGenerator(TINY).eval()
+
+
+def one_hot(classes: Tensor, count: int) -> Tensor:
+    """Logits (1, count, h, w) that are sure of the classes (h, w)."""
+    return (F.one_hot(classes, count).movedim(-1, 0)[None] * 60.0).float()
+
+
+def test_parameters_are_those_of_lite0_without_its_classifier() -> None:
+    """4,652,008 published, less 320 x 1280 + 2 x 1280 of the last layer, 1281 x 1000 of classes."""
+    counted = sum(p.numel() for p in Lite0Encoder().parameters())
+    assert counted == 4_652_008 - 320 * 1280 - 2 * 1280 - 1281 * 1000
+    assert Lite0Encoder().channels == [16, 24, 40, 112, 320]
+
+
+def test_features_and_logits_have_their_strides() -> None:
+    network, image = tiny(), torch.rand(2, 3, 64, 96)
+    sizes = [tuple(f.shape[2:]) for f in network.encoder(image)]
+    assert sizes == [(32, 48), (16, 24), (8, 12), (4, 6), (2, 3)]
+    left, right = network(image)
+    assert left.shape == right.shape == (2, 7, 32, 48)
+    with pytest.raises(InputError, match=r"multiples of 32 px, got 60x96"):
+        network(torch.rand(1, 3, 60, 96))
+
+
+def test_convolutions_of_stride_two_pad_below_and_to_the_right() -> None:
+    """TensorFlow's SAME: of 4 pixels, a 3x3 kernel of stride 2 sees 0..2 and 2..4."""
+    first = Lite0Encoder(1 / 32).stem
+    torch.nn.init.ones_(first.conv.weight)
+    image = torch.zeros(1, 3, 4, 4)
+    image[..., 0, 0] = 1.0
+    found = first.conv(F.pad(image, (0, 1, 0, 1)))
+    torch.testing.assert_close(first(image), first.norm(found))
+    assert found[0, 0].tolist() == [[3.0, 0.0], [0.0, 0.0]]
+
+
+def test_planes_are_even_in_the_logarithm() -> None:
+    planes = make_planes(SelectionConfig(planes=4, disparity_px=(1.0, 8.0)))
+    torch.testing.assert_close(planes, PLANES)
+
+
+def test_the_expectation_is_that_of_the_logarithm_without_the_sky() -> None:
+    shares = torch.tensor([0.5, 0.0, 0.25, 0.0, 0.25])  # sky, 1, 2, 4, 8 px
+    logits = shares.clamp(min=1e-30).log().reshape(1, 5, 1, 1)
+    found = log_expectation(logits, PLANES)
+    assert float(found) == pytest.approx((math.log(2) + math.log(8)) / 2, rel=1e-5)
+
+
+def test_a_sure_answer_is_read_at_the_size_of_the_image() -> None:
+    classes = torch.tensor([[0, 3], [0, 3]])
+    found = select(one_hot(classes, 5), PLANES, (4, 8))
+    assert found.disparity_px.shape == (1, 4, 8)
+    torch.testing.assert_close(found.disparity_px[0, :, -1], torch.full((4,), 4.0))
+    assert bool(found.is_sky[0, :, 0].all())
+    assert not bool(found.is_sky[0, :, -1].any())
+    torch.testing.assert_close(found.confidence[0, :, -1], torch.ones(4))
+    assert float(found.shift_px[0, 0, 0]) == 0.0
+
+
+def test_an_even_distribution_is_no_confidence() -> None:
+    found = select(torch.zeros(1, 5, 1, 1), PLANES, (2, 2))
+    assert float(found.confidence.max()) < 0.3
+
+
+def test_one_shift_a_pixel_looks_to_the_right_and_repeats_the_border() -> None:
+    left = torch.arange(6.0).expand(1, 3, 1, 6)
+    drawn = shift_left(left, torch.full((1, 1, 6), 2.0))
+    assert drawn[0, 0, 0].tolist() == pytest.approx([2, 3, 4, 5, 5, 5])
+    half = shift_left(left, torch.full((1, 1, 6), 0.5))
+    assert half[0, 0, 0].tolist() == pytest.approx([0.5, 1.5, 2.5, 3.5, 4.5, 5.0])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.7])
+def test_a_sure_mixture_is_one_shift(scale: float) -> None:
+    torch.manual_seed(0)
+    left, classes = torch.rand(1, 3, 5, 20), torch.randint(0, 5, (5, 20))
+    mixed = mix_shifts(left, one_hot(classes, 5), PLANES * scale)
+    shifts = torch.cat([torch.zeros(1), PLANES * scale])[classes][None]
+    torch.testing.assert_close(mixed, shift_left(left, shifts), rtol=0, atol=1e-5)
+
+
+def test_what_the_left_image_does_not_show_is_marked() -> None:
+    """A box of 6 px before a wall of 2 px: in the right view the wall shows 4 px more beside it."""
+    left = torch.full((1, 1, 40), 2.0)
+    left[..., 20:30] = 6.0
+    right = torch.full((1, 1, 40), 2.0)
+    right[..., 14:24] = 6.0
+    filled = find_filled(left, right)[0, 0].nonzero()[:, 0].tolist()
+    assert filled == [24, 25, 26, 27, 38, 39]
+
+
+@pytest.mark.parametrize("size", [(64, 96), (50, 70), (33, 31), (5, 7)])
+def test_any_size_is_answered_at_its_own_size(size: tuple[int, int]) -> None:
+    drawn = make_synthesiser(tiny()).draw(torch.rand(2, 3, *size))
+    assert drawn.right.shape == (2, 3, *size)
+    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky, drawn.is_filled):
+        assert part is not None
+        assert part.shape == (2, *size)
+    assert drawn.disparity_px is not None
+    assert bool((drawn.disparity_px > 0).all())
+
+
+def test_neighbours_in_a_batch_change_nothing() -> None:
+    drawer, images = make_synthesiser(tiny()), torch.rand(2, 3, 64, 64)
+    both, alone = drawer.draw(images), drawer.draw(images[:1])
+    torch.testing.assert_close(both.right[:1], alone.right, rtol=0, atol=1e-5)
+
+
+def test_gradients_reach_the_right_view_through_the_drawn_one() -> None:
+    network = tiny().train()
+    draw_right(network, torch.rand(1, 3, 64, 64)).square().mean().backward()
+    head = network.head.weight.grad
+    assert head is not None
+    assert float(head[TINY.planes + 1 :].abs().sum()) > 0
+
+
+def published_names(encoder: Lite0Encoder) -> dict[str, Tensor]:
+    """State dict of the encoder under the names that its publisher uses, with a classifier."""
+    state = {}
+    for name, tensor in encoder.state_dict().items():
+        if name.startswith("stem."):
+            state[name.replace("stem.conv", "_conv_stem").replace("stem.norm", "_bn0")] = tensor
+            continue
+        _, number, part, kind, rest = re.split(r"\.", name, maxsplit=4)
+        norm = {"expand": "_bn0", "depthwise": "_bn1", "project": "_bn2"}[part]
+        state[f"_blocks.{number}.{f'_{part}_conv' if kind == 'conv' else norm}.{rest}"] = tensor
+    extra = {"_conv_head.weight": (1280, 320, 1, 1), "_bn1.weight": (1280,), "_fc.bias": (1000,)}
+    return state | {name: torch.zeros(shape) for name, shape in extra.items()}
+
+
+def test_the_published_encoder_is_imported_whole(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    encoder = Lite0Encoder()
+    torch.save(published_names(encoder), tmp_path / "lite0.pth")
+    import_lite0(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
+    found = read_lite0(tmp_path / "lite0.safetensors").state_dict()
+    for name, tensor in encoder.state_dict().items():
+        assert torch.equal(found[name], tensor), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.pop("_blocks.3._bn1.bias"), "blocks.3.depthwise.norm.bias"),
+        (lambda state: state.update(odd=torch.zeros(1)), "odd"),
+        (lambda state: state.update(epoch=3), "holds no tensors by name"),
+    ],
+)
+def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) -> None:  # noqa: ANN001
+    state = published_names(Lite0Encoder())
+    change(state)
+    torch.save(state, tmp_path / "lite0.pth")
+    with pytest.raises(InputError, match=message):
+        import_lite0(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
+    assert not (tmp_path / "lite0.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"encoder_width": 0.0}, "encoder_width must be above 0"),
+        ({"planes": 1}, "planes 2 or more"),
+        ({"disparity_px": (4.0, 2.0)}, "range of positive disparities"),
+        ({"virtual_focal_px": 0.0}, "positive focal length"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SelectionConfig(**changes)
