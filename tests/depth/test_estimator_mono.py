@@ -343,3 +343,53 @@ def test_the_matcher_and_both_are_one_word_away() -> None:
     )
     joined = join_matches(own, other)
     assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)
+
+
+def selection_file(folder: Path, answer: str = "own") -> Path:
+    """Weights of a generator that is sure of plane 3 (4 px), without a matcher."""
+    path = folder / f"{answer}.safetensors"
+    write_depth_weights(path, generator=sure_of(3, answer), facts={})
+    return path
+
+
+def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) -> None:
+    net = FakestereoNet.load(selection_file(tmp_path))
+    assert net.matcher is None
+    image, rig = torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX, 0.2)
+    found = net.estimate(image, rig).depth_m
+    assert found is not None
+    assert float(found.mean()) == pytest.approx(FOCAL_PX * BASELINE_M / 4, rel=1e-4)
+    pair = StereoInput(name="street", left=image, right=image.flip(-1), camera=rig)
+    for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+        with pytest.raises(InputError, match=r"street: .*a pair needs a matcher.*matcher='sgbm'"):
+            estimate(pair)
+
+
+@pytest.mark.parametrize("answer", ["matched", "joined"])
+def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: str) -> None:
+    path = selection_file(tmp_path, answer)
+    with pytest.raises(InputError, match="there is no matcher in that"):
+        FakestereoNet.load(path)
+    with pytest.raises(InputError, match="matcher is None"):
+        FakestereoNet(None, make_synthesiser(sure_of(3, answer)))
+    assert FakestereoNet.load(path, matcher=constant_matcher(2.0)).matcher is not None
+    with pytest.raises(InputError, match="there is no matcher in that"):
+        FakestereoNet.load(selection_file(tmp_path), matcher="psmnet")
+    with pytest.raises(InputError, match="matcher is None"):
+        FakestereoNet(None)
+
+
+def test_the_answer_may_be_another_than_the_weights_say(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    path, painting = selection_file(tmp_path), tmp_path / "g.safetensors"
+    write_depth_weights(painting, generator=generator, facts={})
+    given = constant_matcher(2.0)
+    matched = FakestereoNet.load(path, matcher=given, answer="matched")
+    found = matched.estimate(torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX))
+    assert float(found.disparity_px.mean()) == pytest.approx(2.0)
+    FakestereoNet.load(painting, matcher=given, answer="matched")
+    with pytest.raises(InputError, match="answer is 'own'"):
+        FakestereoNet.load(painting, matcher=given, answer="own")
+    with pytest.raises(InputError, match="answer is 'joined'"):
+        FakestereoNet.load(matcher=given, answer="joined")
