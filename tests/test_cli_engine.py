@@ -7,6 +7,7 @@ import json
 import shutil
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,7 +16,13 @@ from tests.pose.made_object import bottle, bracket, cloud_of, pose_at, tiny_weig
 
 from depthpose.cli import engine, main
 from depthpose.core.engine import read_results, shard_results
-from depthpose.core.files import Cloud, write_cloud, write_image
+from depthpose.core.files import (
+    Cloud,
+    write_cloud,
+    write_depth_png,
+    write_disparity_png,
+    write_image,
+)
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
@@ -139,6 +146,74 @@ def test_other_settings_need_another_folder(
     assert predict(home, tmp_path, str(home / "left"), *RAY) == 0
     assert predict(home, tmp_path, str(home / "left"), *RAY, "--color-range", "1", "9") == 2
     assert "color_range_m" in capsys.readouterr().err
+
+
+@pytest.fixture
+def truth(home: Path, tmp_path: Path) -> Path:
+    """The five pairs as a data set with truth; the last one has none."""
+    data = tmp_path / "data"
+    for side in ("left", "right"):
+        shutil.copytree(home / side, data / side)
+    for number in range(4):
+        made = torch.Generator().manual_seed(number)
+        disparity_px = 1 + 14 * torch.rand(48, 64, generator=made)
+        write_disparity_png(data / "disp_occ" / f"{number}.png", disparity_px)
+        write_depth_png(data / "lidar_depth" / f"{number}.png", 35 / disparity_px)
+    shutil.copyfile(home / "rig.json", data / "camera.json")
+    return data
+
+
+@pytest.mark.parametrize("protocol", ["kitti-2015", "eigen-improved-garg"])
+def test_shards_measure_exactly_as_files_do(
+    home: Path, truth: Path, tmp_path: Path, double: InProcessEngine, protocol: str
+) -> None:
+    sides = [str(home / "left"), str(home / "right")]
+    assert match(home, tmp_path / "files", *sides) == 0
+    assert match(home, tmp_path / "shards", *sides, *RAY, "--block", "2") == 0
+    rows: list[dict[str, Any]] = []
+    for name, words in (("files", []), ("shards", []), ("shards", RAY)):
+        out = tmp_path / f"measured-{len(rows)}"
+        given = ["--predictions", str(tmp_path / name), "--protocol", protocol]
+        assert main(["depth", "evaluate", "--data", str(truth), *given, "--out", str(out), *words]
+                    ) == 0  # fmt: skip
+        rows.append(
+            {
+                kind: json.loads((out / f"{kind}.json").read_text())
+                for kind in ("rows", "frames", "confidence")
+            }
+        )
+    assert rows[0] == rows[1] == rows[2]
+    assert len(rows[0]["frames"]) % 4 == 0
+
+
+def test_a_frame_that_no_shard_holds_is_missed(
+    home: Path, truth: Path, tmp_path: Path, double: InProcessEngine,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    (home / "some.csv").write_text("left,right\nleft/0.png,right/0.png\nleft/4.png,right/4.png")
+    assert match(home, tmp_path / "shards", str(home / "some.csv"), *RAY) == 0
+    words = ["--predictions", str(tmp_path / "shards"), "--protocol", "kitti-2015"]
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["depth", "evaluate", "--data", str(truth), *words, *out]) == 2
+    assert "no prediction for frame '1'" in capsys.readouterr().err
+
+
+def test_a_shard_made_anew_is_measured_anew(
+    home: Path, truth: Path, tmp_path: Path, double: InProcessEngine
+) -> None:
+    images = tmp_path / "in"
+    for side in ("left", "right"):
+        shutil.copytree(home / side, images / side)
+    whole = (images / "left" / "2.png").read_bytes()
+    (images / "left" / "2.png").write_bytes(b"no picture")
+    sides = [str(images / "left"), str(images / "right")]
+    words = ["--predictions", str(tmp_path / "shards"), "--protocol", "kitti-2015"]
+    measure = ["depth", "evaluate", "--data", str(truth), *words, "--out", str(tmp_path / "out")]
+    assert match(home, tmp_path / "shards", *sides, *RAY) == 1
+    assert main(measure) == 2, "frame 2 is missing"
+    (images / "left" / "2.png").write_bytes(whole)
+    assert match(home, tmp_path / "shards", *sides, *RAY) == 0
+    assert main(measure) == 0
 
 
 def test_clouds_have_the_poses_of_the_plain_command(

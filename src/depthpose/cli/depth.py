@@ -192,7 +192,7 @@ def evaluate(
     out: Path,
     weights: tuple[str, ...] = (),
     matcher: MatcherName | None = None,
-    predictions: Path | None = None,
+    predictions: str | None = None,
     floor: tuple[FloorName, ...] = (),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
@@ -203,6 +203,7 @@ def evaluate(
     device: str = "cpu",
     precision: Precision = "fp32",
     max_memory: str | None = None,
+    engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
@@ -221,7 +222,8 @@ def evaluate(
         weights: files or names. Weights with a generator see the left view alone; 'both:NAME' shows
             their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one.
         matcher: sgbm measures OpenCV's StereoSGBM.
-        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy.
+        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
+            that 'depth predict|match --engine ray' left, path or URL.
         floor: what every method must beat: rows (the best constant depth of each image row) or
             nearest (the depth of the training image that looks most alike), or both.
         train: folders with the frames that a floor is fitted to.
@@ -234,8 +236,10 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
         precision: fp32 or bf16.
         max_memory: bound on the memory of activations, such as 1GB.
+        engine: where --predictions that are shards are measured; the numbers are the same.
     """
     from depthpose.cli import evaluating, methods
+    from depthpose.core.engine import is_job
     from depthpose.depth.evaluate import find_protocol
 
     if not weights and matcher is None and predictions is None and not floor:
@@ -255,5 +259,13 @@ def evaluate(
         chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
     home = out / "predictions"
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
-    folders += [] if predictions is None else [predictions]
+    if predictions is not None and is_job(predictions):
+        from depthpose.cli.engine_evaluating import ShardTruth, measure_shards
+
+        truth = ShardTruth(data=str(data.resolve()), split=split, protocol=protocol, caps_m=cap)
+        ready = measure_shards(dataset, predictions, truth, out, engine)
+        return evaluating.measure(dataset, folders, protocol, cap, out, [ready])
+    if engine.is_ray:
+        raise InputError("--engine ray measures shards; give them by --predictions")
+    folders += [] if predictions is None else [Path(predictions)]
     return evaluating.measure(dataset, folders, protocol, cap, out)

@@ -11,7 +11,6 @@ from depthpose.core.engine.work import Runner, Work
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 
-
 TEXTS = Files(roles=("text",), suffixes=(".txt",))
 
 

@@ -1,6 +1,7 @@
 """A job: the folder of the results claimed, blocks done by an engine, one list of all."""
 
 import csv
+import hashlib
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -8,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from depthpose.core.engine.items import Item
-from depthpose.core.engine.plan import Block, make_plan
+from depthpose.core.engine.plan import PLAN, Block, make_plan
 from depthpose.core.engine.shard import ShardFormat, read_shard
 from depthpose.core.engine.store import (
     absolute,
@@ -99,6 +100,39 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
         refuse_other_settings(out, earlier, settings)
         return
     publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
+
+
+def is_job(out: str) -> bool:
+    """Whether a folder holds shards of a job."""
+    return exists(join(absolute(out), PLAN))
+
+
+def read_job_settings(out: str) -> dict[str, Any]:
+    """Give the settings that made the shards of a folder.
+
+    Raises:
+        InputError: there are none.
+    """
+    record = join(absolute(out), RECORD)
+    try:
+        return dict(json.loads(read_from(record))["settings"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{record}: not a record of a run. Choose another folder.") from error
+
+
+def result_items(out: str) -> list[Item]:
+    """Take the shards of an earlier job as inputs of another: a record and a shard each.
+
+    The name changes with the record, so that a shard that was made anew is a new input.
+    """
+    folder = join(absolute(out), SHARDS)
+    return [
+        Item(
+            f"{_shard(done)}-{hashlib.sha256(done.to_json().encode()).hexdigest()[:12]}",
+            (join(folder, f"{_shard(done)}.json"), join(folder, done.shard)),
+        )
+        for done in read_results(out)
+    ]
 
 
 def read_results(out: str) -> list[Done]:

@@ -8,7 +8,7 @@ from depthpose.core.engine.items import Item
 from depthpose.core.engine.store import exists, join, publish_bytes, read_from
 from depthpose.core.errors import InputError
 
-_PLAN = "plan.jsonl"
+PLAN = "plan.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     Raises:
         InputError: an earlier run gave a name to another file, or the place refuses.
     """
-    known = _read_plan(join(out, _PLAN))
+    known = _read_plan(join(out, PLAN))
     files = {item.name: item.files for block in known for item in block.items}
     for item in items:
         if files.get(item.name, item.files) != item.files:
@@ -72,7 +72,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     ]
     if lots:
         lines = "".join(f"{block.to_json()}\n" for block in blocks)
-        publish_bytes(lines.encode(), join(out, _PLAN))
+        publish_bytes(lines.encode(), join(out, PLAN))
     return blocks
 
 

@@ -142,6 +142,13 @@ class Runner:
                     one.close()
 
 
+def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
+    """Do blocks in this process, one after the other: the engine that needs no cluster."""
+    runner = Runner(work, out, form)
+    for block in blocks:
+        yield runner.run(block)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Opened:
     """An input whose files are at hand, or the reason why not."""
