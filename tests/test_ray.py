@@ -18,7 +18,9 @@ from tests.test_cli_engine import files_of, make_home, predict, unpacked
 pytestmark = pytest.mark.slow
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'depthpose[ray]'")
 
-PATIENCE_S = 540
+PATIENCE_S = float(os.environ.get("DEPTHPOSE_PATIENCE_S", "540"))
+"""How long a command may take: a worker that starts again loads torch for half a minute where
+cores are shared."""
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +142,11 @@ def test_two_nodes_give_what_one_process_gives(home: Path, tmp_path: Path, nodes
     assert unpacked(tmp_path / "big") == files_of(tmp_path / "plain")
 
 
-def test_ten_kills_at_random_moments_lose_nothing(home: Path, tmp_path: Path, nodes: Nodes) -> None:
+def test_ten_kills_at_random_moments_lose_nothing(
+    home: Path, tmp_path: Path, nodes: Nodes, record_property: Callable[[str, object], None]
+) -> None:
     choose = random.Random(int(os.environ.get("DEPTHPOSE_SEED", "0")))
-    total, kills = int(os.environ.get("DEPTHPOSE_KILL_INPUTS", "1500")), []
+    total, kills = int(os.environ.get("DEPTHPOSE_KILL_INPUTS", "300")), []
 
     def kill_ten() -> None:
         shards = tmp_path / "out" / "shards"
@@ -157,8 +161,10 @@ def test_ten_kills_at_random_moments_lose_nothing(home: Path, tmp_path: Path, no
             elif nodes.kill_worker(choose):
                 kills.append("worker")
 
-    words = [str(repeated(home, total)), "--address", nodes.address, "--block", "10"]
+    words = [str(repeated(home, total)), "--address", nodes.address, "--block", "5"]
+    start = time.monotonic()
     run(command(home, str(tmp_path / "out"), *words), kill_ten)
+    record_property("seconds", time.monotonic() - start)
     assert (kills.count("worker"), kills.count("node")) == (7, 3)
     assert predict(home, tmp_path / "plain", str(home / "left")) == 0
     wanted, found = files_of(tmp_path / "plain"), unpacked(tmp_path / "out")
@@ -166,7 +172,7 @@ def test_ten_kills_at_random_moments_lose_nothing(home: Path, tmp_path: Path, no
     for name, files in found.items():
         assert files == wanted[str(int(name) % 5)], name
     shards = {path.name for path in (tmp_path / "out" / "shards").iterdir()}
-    assert shards == {f"{k:06d}.{end}" for k in range(total // 10) for end in ("tar", "json")}
+    assert shards == {f"{k:06d}.{end}" for k in range(total // 5) for end in ("tar", "json")}
     assert (tmp_path / "out" / "manifest.csv").read_text().count("\n") == total + 1
 
 
