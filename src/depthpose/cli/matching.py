@@ -17,7 +17,7 @@ from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
 from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +56,13 @@ class Pairs:
 
 def refuse_unusable_first(pairs: Pairs) -> None:
     """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    refuse_unrectified_pair(pairs.read(0))
+
+
+def refuse_unrectified_pair(pair: StereoInput) -> None:
+    """Refuse a pair that is swapped or not rectified, and name the option that takes it."""
     try:
-        refuse_unrectified(pairs.read(0))
+        refuse_unrectified(pair)
     except InputError as error:
         raise InputError(f"{error} (--no-check matches them all the same.)") from error
 
@@ -91,15 +96,20 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
                 raise
             failures.append(str(error))
             continue
-        if with_cloud:
-            write_estimate_cloud(out, pair, estimate)
-        write_estimate(out, pair, estimate)
+        write_match(out, pair, estimate, with_cloud=with_cloud)
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
     if find_shard().rank == 0:
         _write_page(pairs, out, failures)
     return 1 if failures else 0
+
+
+def write_match(out: Path, pair: StereoInput, estimate: DepthEstimate, *, with_cloud: bool) -> None:
+    """Write the files of a matched pair; the disparity comes last."""
+    if with_cloud:
+        write_estimate_cloud(out, pair, estimate)
+    write_estimate(out, pair, estimate)
 
 
 def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:

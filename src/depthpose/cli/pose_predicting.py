@@ -84,7 +84,7 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
     if not files:
         raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
-    return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+    return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
 
 
 def view_jobs(
@@ -107,7 +107,9 @@ def view_jobs(
             f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
         )
     return [
-        _job(p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit))
+        input_job(
+            p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit)
+        )
         for p in depths
     ]
 
@@ -171,6 +173,11 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     if shard.rank:
         return None
     return _gather(jobs, out, shard)
+
+
+def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
+    """Estimate some inputs together; what cannot be read has the status ``unreadable``."""
+    return list(_safely(method)([job.read() for job in jobs]))
 
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
@@ -294,7 +301,8 @@ def _unread(given: Unreadable) -> PoseEstimate:
     )
 
 
-def _job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+def input_job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+    """Take one input; one that cannot be read stops no other."""
     return _safe(Job(name=name, read=read), object)
 
 

@@ -2,11 +2,12 @@
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,6 +50,10 @@ class Lens:
         f = self.focal_px
         K = [[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]
         return Camera(width=width, height=height, K=torch.tensor(K, dtype=torch.float64))
+
+    def facts(self) -> dict[str, Any]:
+        """Give what is known as JSON values: it decides the results."""
+        return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,18 +104,19 @@ def predict_all(
     sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
 ) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
-    known = lens.camera
-    facts = {"K": known.K.tolist()} if known else {"focal_px": lens.focal_px}
-    claim_folder(out, {**method.settings, "camera": facts, "color_range_m": list(look.range_m)})
+    claim_folder(
+        out, {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
+    )
     claim_names(out, {source.stem: source for source in sources})
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
     with open_viewer(None if find_shard().rank else view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
-        done = predictor.predict_images([path for path in mine if not _is_video(path)])
+        images = {path.stem: path for path in mine if not _is_video(path)}
+        done = predictor.predict_images(images)
         for path in filter(_is_video, mine):
             done += predictor.predict_video(path)
-    failures = predictor.failures
+    failures = list(predictor.failures.values())
     if failures and len(sources) == 1:
         raise failures[0]
     for failure in failures:
@@ -140,17 +146,17 @@ def _write_page(
 
 @dataclass(frozen=True, kw_only=True)
 class Predictor:
-    """Images in, files out; what fails is remembered in ``failures``."""
+    """Images in, files out; what fails is remembered in ``failures``, by its name."""
 
     lens: Lens
     net: FakestereoNet
     out: Path
     look: Look
     viewer: Viewer | None = None
-    failures: list[InputError] = field(default_factory=list)
+    failures: dict[str, InputError] = field(default_factory=dict)
 
-    def predict_images(self, sources: list[Path]) -> int:
-        """Predict images; give how many are done."""
+    def predict_images(self, sources: Mapping[str, Path]) -> int:
+        """Predict images, each with the name of its results; give how many are done."""
         return len(self._predict(self._read(sources), len(sources), "images"))
 
     def predict_video(self, source: Path) -> int:
@@ -161,16 +167,16 @@ class Predictor:
             colors = _colors(names, self.out, self.look)
             write_video(self.out / f"{source.stem}.color.mp4", colors, video.fps)
         except InputError as error:
-            self.failures.append(error)
+            self.failures[source.name] = error
             return 0
         return len(names)
 
-    def _read(self, sources: list[Path]) -> Iterator[tuple[str, Tensor]]:
-        for source in sources:
+    def _read(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
+        for name, source in sources.items():
             try:
-                yield source.stem, read_image(source)
+                yield name, read_image(source)
             except InputError as error:
-                self.failures.append(error)
+                self.failures[name] = error
 
     def _predict(
         self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
@@ -199,7 +205,7 @@ class Predictor:
         except InputError as error:
             if len(inputs) > 1:
                 return [name for given in inputs for name in self._predict_chunk([given])]
-            self.failures.append(error)
+            self.failures[inputs[0].name] = error
             return []
         return [given.name for given in inputs]
 

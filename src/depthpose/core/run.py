@@ -16,7 +16,7 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_json
 
-_RECORD = "run.json"
+RECORD = "run.json"
 _SOURCES = "sources.json"
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
@@ -109,11 +109,16 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         InputError: the folder holds a run with other settings; the first difference is named.
     """
-    record = folder / _RECORD
+    record = folder / RECORD
     if record.exists():
-        _refuse_other_settings(folder, read_json(record), dict(settings))
+        refuse_other_settings(folder, read_json(record), settings)
         return
-    write_json(record, {"settings": dict(settings), "environment": environment()})
+    write_json(record, run_record(settings))
+
+
+def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what ``run.json`` holds: the settings, and what they were run with."""
+    return {"settings": dict(settings), "environment": environment()}
 
 
 def claim_names(folder: Path, sources: Mapping[str, Path]) -> None:
@@ -142,7 +147,7 @@ def claim_names(folder: Path, sources: Mapping[str, Path]) -> None:
 
 def read_settings(folder: Path) -> dict[str, Any] | None:
     """Give the settings that made ``folder``, or None where no run claimed it."""
-    record = folder / _RECORD
+    record = folder / RECORD
     if not record.exists():
         return None
     content = read_json(record)
@@ -152,10 +157,15 @@ def read_settings(folder: Path) -> dict[str, Any] | None:
     return settings
 
 
-def _refuse_other_settings(folder: Path, record: object, settings: dict[str, Any]) -> None:
+def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[str, Any]) -> None:
+    """Refuse a folder whose record says that other settings made what it holds.
+
+    Raises:
+        InputError: the first difference is named.
+    """
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
-        raise InputError(f"{folder / _RECORD}: not a record of a run. Choose another folder.")
+        raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
     # A knob that one of the two does not know counts as None: a later version may add knobs.
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):

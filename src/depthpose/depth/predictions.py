@@ -37,6 +37,17 @@ class Estimator(Protocol):
 
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
+ENDINGS = (
+    "depth_m.npy",
+    "depth.png",
+    "confidence.npy",
+    "right.png",
+    "color.png",
+    "ply",
+    "disparity_px.npy",
+)
+"""Of the files of an estimate, as :func:`write_estimate` and its cloud have them."""
+
 
 COLOR_RANGE_M = (3.0, 80.0)
 """Near and far end of the colours of depth, one for all pictures, so that they compare."""
