@@ -138,6 +138,7 @@ def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path)
+    assert net.matcher is not None
     match = net.matcher.match
 
     def spy(left: Tensor, right: Tensor) -> object:
@@ -283,9 +284,8 @@ def sure_of(plane: int, answer: str = "own") -> SelectionGenerator:
     network = SelectionGenerator(config).eval()
     torch.nn.init.zeros_(network.head.weight)
     with torch.no_grad():
-        network.head.bias.copy_(
-            20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
-        )
+        wanted = 20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
+        network.head.bias = torch.nn.Parameter(wanted)
     return network
 
 
