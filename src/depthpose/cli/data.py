@@ -302,6 +302,7 @@ def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> 
         rig=frame.rig,
         disparity_px=frame.disparity_px,
         occluded=frame.occluded,
+        is_sky=frame.is_sky,
         points=frame.lidar_points,
         camera_from_velodyne=camera_from_velodyne(),
     )
