@@ -29,9 +29,17 @@ _PSMNET = (
 )
 _EVALUATE = "depthpose depth evaluate --data SAMPLES/depth"
 _PAIRS = "SAMPLES/depth/street_pairs"
+_TRAIN = (
+    f"--train {_PAIRS}/kitti2015_train_drives {_PAIRS}/kitti_object_more --train-without "
+    "train_000007 train_000008 train_000009 train_000010 train_000013"
+)
 _DEPTH = {"AbsRel": "abs_rel", "SqRel": "sq_rel", "RMSE": "rmse", "RMSElog": "rmse_log"}
 _DELTAS = {"d1": "d1", "d2": "d2", "d3": "d3"}
 _SGBM = {"SGBM, holes filled": {"method": "sgbm (holes filled)"}}
+_FLOORS = {
+    "best constant depth of each row": {"method": "floor: rows"},
+    "nearest training image's depth": {"method": "floor: nearest"},
+}
 _STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}}
 
 
@@ -87,16 +95,14 @@ TABLES = (
         commands=(
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
             "--protocol eigen-raw-camera --matcher sgbm --floor rows nearest "
-            f"--train {_PAIRS}/kitti2015_train_drives {_PAIRS}/kitti_object_more "
-            "--train-without train_000007 train_000009 "
+            f"{_TRAIN} "
             "--weights default both:default kitti-nc both:kitti-nc sgbm:kitti-nc --out OUT/mono",
         ),
         files=("mono/rows.json",),
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
-            "best constant depth of each row": {"method": "floor: rows"},
-            "nearest training image's depth": {"method": "floor: nearest"},
+            **_FLOORS,
             "mono, fine-tuned (default)": {"weights": "default", "sees": "left view"},
             "mono, fine-tuned (kitti-nc)": {"weights": "kitti-nc", "sees": "left view",
                                             "method": "fakestereo"},
@@ -105,6 +111,23 @@ TABLES = (
             "real stereo, our matcher (default)": {"weights": "default", "sees": "both views"},
             "real stereo, our matcher (kitti-nc)": {"weights": "kitti-nc", "sees": "both views"},
             "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
+        },
+    ),
+    Table(
+        name="mono-0052",
+        after="Eight more frames, of one other Eigen test drive",
+        commands=(
+            f"{_EVALUATE}/kitti_raw/2011_09_26/2011_09_26_drive_0052_sync "
+            f"--protocol eigen-raw-camera --floor rows nearest {_TRAIN} --weights default kitti-nc "
+            "--out OUT/mono-0052",
+        ),
+        files=("mono-0052/rows.json",),
+        numbers={**_DEPTH, **_DELTAS},
+        key={"cap": "cap_m"},
+        rows={
+            **_FLOORS,
+            "mono, default": {"weights": "default"},
+            "mono, kitti-nc": {"weights": "kitti-nc"},
         },
     ),
     Table(
