@@ -32,9 +32,10 @@ def predict(
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
 
-    For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png (16 bit, metres
-    x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the drawn view),
-    NAME.color.png, and NAME.ply with --cloud. A video gives the files of each frame and
+    For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
+    (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
+    drawn view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
+    NAME.ply with --cloud. A video gives the files of each frame and
     NAME.color.mp4. report.html shows some of them, with the cloud in 3D. A rerun skips what is
     finished; other settings need another --out.
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, back_project
@@ -62,8 +62,9 @@ def write_estimate(
     """Write the files of one estimate; the disparity comes last and marks the frame as finished.
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
-    ``NAME.color.png``, ``NAME.right.png`` (synthesised) and ``NAME.disparity_px.npy``, each where
-    the estimate has it. The disparity is that of the frame's own rig.
+    ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky)
+    and ``NAME.disparity_px.npy``, each where the estimate has it. The disparity is that of the
+    frame's own rig.
     """
     base = folder / pair.name
     if estimate.depth_m is not None:
@@ -73,6 +74,8 @@ def write_estimate(
         write_map(_file(base, "confidence.npy"), estimate.confidence)
     if estimate.right is not None:
         write_image(_file(base, "right.png"), estimate.right)
+    if estimate.is_sky is not None:
+        write_image(_file(base, "sky.png"), estimate.is_sky.float().expand(3, -1, -1))
     picture = (
         draw_disparity(estimate.disparity_px)
         if estimate.depth_m is None
@@ -153,6 +156,12 @@ def read_drawn_view(folder: Path, name: str) -> Float[Tensor, "3 h w"] | None:
     return read_image(path) if path.is_file() else None
 
 
+def read_sky(folder: Path, name: str) -> Bool[Tensor, "h w"] | None:
+    """Read where a prediction says sky, or None where its weights do not know it."""
+    path = _file(folder / name, "sky.png")
+    return read_image(path)[0] > 0 if path.is_file() else None
+
+
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
     """Read back what :func:`write_estimate` wrote.
 
@@ -170,6 +179,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         disparity_px=disparity_px,
         confidence=read_confidence(folder, name),
         right=read_image(right) if right.is_file() else None,
+        is_sky=read_sky(folder, name),
     )
 
 
