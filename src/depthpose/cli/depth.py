@@ -35,9 +35,9 @@ def predict(
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
     drawn view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
-    NAME.ply with --cloud. A video gives the files of each frame and
+    NAME.cloud.ply with --cloud. A video gives the files of each frame and
     NAME.color.mp4. report.html shows some of them, with the cloud in 3D. A rerun skips what is
-    finished; other settings need another --out.
+    finished; other settings need another --out. No file is written over that is not the run's own.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --focal-px 1100 --out out
@@ -56,7 +56,7 @@ def predict(
         max_memory: bound on the memory of the matcher, such as 1GB; exact.
         batch: images of one size that go through the networks together: for a GPU; a processor is
             busy with one.
-        cloud: write a coloured point cloud, NAME.ply.
+        cloud: write a coloured point cloud, NAME.cloud.ply.
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
         engine: where the work is done.
     """
@@ -82,7 +82,7 @@ def predict(
             with_sgbm=matcher == "sgbm",
         )
         return engine_depth.predict(images, (camera, focal_px), recipe, look, out, engine)
-    sources = predicting.find_sources(images)
+    sources = predicting.find_sources(images, Path(out))
     lens = predicting.read_lens(camera, focal_px, sources[0])
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
     return predicting.predict_all(sources, lens, method, Path(out), look, view)
@@ -109,8 +109,9 @@ def match(
 
     For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
-    NAME.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips what
-    is finished; other settings need another --out.
+    NAME.cloud.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips
+    what is finished; other settings need another --out. No file is written over that is not the
+    run's own.
 
         depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out out
 
@@ -129,11 +130,12 @@ def match(
         tile: match tiles of so many rows and columns: less memory and approximate. The first
             pair is matched whole as well, and the change of its disparity is said.
         left_right_check: match the mirrored pair too, which makes the confidence better.
-        cloud: write a coloured point cloud, NAME.ply.
+        cloud: write a coloured point cloud, NAME.cloud.ply.
         check: look at the first pair for swapped or unrectified images before any work.
         engine: where the work is done.
     """
     from depthpose.cli import matching, methods
+    from depthpose.core.run import refuse_among_inputs
 
     if (weights is None) == (matcher != "sgbm"):
         raise InputError("match with --weights FILE (PSMNet), or with --matcher sgbm.")
@@ -154,6 +156,7 @@ def match(
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it as the second word")
     pairs = matching.Pairs.find(left, right, camera)
+    refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
     if check:
         matching.refuse_unusable_first(pairs)
     if weights is None:
@@ -242,6 +245,8 @@ def evaluate(
     """
     from depthpose.cli import evaluating, methods
     from depthpose.core.engine import is_job
+    from depthpose.core.report import table_files
+    from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
 
     if not weights and matcher is None and predictions is None and not floor:
@@ -260,6 +265,8 @@ def evaluate(
         training = evaluating.open_training(train, train_without)
         chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
     home = out / "predictions"
+    files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
+    claim_folder(out, {"command": "depth evaluate"}, files)
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
     if predictions is not None and is_job(predictions):
         from depthpose.cli.engine_evaluating import ShardTruth, measure_shards

@@ -8,14 +8,20 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_page import write_depth_page
+from depthpose.cli.depth_page import PAGE, write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
-from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
 from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
 from depthpose.depth.types import DepthEstimate, StereoInput
 
@@ -80,13 +86,13 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
 def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
     rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
-    claim_folder(out, {**method.settings, "camera": rig})
-    claim_names(out, {path.stem: path for path in pairs.left})
+    claim_folder(out, {**method.settings, "camera": rig}, [PAGE])
+    claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
     failures: list[str] = []
     mine = find_shard().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):
         name = pairs.left[index].stem
-        if is_finished(out, name) and (not with_cloud or (out / f"{name}.ply").is_file()):
+        if is_finished(out, name) and (not with_cloud or has_cloud(out, name)):
             continue
         try:
             pair = pairs.read(index)

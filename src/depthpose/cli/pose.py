@@ -48,12 +48,13 @@ def predict(
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
-    poses.json holds for each input camera_from_model (metres), its covariance, status and reason,
-    and the seconds of each stage. A cloud or depth image NAME gives NAME.ply, the posed model
-    beside the cloud, and NAME.png over the depth image; a data set gives
-    depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. report.html shows some of them in 3D, and every
-    refusal. A rerun skips what is finished; other settings need another --out; processes of
-    torchrun share the work.
+    poses.json holds for each input camera_from_model (metres), its covariance (about this answer
+    alone; the risk is of being wrong altogether), status and reason, and the seconds of each stage.
+    A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv and
+    SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
+    what is finished; other settings need another --out; no file is written over that is not the
+    run's own. Processes of torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
@@ -86,7 +87,7 @@ def predict(
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_methods import pose_methods
     from depthpose.cli.pose_page import write_pose_page
-    from depthpose.core.run import claim_names, own_device
+    from depthpose.core.run import own_device
 
     _refuse_mixture(cloud, depth, bop)
     config = EstimateConfig(
@@ -106,20 +107,20 @@ def predict(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
             "and --camera, or weights that vote"
         )
-    name = posing.object_named(object, method)
+    name, home = posing.object_named(object, method), Path(out)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
-        jobs = posing.cloud_jobs(Path(cloud), unit or "m", name)
+        jobs = posing.cloud_jobs(Path(cloud), unit or "m", name, home)
         settings |= {"unit": unit or "m"}
     else:
         assert depth is not None
         if mask is None or camera is None:
             raise InputError("--depth needs --mask and --camera beside it")
-        jobs = posing.view_jobs(Path(depth), Path(mask), camera, name, unit)
+        jobs = posing.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
         settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}
-    home = Path(out)
-    claim_names(home, {job.name: Path(cloud or depth or out) for job in jobs})
+    settings = {**method.settings, **settings}
+    posing.claim(home, settings, jobs, Path(cloud or depth or out))
     predictions = posing.predict_all(method, jobs, home, settings, batch, view)
     if predictions is None:
         return 0
@@ -174,10 +175,14 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
     """
     from depthpose.cli import pose_evaluating, pose_masks, pose_methods
+    from depthpose.core.report import table_files
+    from depthpose.core.run import claim_folder
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = pose_evaluating.open_instances(bop, split, objects, targets)
+    files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
+    claim_folder(out, {"command": "pose evaluate"}, files)
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
     )
@@ -209,7 +214,8 @@ def _predict_bop(
     (masks,) = find_masks([word], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = posing.bop_jobs(dataset, masks, method)
-    settings |= masks.settings
+    settings = {**method.settings, **settings, **masks.settings}
+    posing.claim_bop(out, settings, dataset)
     predictions = posing.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_page import write_depth_page
+from depthpose.cli.depth_page import PAGE, write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.cli.viewing import Viewer, open_viewer
 from depthpose.core.camera import Camera, StereoRig, read_camera
@@ -28,10 +28,18 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.run import claim_folder, claim_names, find_shard
+from depthpose.core.run import claim_folder, claim_names, find_shard, refuse_among_inputs
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
 from depthpose.depth.types import StereoInput
+
+_VIDEO = ".color.mp4"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +92,12 @@ def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
     return Lens(camera=read, focal_px=focal_px)
 
 
-def find_sources(words: Sequence[str]) -> list[Path]:
+def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     """List images and videos.
 
     Raises:
-        InputError: nothing there, or two inputs whose results would have one name.
+        InputError: nothing there, two inputs whose results would have one name, or a folder of
+            inputs that is ``out`` too.
     """
     found: list[Path] = []
     for word in words:
@@ -97,6 +106,14 @@ def find_sources(words: Sequence[str]) -> list[Path]:
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
+    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in found
+              if _is_video(path) for stem in stems]  # fmt: skip
+    if (frame := next(filter(None, frames), None)) is not None:
+        raise InputError(
+            f"an input is called {frame[0]!r}, as a frame of a video would be, and so would their "
+            "results; rename one of the two"
+        )
+    refuse_among_inputs(out, words, found)
     return found
 
 
@@ -104,10 +121,11 @@ def predict_all(
     sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
 ) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
-    claim_folder(
-        out, {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
-    )
-    claim_names(out, {source.stem: source for source in sources})
+    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
+    claim_folder(out, settings, [PAGE])
+    videos = [source.stem for source in sources if _is_video(source)]
+    endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
+    claim_names(out, {source.stem: source for source in sources}, endings, videos)
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
     with open_viewer(None if find_shard().rank else view) as viewer:
@@ -165,7 +183,7 @@ class Predictor:
             video = read_video(source)
             names = self._predict(iter(video), video.frames or None, source.name)
             colors = _colors(names, self.out, self.look)
-            write_video(self.out / f"{source.stem}.color.mp4", colors, video.fps)
+            write_video(self.out / f"{source.stem}{_VIDEO}", colors, video.fps)
         except InputError as error:
             self.failures[source.name] = error
             return 0
@@ -210,8 +228,8 @@ class Predictor:
         return [given.name for given in inputs]
 
     def _is_finished(self, name: str) -> bool:
-        has_cloud = not self.look.with_cloud or (self.out / f"{name}.ply").is_file()
-        return has_cloud and is_finished(self.out, name)
+        is_drawn = not self.look.with_cloud or has_cloud(self.out, name)
+        return is_drawn and is_finished(self.out, name)
 
 
 def _size_of(source: Path) -> tuple[int, int]:

@@ -10,7 +10,15 @@ import torch
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig, Progress, Task, held_out_text, leave_card, train
+from depthpose.core.loop import (
+    LoopConfig,
+    Progress,
+    Task,
+    held_out_text,
+    leave_card,
+    run_files,
+    train,
+)
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
@@ -171,7 +179,8 @@ def _walk(
         settings["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
-    claim_folder(run.folder, settings)
+    names = ("generator", "matcher", "fakestereo")
+    claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
     seconds = train(task, pairs, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
     return facts, seconds

@@ -4,6 +4,8 @@ from depthpose.pose.predictions.jobs import Job as Job
 from depthpose.pose.predictions.jobs import detection_jobs as detection_jobs
 from depthpose.pose.predictions.jobs import instance_jobs as instance_jobs
 from depthpose.pose.predictions.jobs import predict as predict
+from depthpose.pose.predictions.records import CLOUD as CLOUD
+from depthpose.pose.predictions.records import PICTURE as PICTURE
 from depthpose.pose.predictions.records import POSES as POSES
 from depthpose.pose.predictions.records import STAGES as STAGES
 from depthpose.pose.predictions.records import Place as Place

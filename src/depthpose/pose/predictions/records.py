@@ -17,6 +17,8 @@ from depthpose.pose.bop.parse import integer, number, read_rows
 from depthpose.pose.types import PoseEstimate, Status
 
 POSES = "poses.json"
+PICTURE, CLOUD = "pose.png", "pose.ply"
+"""What follows ``NAME.`` in the names of the files that show a pose."""
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
