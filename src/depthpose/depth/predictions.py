@@ -37,22 +37,10 @@ class Estimator(Protocol):
 
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
-ENDINGS = (
-    "depth_m.npy",
-    "depth.png",
-    "confidence.npy",
-    "right.png",
-    "color.png",
-    "ply",
-    "disparity_px.npy",
-)
-"""Of the files of an estimate, as :func:`write_estimate` and its cloud have them."""
-
-
 CLOUD = "cloud.ply"
 ENDINGS = (
-    "depth_m.npy", "depth.png", "confidence.npy", "right.png", "color.png", "disparity_px.npy",
-    CLOUD,
+    "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
+    "disparity_px.npy", CLOUD,
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
