@@ -8,15 +8,18 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
+from tests.depth.made_selection import sure_of
 from tests.made_street import make_street
 from tests.pages.read_page import read_page
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
+from depthpose.core.errors import InputError
 from depthpose.core.files import (
     read_image,
     read_map,
@@ -27,7 +30,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.loop import read_metrics
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
-from depthpose.depth.stereo import PSMNet
+from depthpose.depth.stereo import PSMNet, SGBMMatcher
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
 
@@ -103,6 +106,31 @@ def test_an_image_that_is_called_like_a_frame_of_a_video_is_refused(
     words = [str(tmp_path / name) for name in ("drive.avi", "drive_000001.png")]
     assert predict(home, tmp_path / "out", *words, "--focal-px", "70") == 2
     assert "an input is called 'drive_000001', as a frame of a video" in capsys.readouterr().err
+
+
+def test_weights_that_answer_themselves_need_no_matcher(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = str(tmp_path / "own.safetensors")
+    write_depth_weights(Path(weights), generator=sure_of(0), facts={"licence": "MIT"})
+    image, camera = str(home / "images/0.png"), ["--camera", str(home / "cam.json")]
+    words = [image, *camera, "--weights", weights, "--out"]
+    assert main(["depth", "predict", *words, str(tmp_path / "own"), "--cloud"]) == 0
+    assert bool(read_map(tmp_path / "own/0.depth_m.npy").isnan().all()), "nothing but sky"
+    assert bool((read_image(tmp_path / "own/0.sky.png") == 1).all())
+    page = read_page(tmp_path / "own/report.html")
+    assert any("grey: sky or no answer" in text for text in page.texts["figcaption"])
+    assert "100.0% of the pixels" in page.texts["dd"]
+    assert [layer["count"] for scene in page.scenes for layer in scene["layers"]] == [0]
+    asked = [*words, str(tmp_path / "sgbm"), "--matcher", "sgbm"]
+    with patch.object(SGBMMatcher, "match", side_effect=InputError("OpenCV was asked")):
+        assert main(["depth", "predict", *asked]) == 2
+    assert "OpenCV was asked" in capsys.readouterr().err
+    rig = tmp_path / "rig.json"
+    rig.write_text(json.dumps({**CAMERA, "baseline_m": 0.5}))
+    pair = [image, image, "--camera", str(rig), "--weights", weights, "--no-check"]
+    assert main(["depth", "match", *pair, "--out", str(tmp_path / "pair")]) == 2
+    assert "holds no matcher, which a pair needs" in capsys.readouterr().err
 
 
 def test_processes_share_a_folder_of_images(

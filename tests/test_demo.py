@@ -1,9 +1,11 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from tests.depth.made_selection import sure_of
 from tests.made_street import make_street
 
 from depthpose.core.camera import StereoRig, read_camera
@@ -11,9 +13,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
 from depthpose.core.run import read_settings
 from depthpose.demo import make_demo
+from depthpose.demo.depth import _nets
 from depthpose.demo.motorcycle import read_motorcycle
 from depthpose.demo.pose import show_poses
 from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.objects import PARTS
 from depthpose.pose.predictions import read_predictions
@@ -83,6 +88,16 @@ def test_the_demo_writes_over_nothing_of_somebody_else(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="part: is there already, and no run of this command"):
         make_demo(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["part"]
+
+
+def test_without_a_matcher_the_pair_is_left_to_opencv() -> None:
+    net = FakestereoNet(None, make_synthesiser(sure_of(3)))
+    street = make_street(0.1)
+    methods = _nets(net, replace(street, input=replace(street.input, name="street")))
+    assert {name: sees for name, (sees, _) in methods.items()} == {
+        "Fakestereo-Net, compact": "one image",
+        "SGBM, holes filled": "both images",
+    }
 
 
 def test_the_demo_poses_parts_and_answers_none_wrongly(tmp_path: Path) -> None:

@@ -1,28 +1,26 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
 from torch import Tensor
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig, SGBMConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
+from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.weights import write_depth_weights
-
-FOCAL_PX, BASELINE_M = 120.0, 0.5
 
 
 @pytest.fixture(scope="module")
@@ -266,27 +264,6 @@ def test_values_that_are_no_picture_are_refused(
 def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         as_tensor(given)
-
-
-SELECTION = SelectionConfig(
-    encoder_width=0.1,
-    widths=(4, 4, 4, 4),
-    planes=4,
-    disparity_px=(1.0, 8.0),
-    virtual_focal_px=FOCAL_PX,
-    virtual_baseline_m=BASELINE_M,
-)
-
-
-def sure_of(plane: int, answer: str = "own") -> SelectionGenerator:
-    """A network that says the same class of each pixel of both views: 0 is the sky, k a plane."""
-    config = dataclasses.replace(SELECTION, answer=answer)
-    network = SelectionGenerator(config).eval()
-    torch.nn.init.zeros_(network.head.weight)
-    with torch.no_grad():
-        wanted = 20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
-        network.head.bias = torch.nn.Parameter(wanted)
-    return network
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:

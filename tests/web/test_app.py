@@ -17,11 +17,13 @@ import pytest
 import torch
 from httpx2 import Response
 from starlette.testclient import TestClient
+from tests.depth.made_selection import sure_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import adds_m
 from depthpose.pose.objects import make_part
@@ -218,6 +220,39 @@ def test_the_matcher_may_want_a_larger_picture_than_the_generator(
     files = {"image": "left.png", "camera": "camera.json"}
     status, text = refusal(ask(TestClient(app, base_url=URL), "depth", samples, files))
     assert (status, "more than this page computes" in text) == (400, True)
+
+
+def page_without_matcher(plane: int, nets: tuple[FakestereoNet, GeoPoseNet]) -> TestClient:
+    net = FakestereoNet(None, make_synthesiser(sure_of(plane)))
+    return TestClient(make_app(net, nets[1]), base_url=URL)
+
+
+def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, page: TestClient
+) -> None:
+    client = page_without_matcher(3, nets)
+    html = client.get("/").text
+    assert "One image to depth in metres." in html
+    assert 'name="right"' not in html
+    assert 'name="right"' in page.get("/").text
+    one = {"image": "left.png", "camera": "camera.json"}
+    found = ask(client, "depth", samples, one).json()
+    assert found["said"].endswith(" m. 0% are sky.")
+    assert "grey: sky or no answer" in found["pictures"][0]["caption"]
+    status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
+    assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
+
+
+def test_a_picture_of_the_sky_alone_is_said_to_be_one(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path
+) -> None:
+    files = {"image": "left.png", "camera": "camera.json"}
+    found = ask(page_without_matcher(0, nets), "depth", samples, files).json()
+    assert found["said"] == (
+        "No pixel got a depth from one image; 100% of the image is taken for sky."
+    )
+    assert found["scene"]["layers"][0]["count"] == 0
+    assert "left.sky.png" in [file["name"] for file in found["files"]]
 
 
 def test_terms_of_the_weights_stand_beside_the_answer(
