@@ -21,7 +21,7 @@ from depthpose.core.run import environment
 
 
 def main() -> None:
-    """Print the times."""
+    """Print a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--images", type=int, default=500)
     parser.add_argument("--size", type=int, nargs=2, default=(96, 160), metavar=("H", "W"))
