@@ -127,17 +127,37 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     }
 
 
+def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
+    """Take turns in one process, one thread: processor time bears a machine with other work."""
+    torch.set_num_threads(1)
+    image = street()
+    nets = {name: make_net(name, MatcherConfig()) for name in names}
+    times: dict[str, list[float]] = {name: [] for name in names}
+    for _ in range(runs):
+        for name, net in nets.items():
+            begin = time.process_time()
+            net.estimate_pair(image)
+            times[name].append(time.process_time() - begin)
+    return [{"set": Path(name).stem, "processor_s": min(times[name])} for name in names]
+
+
 def main() -> None:
     """Run every set in a process of its own and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--weights", nargs="+", default=["default", "full"])
     parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--device", default="cpu")
+    parser.add_argument(
+        "--compare", nargs="+", metavar="W", help="processor time of one thread, taking turns"
+    )
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
         weights, precision = options.child
         print(json.dumps(run_once(weights, precision, options.device)))
+        return
+    if options.compare:
+        print(markdown_table(compare(options.compare)))
         return
     rows = []
     for weights in options.weights:

@@ -96,18 +96,15 @@ TABLES = (
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
             "--protocol eigen-raw-camera --matcher sgbm --floor rows nearest "
             f"{_TRAIN} "
-            "--weights default both:default kitti-nc both:kitti-nc sgbm:kitti-nc --out OUT/mono",
+            "--weights default both:default kitti-nc both:kitti-nc --out OUT/mono",
         ),
         files=("mono/rows.json",),
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
             **_FLOORS,
-            "mono, fine-tuned (default)": {"weights": "default", "sees": "left view"},
-            "mono, fine-tuned (kitti-nc)": {"weights": "kitti-nc", "sees": "left view",
-                                            "method": "fakestereo"},
-            "kitti-nc's drawn view, matched by SGBM": {
-                "weights": "kitti-nc", "method": "fakestereo with sgbm (holes filled)"},
+            "one image (default)": {"weights": "default", "sees": "left view"},
+            "one image (kitti-nc)": {"weights": "kitti-nc", "sees": "left view"},
             "real stereo, our matcher (default)": {"weights": "default", "sees": "both views"},
             "real stereo, our matcher (kitti-nc)": {"weights": "kitti-nc", "sees": "both views"},
             "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
@@ -126,8 +123,8 @@ TABLES = (
         key={"cap": "cap_m"},
         rows={
             **_FLOORS,
-            "mono, default": {"weights": "default"},
-            "mono, kitti-nc": {"weights": "kitti-nc"},
+            "one image, default": {"weights": "default"},
+            "one image, kitti-nc": {"weights": "kitti-nc"},
         },
     ),
     Table(
@@ -141,8 +138,8 @@ TABLES = (
         files=("disparity/rows.json",),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
         rows={
-            "mono, default": {"weights": "default", "sees": "left view"},
-            "mono, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
+            "one image, default": {"weights": "default", "sees": "left view"},
+            "one image, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
             "both views, default": {"weights": "default", "sees": "both views"},
             "both views, kitti-nc": {"weights": "kitti-nc", "sees": "both views"},
             **_SGBM,
