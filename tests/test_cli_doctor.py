@@ -3,10 +3,13 @@
 from importlib import metadata
 
 import pytest
+from tests.depth.made_selection import sure_of
 
 from depthpose import __version__
 from depthpose.cli import main
 from depthpose.core.errors import InputError
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 
 
@@ -31,6 +34,20 @@ def test_doctor_names_what_is_here_and_tries_each_room(
     assert "weights parts: geoposenet, MIT" in said
     assert "depth room: a pair shifted by 12 px was matched at 1" in said
     assert "pose room: a made flange was posed " in said
+
+
+@pytest.mark.parametrize(("plane", "code"), [(3, 0), (0, 1)])
+def test_weights_without_a_matcher_are_tried_on_one_image(
+    plane: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = FakestereoNet(None, make_synthesiser(sure_of(plane)))
+    monkeypatch.setattr(FakestereoNet, "load", lambda _: net)
+    assert main(["doctor"]) == code
+    said = capsys.readouterr()
+    if plane:
+        assert "depth room: one image got a depth for 100% of its pixels, 15.0 m" in said.out
+    else:
+        assert "one image got a depth for 0% of its pixels" in said.err
 
 
 def test_a_room_that_fails_is_named_and_the_other_is_tried(

@@ -87,6 +87,22 @@ def test_one_large_difference_is_judged_by_its_kind(tmp_path: Path) -> None:
     assert 0 < float(rows[0]["mean difference"]) < 1e-6
 
 
+@pytest.mark.parametrize("wrong", [np.nan, 9.0])
+def test_a_share_may_flip_and_is_said(wrong: float, tmp_path: Path) -> None:
+    """One of six numbers is far off, or NaN in one answer alone: a sixth may, a tenth may not."""
+    y = 2 * X + 1
+    y[0, 0] = wrong
+    rows = freeze(tmp_path / "line.onnx", line_export(y, flips=0.2))
+    assert rows[0]["flipped"] == pytest.approx(1 / 6)
+    assert rows[0]["largest difference"] == 0.0
+    assert "flipped" not in rows[1]
+    with pytest.raises(InputError, match=r"by more than 1e-06 on 16\.667% .* 10\.000% may"):
+        freeze(tmp_path / "other.onnx", line_export(y, flips=0.1))
+    with pytest.raises(InputError, match="on 100.000% of the numbers"):
+        freeze(tmp_path / "other.onnx", line_export(np.full_like(X, np.nan), flips=0.9))
+    assert not (tmp_path / "other.onnx").exists()
+
+
 def test_an_interrupt_leaves_no_half_file_and_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "line.onnx"
     path.write_bytes(b"old")

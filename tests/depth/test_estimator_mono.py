@@ -1,28 +1,26 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
 from torch import Tensor
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig, SGBMConfig
+from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
+from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.weights import write_depth_weights
-
-FOCAL_PX, BASELINE_M = 120.0, 0.5
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +136,7 @@ def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path)
+    assert net.matcher is not None
     match = net.matcher.match
 
     def spy(left: Tensor, right: Tensor) -> object:
@@ -267,28 +266,6 @@ def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> N
         as_tensor(given)
 
 
-SELECTION = SelectionConfig(
-    encoder_width=0.1,
-    widths=(4, 4, 4, 4),
-    planes=4,
-    disparity_px=(1.0, 8.0),
-    virtual_focal_px=FOCAL_PX,
-    virtual_baseline_m=BASELINE_M,
-)
-
-
-def sure_of(plane: int, answer: str = "own") -> SelectionGenerator:
-    """A network that says the same class of each pixel of both views: 0 is the sky, k a plane."""
-    config = dataclasses.replace(SELECTION, answer=answer)
-    network = SelectionGenerator(config).eval()
-    torch.nn.init.zeros_(network.head.weight)
-    with torch.no_grad():
-        network.head.bias.copy_(
-            20.0 * torch.nn.functional.one_hot(torch.tensor(plane), 5).repeat(2)
-        )
-    return network
-
-
 def constant_matcher(disparity_px: float) -> CallableMatcher:
     return CallableMatcher(lambda left, _: torch.full(left.shape[1:], disparity_px))
 
@@ -343,3 +320,53 @@ def test_the_matcher_and_both_are_one_word_away() -> None:
     )
     joined = join_matches(own, other)
     assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)
+
+
+def selection_file(folder: Path, answer: str = "own") -> Path:
+    """Weights of a generator that is sure of plane 3 (4 px), without a matcher."""
+    path = folder / f"{answer}.safetensors"
+    write_depth_weights(path, generator=sure_of(3, answer), facts={})
+    return path
+
+
+def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) -> None:
+    net = FakestereoNet.load(selection_file(tmp_path))
+    assert net.matcher is None
+    image, rig = torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX, 0.2)
+    found = net.estimate(image, rig).depth_m
+    assert found is not None
+    assert float(found.mean()) == pytest.approx(FOCAL_PX * BASELINE_M / 4, rel=1e-4)
+    pair = StereoInput(name="street", left=image, right=image.flip(-1), camera=rig)
+    for estimate in (net.estimate_pair, lambda one: net.estimate_many([one])):
+        with pytest.raises(InputError, match=r"street: .*a pair needs a matcher.*matcher='sgbm'"):
+            estimate(pair)
+
+
+@pytest.mark.parametrize("answer", ["matched", "joined"])
+def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: str) -> None:
+    path = selection_file(tmp_path, answer)
+    with pytest.raises(InputError, match="there is no matcher in that"):
+        FakestereoNet.load(path)
+    with pytest.raises(InputError, match="matcher is None"):
+        FakestereoNet(None, make_synthesiser(sure_of(3, answer)))
+    assert FakestereoNet.load(path, matcher=constant_matcher(2.0)).matcher is not None
+    with pytest.raises(InputError, match="there is no matcher in that"):
+        FakestereoNet.load(selection_file(tmp_path), matcher="psmnet")
+    with pytest.raises(InputError, match="matcher is None"):
+        FakestereoNet(None)
+
+
+def test_the_answer_may_be_another_than_the_weights_say(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    path, painting = selection_file(tmp_path), tmp_path / "g.safetensors"
+    write_depth_weights(painting, generator=generator, facts={})
+    given = constant_matcher(2.0)
+    matched = FakestereoNet.load(path, matcher=given, answer="matched")
+    found = matched.estimate(torch.rand(3, 64, 96), camera(96, 64, FOCAL_PX))
+    assert float(found.disparity_px.mean()) == pytest.approx(2.0)
+    FakestereoNet.load(painting, matcher=given, answer="matched")
+    with pytest.raises(InputError, match="answer is 'own'"):
+        FakestereoNet.load(painting, matcher=given, answer="own")
+    with pytest.raises(InputError, match="answer is 'joined'"):
+        FakestereoNet.load(matcher=given, answer="joined")

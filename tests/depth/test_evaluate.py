@@ -10,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import clamped_depth, evaluate
+from depthpose.depth.evaluate import clamped_depth, evaluate, frame_result
 from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.predictions import (
     is_finished,
@@ -54,6 +54,22 @@ def write_predictions(folder: Path, change: Callable[[torch.Tensor], torch.Tenso
     for k, name in enumerate("abc"):
         write_map(folder / f"{name}.disparity_px.npy", change(truth_px(k)))
     return folder
+
+
+def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path) -> None:
+    """Its disparity is that of a point 10 km away, which is no depth."""
+    is_sky = torch.zeros(H, W, dtype=torch.bool)
+    is_sky[:5] = True
+    disparity_px = torch.where(is_sky, 0.004, truth_px(0))
+    depth_m = torch.where(is_sky, torch.nan, depth_from_disparity(truth_px(0), rig()))
+    estimate = DepthEstimate(depth_m=depth_m, disparity_px=disparity_px, is_sky=is_sky)
+    write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
+    again = read_estimate(tmp_path / "p", "a", rig())
+    assert again.is_sky is not None
+    assert torch.equal(again.is_sky, is_sky)
+    shown = frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None).estimate.depth_m
+    assert shown is not None
+    assert torch.equal(shown.isnan(), is_sky)
 
 
 def test_perfect_disparity_has_no_error(pairs: Dataset, tmp_path: Path) -> None:

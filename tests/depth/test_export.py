@@ -4,18 +4,21 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tests.depth.made_selection import CONFIG, of_all_kinds
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
+from depthpose.core.export import network_model
 from depthpose.core.files import write_image
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
-from depthpose.depth.export.network import SizelessPSMNet, gathered_volume
+from depthpose.depth.export.network import SizelessPSMNet, SizelessSelection, gathered_volume
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.stereo.psmnet import concatenation_volume
 from depthpose.depth.synthesis import UNetGenerator
@@ -32,12 +35,45 @@ def tiny_matcher(**knobs: object) -> PSMNet:
     return PSMNet(PSMNetConfig(**size | knobs)).eval()  # pyright: ignore[reportArgumentType]
 
 
+def calm_matcher() -> PSMNet:
+    """A matcher of broad distributions: an untrained one jumps where a view changes little."""
+    matcher = tiny_matcher(work_focal_px=70.0)
+    with torch.no_grad():
+        for head in matcher.heads:
+            head.cost.weight.mul_(0.002)
+    return matcher
+
+
 def tiny_weights(**knobs: object) -> DepthWeights:
     torch.manual_seed(0)
     rig = {"width": 2, "levels": 4, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
     generator = UNetGenerator(GeneratorConfig(**rig | knobs)).eval()  # pyright: ignore[reportArgumentType]
     matcher = tiny_matcher(work_focal_px=70.0)
     return DepthWeights(generator=generator, matcher=matcher, facts=TERMS)
+
+
+@pytest.fixture(scope="module")
+def selection_network() -> Any:  # noqa: ANN401 - an ONNX model
+    """The network of :func:`of_all_kinds`, exported once: that is what takes the time."""
+    module, multiple = SizelessSelection(of_all_kinds()).eval(), CONFIG.side_multiple_px
+    return network_model(module, [torch.rand(2, 3, 2 * multiple, 3 * multiple)], multiple)
+
+
+@pytest.fixture
+def selection(
+    selection_network: Any,  # noqa: ANN401
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Path:
+    """Folder with ``w.safetensors``: a generator that selects, without a matcher."""
+    monkeypatch.setattr("depthpose.depth.export.views.network_model", lambda *_: selection_network)
+    write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
+    return tmp_path
+
+
+def export_to(folder: Path, *words: str) -> int:
+    file = str(folder / "w.safetensors")
+    return main(["export", "depth", "--weights", file, "--out", str(folder / "depth.onnx"), *words])
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +85,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "w.safetensors",
         generator=weights.generator, matcher=weights.matcher, facts=TERMS,
     )  # fmt: skip
-    words = ["--weights", str(folder / "w.safetensors"), "--out", str(folder / "depth.onnx")]
-    assert main(["export", "depth", *words]) == 0
+    assert export_to(folder) == 0
     return folder
 
 
@@ -108,7 +143,54 @@ def test_a_pair_at_the_focal_length_of_the_weights(exported: Path) -> None:
     assert {row["output"] for row in rows} == {"disparity_px", "confidence"}
 
 
+def test_an_answer_of_its_own_is_exported_without_a_matcher(selection: Path) -> None:
+    """At every size, in batches; the sky is a decision, which may flip on its border."""
+    assert export_to(selection) == 0
+    record = json.loads((selection / "depth.proof.json").read_text())
+    found = {(row["input"], row["output"]): row for row in record["differences"]}
+    assert len(found) == 20
+    for (_, name), row in found.items():
+        assert row["largest difference" if name == "depth_m" else "mean difference"] < 2e-3
+        assert row.get("flipped", 0.0) < 1e-3
+    assert record["facts"]["answer"] == "own"
+    infer_as_documented(selection, least_px=0.0)
+
+
+@pytest.mark.parametrize("answer", ["joined", pytest.param("matched", marks=pytest.mark.slow)])
+def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path, answer: Answer) -> None:
+    matcher = calm_matcher()
+    generator = of_all_kinds(answer)
+    write_depth_weights(
+        selection / "w.safetensors", generator=generator, matcher=matcher, facts=TERMS
+    )
+    assert export_to(selection) == 0
+    rows = json.loads((selection / "depth.proof.json").read_text())["differences"]
+    assert {row["output"] for row in rows} >= {"depth_m", "is_sky"}
+    lone = DepthWeights(generator=generator, matcher=None, facts=TERMS)
+    with pytest.raises(InputError, match="lack the matcher"):
+        depth_export(lone, None, {}).graph()
+
+
+def test_another_sky_is_no_proof(selection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is held to the limits is the sky too: the proof must fail where it is another."""
+    limits = depth_export(
+        DepthWeights(generator=of_all_kinds(), matcher=None, facts=TERMS), None, {}
+    ).limits
+    assert 0 < limits["depth_m"].flips <= 1e-3
+    network = of_all_kinds()
+    with torch.no_grad():
+        network.head.bias[0] += 1.0
+    write_depth_weights(selection / "w.safetensors", generator=network, facts=TERMS)
+    assert export_to(selection) == 2
+    assert not (selection / "depth.onnx").exists()
+
+
 def test_inference_without_torch_as_the_documentation_says(exported: Path) -> None:
+    infer_as_documented(exported, least_px=1.0)
+
+
+def infer_as_documented(exported: Path, least_px: float) -> None:
+    """Run the lines of docs/export.md where torch is not, and compare with the estimator."""
     torch.manual_seed(2)
     image = torch.nn.functional.interpolate(torch.rand(1, 3, 9, 20), (70, 150), mode="bicubic")[0]
     write_image(exported / "street.png", image.clamp(0, 1))
@@ -125,9 +207,11 @@ def test_inference_without_torch_as_the_documentation_says(exported: Path) -> No
     assert expected.depth_m is not None
     depth_m = np.load(exported / "street.depth_m.npy")
     assert depth_m.shape == (70, 150)
-    is_near = expected.disparity_px.numpy() >= 1
+    is_near = expected.disparity_px.numpy() >= least_px
     assert is_near.sum() > 1000
-    np.testing.assert_allclose(depth_m[is_near], expected.depth_m.numpy()[is_near], rtol=0.01)
+    is_close = np.isclose(depth_m, expected.depth_m.numpy(), rtol=0.01, equal_nan=True)
+    assert is_close[is_near].mean() > (0.999 if expected.is_sky is not None else 1 - 1e-9)
+    assert (expected.is_sky is not None) == bool(np.isnan(depth_m).any())
 
 
 def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:

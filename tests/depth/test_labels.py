@@ -53,10 +53,10 @@ def test_an_unsure_matcher_labels_nothing() -> None:
 
 def test_a_labelled_folder_trains_and_is_gone_on_with(tmp_path: Path) -> None:
     dataset = open_dataset(write_pairs(tmp_path / "pairs", (0.2, 0.25)))
-    out, settings = tmp_path / "out", {"weights": "none"}
+    out = tmp_path / "out"
+    settings: dict[str, object] = {"weights": "none"}
     labelled = label_pairs(brightness_matcher(), dataset, LabelConfig(), out, settings)
-    assert next(labelled)[0] == "00"
-    labelled.close()
+    assert next(labelled)[0] == "00"  # and no more of it
     rest = list(label_pairs(brightness_matcher(), dataset, LabelConfig(), out, settings))
     assert [name for name, _ in rest] == ["01"]
     found = open_dataset(out)

@@ -55,6 +55,24 @@ def test_the_facts_are_those_of_the_map() -> None:
     assert "mean confidence" not in facts
 
 
+def test_the_sky_is_grey_and_said_and_has_no_points() -> None:
+    is_sky = torch.zeros(truth_m().shape, dtype=torch.bool)
+    is_sky[:9] = True
+    depth_m = torch.where(is_sky, torch.nan, 7.0)
+    found = replace(estimate(), depth_m=depth_m, is_sky=is_sky)
+    section = depth_section("a", DepthShown(pair=PAIR, estimate=found))
+    _, depth = drawings(section)
+    assert depth.caption.endswith("grey: sky or no answer")
+    assert bool((depth.image[:, :9] == 0.5).all())
+    assert dict(section.facts)["sky"] == f"{float(is_sky.float().mean()):.1%} of the pixels"
+    cloud = section.scenes[0].layers[0].shape
+    assert isinstance(cloud, Cloud)
+    assert len(cloud.points) == int((~is_sky).sum())
+    plain = depth_section("a", DepthShown(pair=PAIR, estimate=estimate()))
+    assert drawings(plain)[1].caption.endswith("grey: none")
+    assert "sky" not in dict(plain.facts)
+
+
 def test_without_a_camera_there_is_disparity_and_no_cloud() -> None:
     found = replace(estimate(), depth_m=None)
     section = depth_section("a", DepthShown(pair=replace(PAIR, camera=None), estimate=found))

@@ -17,11 +17,13 @@ import pytest
 import torch
 from httpx2 import Response
 from starlette.testclient import TestClient
+from tests.depth.made_selection import sure_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import adds_m
 from depthpose.pose.objects import make_part
@@ -92,7 +94,9 @@ def test_one_image_becomes_the_depth_that_python_gives(
     found = ask(page, "depth", samples, {"image": "left.png", "camera": "camera.json"}).json()
     assert found["ok"]
     names = [file["name"] for file in found["files"]]
-    assert {"left.depth_m.npy", "left.right.png", "left.confidence.png", "left.ply"} <= set(names)
+    assert {"left.depth_m.npy", "left.right.png", "left.confidence.png", "left.cloud.ply"} <= set(
+        names
+    )
     assert found["scene"]["layers"][0]["count"] > 1000
     data = page.get("/" + found["folder"] + "left.depth_m.npy").content
     expected = nets[0].estimate(samples / "left.png", samples / "camera.json").depth_m
@@ -114,7 +118,7 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
     (samples / "bare.txt").write_text("180.5 180.5 150.25 44.5")
     bare = ask(page, "depth", samples, {"image": "left.png", "camera": "bare.txt"}).json()
     answers = (by_file, by_fields, bare)
-    ways = [page.get("/" + a["folder"] + "left.ply").content for a in answers]
+    ways = [page.get("/" + a["folder"] + "left.cloud.ply").content for a in answers]
     assert ways[0] == ways[1] == ways[2]
 
 
@@ -218,6 +222,39 @@ def test_the_matcher_may_want_a_larger_picture_than_the_generator(
     assert (status, "more than this page computes" in text) == (400, True)
 
 
+def page_without_matcher(plane: int, nets: tuple[FakestereoNet, GeoPoseNet]) -> TestClient:
+    net = FakestereoNet(None, make_synthesiser(sure_of(plane)))
+    return TestClient(make_app(net, nets[1]), base_url=URL)
+
+
+def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, page: TestClient
+) -> None:
+    client = page_without_matcher(3, nets)
+    html = client.get("/").text
+    assert "One image to depth in metres." in html
+    assert 'name="right"' not in html
+    assert 'name="right"' in page.get("/").text
+    one = {"image": "left.png", "camera": "camera.json"}
+    found = ask(client, "depth", samples, one).json()
+    assert found["said"].endswith(" m. 0% are sky.")
+    assert "grey: sky or no answer" in found["pictures"][0]["caption"]
+    status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
+    assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
+
+
+def test_a_picture_of_the_sky_alone_is_said_to_be_one(
+    nets: tuple[FakestereoNet, GeoPoseNet], samples: Path
+) -> None:
+    files = {"image": "left.png", "camera": "camera.json"}
+    found = ask(page_without_matcher(0, nets), "depth", samples, files).json()
+    assert found["said"] == (
+        "No pixel got a depth from one image; 100% of the image is taken for sky."
+    )
+    assert found["scene"]["layers"][0]["count"] == 0
+    assert "left.sky.png" in [file["name"] for file in found["files"]]
+
+
 def test_terms_of_the_weights_stand_beside_the_answer(
     nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, truth: Rigid, page: TestClient
 ) -> None:
@@ -280,7 +317,11 @@ def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: st
 def test_a_depth_image_is_posed(page: TestClient, samples: Path, truth: Rigid) -> None:
     found = ask(page, "pose", samples, VIEW, object=PART).json()
     assert_posed(page, found, truth, "depth")
-    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
+    assert [file["name"] for file in found["files"]] == [
+        "depth.pose.ply",
+        "depth.pose.png",
+        "poses.json",
+    ]
 
 
 def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(
@@ -298,8 +339,12 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
     assert not found["ok"]
     assert found["said"].startswith("Refused (")
     assert found["tables"] == {}
-    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
-    seen = page.get("/" + found["folder"] + "depth.ply").content
+    assert [file["name"] for file in found["files"]] == [
+        "depth.pose.ply",
+        "depth.pose.png",
+        "poses.json",
+    ]
+    seen = page.get("/" + found["folder"] + "depth.pose.ply").content
     layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
     count = layers["the object, as seen"]["count"]
     assert f"element vertex {count}\n".encode() in seen

@@ -74,7 +74,8 @@ def duplicates(
 
     from tqdm import tqdm
 
-    from depthpose.core.report import markdown_table, write_table
+    from depthpose.core.report import markdown_table, table_files, write_table
+    from depthpose.core.run import claim_folder
     from depthpose.depth.kitti import DUPLICATE_LIKENESS, find_duplicates, open_dataset
 
     threshold = DUPLICATE_LIKENESS if at_least is None else at_least
@@ -88,6 +89,7 @@ def duplicates(
     if rows:
         print(markdown_table(rows))
     if out is not None:
+        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
         write_table(out, rows, name="duplicates")
     likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
     what = f"{len(first)} x {len(second)} images"
@@ -188,7 +190,8 @@ def make_streets(
         seed=seed, scale=scale, with_antialiasing=with_antialiasing, with_lidar=with_lidar
     )
     # Seeds have drives of their own, so they may share a folder.
-    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"})
+    days = [_day(day) for day in range(1, 6)]
+    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
     indices = range(first, first + number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
@@ -250,7 +253,8 @@ def make_objects(
     )
     said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
     files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
-    claim_folder(out, {**said, "cad": files, "unit": unit, "symmetries": symmetries})
+    settings = {**said, "cad": files, "unit": unit, "symmetries": symmetries}
+    claim_folder(out, settings, ["models", split])
     write_bop_models(out, models)
     scenes = [
         range(first, min(first + _FRAMES_A_SCENE, number))
@@ -288,7 +292,11 @@ def _is_made(split: Path, scene: int, frames: range) -> bool:
 
 
 def _drive(config: "StreetsConfig", day: int) -> str:
-    return f"2100_01_{day:02d}_drive_{config.seed:04d}_sync"
+    return f"{_day(day)}_drive_{config.seed:04d}_sync"
+
+
+def _day(day: int) -> str:
+    return f"2100_01_{day:02d}"
 
 
 def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> None:

@@ -6,10 +6,16 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import tyro
 
 from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from depthpose.depth.estimator import FakestereoNet
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
 _EXTRAS_OF_OURS = ("dev",)
@@ -106,7 +112,7 @@ def _tried(room: str, work: Callable[[], str]) -> bool:
 
 
 def _try_depth() -> str:
-    """Match a pair whose disparity is known everywhere."""
+    """Match a pair whose disparity is known everywhere; or see one image, without a matcher."""
     import torch
 
     from depthpose.depth.estimator import FakestereoNet
@@ -115,12 +121,32 @@ def _try_depth() -> str:
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
     left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
-    found = FakestereoNet.load("default").estimate(left, None, right=right, with_check=False)
+    net = FakestereoNet.load("default")
+    if net.matcher is None:
+        return _try_one_image(net, left)
+    found = net.estimate(left, None, right=right, with_check=False)
     median_px = float(found.disparity_px[:, 2 * _SHIFT_PX :].median())
     said = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
         raise RuntimeError(said)
     return said
+
+
+def _try_one_image(net: "FakestereoNet", image: "Tensor") -> str:
+    """Ask for the depth of an image of which nothing is known."""
+    import torch
+
+    from depthpose.core.camera import Camera
+
+    height, width = image.shape[1:]
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]).double()
+    found = net.estimate(image, Camera(width=width, height=height, K=K))
+    assert found.depth_m is not None
+    known_m = found.depth_m[found.depth_m.isfinite()]
+    said = f"one image got a depth for {len(known_m) / found.depth_m.numel():.0%} of its pixels"
+    if not len(known_m):
+        raise RuntimeError(said)
+    return f"{said}, {float(known_m.median()):.1f} m in the middle"
 
 
 def _try_pose() -> str:

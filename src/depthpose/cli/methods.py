@@ -50,7 +50,8 @@ def weights_method(
         with_sgbm: let OpenCV match the drawn view in place of the weights' own matcher.
 
     Raises:
-        InputError: a matcher alone is asked to do without the right view.
+        InputError: a matcher alone is asked to do without the right view, or weights without a
+            matcher to look at it.
     """
     config = with_usable_precision(config)  # what is computed in is what is recorded
     path = find_weights(weights)
@@ -67,9 +68,14 @@ def weights_method(
     if with_sgbm:
         facts["matcher"] += " with sgbm"
         sgbm = SGBMConfig(with_filled_holes=True)
-        net = FakestereoNet.load(path, matcher="sgbm", config=sgbm)
+        net = FakestereoNet.load(path, matcher="sgbm", config=sgbm, answer="matched")
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
     net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
+    if is_shown and net.matcher is None:
+        raise InputError(
+            f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
+            "weights with one, or sgbm."
+        )
     name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
     return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
 

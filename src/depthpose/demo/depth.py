@@ -38,7 +38,8 @@ def show_depth(
 
     Args:
         out: folder for the pairs, their cameras and the estimates.
-        weights: of generator and matcher, by name or file.
+        weights: of generator and matcher, or of a generator with an answer of its own, by name or
+            file.
         scale: size of the street's images as a share of KITTI's.
     """
     street = Streets(StreetsConfig(seed=STREETS_SEED, scale=scale))[_STREET]
@@ -59,10 +60,9 @@ def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
     # The nearest surfaces of both scenes; OpenCV leaves that many columns unmatched.
     columns = 16 * math.ceil(sample.input.left.shape[2] / 16 / 10)
     sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
-    pairs = {
-        "PSMNet, compact": (_FROM_PAIR, network),
-        "SGBM, holes filled": (_FROM_PAIR, FakestereoNet.load(matcher="sgbm", config=sgbm)),
-    }
+    matched = {} if network.matcher is None else {"PSMNet, compact": (_FROM_PAIR, network)}
+    filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
+    pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
     is_street = sample.input.name == "street"
     return {"Fakestereo-Net, compact": (_FROM_ONE, network), **pairs} if is_street else pairs
 
@@ -94,7 +94,7 @@ def _write_pair(folder: Path, sample: StereoSample) -> None:
     write_image(folder / "left.png", pair.left)
     write_image(folder / "right.png", pair.right)
     write_camera(folder / "camera.json", pair.camera)
-    write_image(folder / "depth.png", draw_depth(truth.depth_m, *_range_m(sample)))
+    write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *_range_m(sample)))
 
 
 def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _opening(folder: Path, sample: StereoSample, text: str, rows: list[dict[str,
         pictures=[
             Picture(path=folder / "left.png", caption="left image"),
             Picture(path=folder / "right.png", caption="right image"),
-            Picture(path=folder / "depth.png", caption="true depth; grey: none", scale=scale),
+            Picture(path=folder / "depth.color.png", caption="true depth; grey: none", scale=scale),
         ],
     )
 

@@ -70,7 +70,7 @@ def label_pairs(
     usable = [n for n, frame in enumerate(dataset.frames) if frame.right and frame.calibration]
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
-    claim_folder(folder, settings)
+    claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
     _write_calibration(folder / "calib.txt", dataset, usable)
     for number in usable:
         name = dataset.frames[number].name

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, back_project
@@ -37,6 +37,12 @@ class Estimator(Protocol):
 
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
+CLOUD = "cloud.ply"
+ENDINGS = (
+    "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
+    "disparity_px.npy", CLOUD,
+)  # fmt: skip
+"""What follows ``NAME.`` in the names of the files of an estimate."""
 
 COLOR_RANGE_M = (3.0, 80.0)
 """Near and far end of the colours of depth, one for all pictures, so that they compare."""
@@ -51,8 +57,9 @@ def write_estimate(
     """Write the files of one estimate; the disparity comes last and marks the frame as finished.
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
-    ``NAME.color.png``, ``NAME.right.png`` (synthesised) and ``NAME.disparity_px.npy``, each where
-    the estimate has it. The disparity is that of the frame's own rig.
+    ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky)
+    and ``NAME.disparity_px.npy``, each where the estimate has it. The disparity is that of the
+    frame's own rig.
     """
     base = folder / pair.name
     if estimate.depth_m is not None:
@@ -62,6 +69,8 @@ def write_estimate(
         write_map(_file(base, "confidence.npy"), estimate.confidence)
     if estimate.right is not None:
         write_image(_file(base, "right.png"), estimate.right)
+    if estimate.is_sky is not None:
+        write_image(_file(base, "sky.png"), estimate.is_sky.float().expand(3, -1, -1))
     picture = (
         draw_disparity(estimate.disparity_px)
         if estimate.depth_m is None
@@ -74,8 +83,8 @@ def write_estimate(
 def write_estimate_cloud(
     folder: Path, pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0
 ) -> None:
-    """Write ``NAME.ply``: what :func:`estimate_cloud` gives."""
-    write_cloud(_file(folder / pair.name, "ply"), estimate_cloud(pair, estimate, far_m))
+    """Write ``NAME.cloud.ply``: what :func:`estimate_cloud` gives."""
+    write_cloud(_file(folder / pair.name, CLOUD), estimate_cloud(pair, estimate, far_m))
 
 
 def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
@@ -95,6 +104,11 @@ def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80
 def is_finished(folder: Path, name: str) -> bool:
     """Whether an earlier run left the estimate of this frame."""
     return _file(folder / name, "disparity_px.npy").is_file()
+
+
+def has_cloud(folder: Path, name: str) -> bool:
+    """Whether an earlier run left the cloud of this frame."""
+    return _file(folder / name, CLOUD).is_file()
 
 
 def has_prediction(folder: Path, name: str) -> bool:
@@ -142,6 +156,12 @@ def read_drawn_view(folder: Path, name: str) -> Float[Tensor, "3 h w"] | None:
     return read_image(path) if path.is_file() else None
 
 
+def read_sky(folder: Path, name: str) -> Bool[Tensor, "h w"] | None:
+    """Read where a prediction says sky, or None where its weights do not know it."""
+    path = _file(folder / name, "sky.png")
+    return read_image(path)[0] > 0 if path.is_file() else None
+
+
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
     """Read back what :func:`write_estimate` wrote.
 
@@ -159,6 +179,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         disparity_px=disparity_px,
         confidence=read_confidence(folder, name),
         right=read_image(right) if right.is_file() else None,
+        is_sky=read_sky(folder, name),
     )
 
 
@@ -178,7 +199,7 @@ def predict(
         folder: where the files go; refused if other settings made what it holds.
         settings: what decides the results.
     """
-    claim_folder(folder, settings)
+    claim_folder(folder, settings, (f"{name}.{end}" for name in names for end in ENDINGS))
     for read_input, name in zip(inputs, names, strict=True):
         if not is_finished(folder, name):
             pair = read_input()

@@ -99,12 +99,19 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
     if depth_m is not None:
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
+        if found.is_sky is not None:
+            facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
         if len(known_m):
             low, middle, high = (float(f(known_m)) for f in (torch.min, torch.median, torch.max))
             facts.append(("nearest, middle, farthest", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
     if found.confidence is not None:
         facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
     return facts
+
+
+def said_grey(found: DepthEstimate) -> str:
+    """Say what grey is in the picture of an estimate."""
+    return "grey: none" if found.is_sky is None else "grey: sky or no answer"
 
 
 def depth_scene(
@@ -122,12 +129,12 @@ def _map_drawing(shown: DepthShown) -> Drawing:
     if found.depth_m is None:
         return Drawing(
             image=draw_disparity(found.disparity_px),
-            caption="estimated disparity, large (near) bright; grey: none",
+            caption=f"estimated disparity, large (near) bright; {said_grey(found)}",
             scale=rising_scale("disparity [px]", 96.0, has_more=True),
         )
     return Drawing(
         image=draw_depth(found.depth_m, *shown.range_m),
-        caption="estimated depth, near bright and far dark; grey: none",
+        caption=f"estimated depth, near bright and far dark; {said_grey(found)}",
         scale=depth_scale(*shown.range_m),
     )
 

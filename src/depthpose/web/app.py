@@ -86,6 +86,7 @@ class Pages:
             objects=pose.objects,
             limit_mb=limits.upload_bytes // 10**6,
             has_one_image=depth.synthesiser is not None,
+            has_pair=depth.matcher is not None,
             has_registration=has_registration(),
         )
         own = Path(__file__).parent

@@ -9,7 +9,7 @@ from depthpose.core.files import read_image, write_image
 from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.pages.depth import depth_facts, depth_scene
+from depthpose.pages.depth import depth_facts, depth_scene, said_grey
 from depthpose.web.answer import Answer, Shown, read_files
 from depthpose.web.form import Form, small_size
 
@@ -28,6 +28,11 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     began = time.perf_counter()
     pair, is_guess = _input(form)
     near_m, far_m = _range_m(form)
+    if pair.right is not None and net.matcher is None:
+        raise InputError(
+            "the weights of this page answer one image alone: leave the right image away, or start "
+            "'depthpose serve' with --weights that hold a matcher"
+        )
     _refuse_work(pair, net)
     found = net.estimate_pair(pair, with_check=True)
     seconds = time.perf_counter() - began
@@ -102,9 +107,10 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
     """Refuse what the networks would see too large: a small focal length enlarges the picture."""
     camera = pair.camera
     assert camera is not None
-    wanted_px = [work_focal_px(net.matcher)]
-    if pair.right is None and net.synthesiser is not None:
-        wanted_px.append(net.synthesiser.config.virtual_focal_px)
+    rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
+    wanted_px = [] if rig is not None and rig.answer == "own" else [work_focal_px(net.matcher)]
+    if rig is not None:
+        wanted_px.append(rig.virtual_focal_px)
     sizes = [focal_size(camera, focal_px) for focal_px in wanted_px if focal_px is not None]
     height, width = pair.left.shape[1:]
     if not sizes and height * width > _MOST_WORK_PIXELS:
@@ -124,7 +130,7 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
 
 def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, float]) -> list[Shown]:
     name = pair.name
-    colors = "near bright and far dark, {:g} m to {:g} m by the logarithm, grey where invalid"
+    colors = f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {said_grey(found)}"
     pictures = [
         Shown(
             file=f"{name}.color.png",
@@ -150,12 +156,17 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     assert found.depth_m is not None
     known_m = found.depth_m[found.depth_m.isfinite()]
     sees = "one image" if pair.right is None else "both images"
+    is_sky = found.is_sky
+    sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     if len(known_m) == 0:
-        return (
-            f"No pixel got a depth from {sees}: is the pair rectified, and left where it belongs?"
+        why = (
+            ": is the pair rectified, and left where it belongs?"
+            if pair.right is not None
+            else (f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else ".")
         )
+        return f"No pixel got a depth from {sees}{why}"
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
     return (
         f"Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
-        f"{middle_m:.2f} m."
+        f"{middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
     )

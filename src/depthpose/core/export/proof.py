@@ -38,11 +38,14 @@ class Limit:
         value: the limit, in the output's unit.
         of: the largest difference, or the mean one where the answer itself jumps.
         is_relative: differences are shares of what PyTorch answers.
+        flips: share of the numbers that may be off by more, or be NaN in one answer alone, and are
+            left out of the differences: where a decision lies on its border.
     """
 
     value: float
     of: Literal["largest", "mean"] = "largest"
     is_relative: bool = False
+    flips: float = 0.0
 
 
 def measure_differences(
@@ -51,8 +54,8 @@ def measure_differences(
     """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
 
     Raises:
-        InputError: an output is NaN where PyTorch's is not, or the other way round; or there is no
-            number to compare.
+        InputError: an output is NaN where PyTorch's is not, or the other way round, or off by
+            more than its limit, on more pixels than may flip; or there is no number to compare.
     """
     session = import_module("onnxruntime").InferenceSession(
         str(path), providers=["CPUExecutionProvider"]
@@ -87,16 +90,28 @@ def refuse_beyond(rows: Iterable[Row]) -> None:
 
 def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> Row:
     answer, expected = (np.asarray(values, np.float64) for values in pair)
-    if answer.shape != expected.shape or (np.isnan(answer) != np.isnan(expected)).any():
+    is_nan = np.isnan(answer), np.isnan(expected)
+    is_other = answer.shape != expected.shape
+    if is_other or ((is_nan[0] != is_nan[1]).any() and not limit.flips):
         raise InputError(
             f"{output} of {case}: onnxruntime answers {answer.shape} with "
-            f"{np.isnan(answer).sum()} NaN, PyTorch {expected.shape} with "
-            f"{np.isnan(expected).sum()}; nothing is written."
+            f"{is_nan[0].sum()} NaN, PyTorch {expected.shape} with "
+            f"{is_nan[1].sum()}; nothing is written."
         )
     difference = np.abs(answer - expected)
     if limit.is_relative:
         difference /= np.abs(expected)
+    difference = np.where(is_nan[0] != is_nan[1], np.inf, difference)
     difference = difference[~np.isnan(difference)]
+    flipped: Row = {}
+    if limit.flips:
+        difference, share = _without_flips(difference, limit)
+        if share > limit.flips:
+            raise InputError(
+                f"{output} of {case}: PyTorch and onnxruntime differ by more than {limit.value:g} "
+                f"on {share:.3%} of the numbers, {limit.flips:.3%} may; nothing is written."
+            )
+        flipped = {"flipped": share}
     if not difference.size:
         raise InputError(
             f"{output} of {case}: PyTorch gives not one number that could be compared, and what is "
@@ -111,4 +126,11 @@ def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> 
         "judged": limit.of,
         "limit": limit.value,
         "unit": "share" if limit.is_relative else "as the output",
+        **flipped,
     }
+
+
+def _without_flips(difference: np.ndarray, limit: Limit) -> tuple[np.ndarray, float]:
+    """Give the differences within the limit, and the share of those beyond it."""
+    is_kept = difference <= limit.value
+    return difference[is_kept], 1.0 - float(is_kept.mean()) if is_kept.size else 0.0

@@ -5,6 +5,10 @@ from typing import Literal
 
 from depthpose.core.errors import InputError
 
+Answer = Literal["own", "matched", "joined"]
+"""Where depth of one image comes from: the generator's own disparity, that of the matcher on left
+and drawn right view, or both, weighed by their confidence."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratorConfig:
@@ -48,6 +52,11 @@ class GeneratorConfig:
         return tuple(self.width * min(2**level, 8) for level in range(self.levels))
 
     @property
+    def answer(self) -> Answer:
+        """Where depth comes from: this network has no disparity of its own."""
+        return "matched"
+
+    @property
     def side_multiple_px(self) -> int:
         """Both sides of an image are multiples of this [px]."""
         return 2**self.levels
@@ -73,7 +82,7 @@ class SelectionConfig:
     disparity_px: tuple[float, float] = (1.2, 88.0)
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
-    answer: Literal["own", "matched", "joined"] = "own"
+    answer: Answer = "own"
     """Where depth comes from: the distribution of the left view; the matcher on left and drawn
     right view; or both, weighed by their confidence."""
 

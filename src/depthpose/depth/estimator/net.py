@@ -12,9 +12,10 @@ from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, SelectionConfig, SGBMConfig
+from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
+from depthpose.depth.estimator.matchers import choose_matcher, set_answer, work_focal_px
 from depthpose.depth.estimator.virtual import (
     focal_size,
     from_virtual,
@@ -23,10 +24,10 @@ from depthpose.depth.estimator.virtual import (
     resized_match,
     square_camera,
 )
-from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
+from depthpose.depth.stereo import Matcher, PSMNetMatcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
-from depthpose.depth.weights import DepthWeights, read_depth_weights
+from depthpose.depth.weights import read_depth_weights
 
 
 class FakestereoNet:
@@ -39,14 +40,20 @@ class FakestereoNet:
         net.estimate("left.png", "rig.json", right="right.png").depth_m
 
     Args:
-        matcher: pair to disparity.
+        matcher: pair to disparity; None where the synthesiser answers depth itself (its
+            ``answer`` is own), for one image alone.
         synthesiser: left view to right view; None matches real pairs only.
         terms: of the weights, where they bind whoever uses them.
     """
 
     def __init__(
-        self, matcher: Matcher, synthesiser: Synthesiser | None = None, *, terms: str = ""
+        self, matcher: Matcher | None, synthesiser: Synthesiser | None = None, *, terms: str = ""
     ) -> None:
+        if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
+            raise InputError(
+                "matcher is None, and without one only a synthesiser whose answer is 'own' gives "
+                "depth. Give a matcher: SGBMMatcher(), or that of weights."
+            )
         self.matcher = matcher
         self.synthesiser = synthesiser
         self.terms = terms
@@ -58,6 +65,7 @@ class FakestereoNet:
         *,
         matcher: str | Path | Matcher | None = None,
         config: MatcherConfig | SGBMConfig | None = None,
+        answer: Answer | None = None,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
@@ -65,16 +73,22 @@ class FakestereoNet:
 
         Args:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
-                needed), or of PSMNet alone (then real pairs only). None: ``matcher`` alone.
+                needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
+                ``matcher`` alone.
                 What names weights: :func:`depthpose.core.checkpoint.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.
+            answer: where depth of one image comes from, in place of what the weights say
+                (:class:`~depthpose.depth.config.SelectionConfig`).
 
         Raises:
-            InputError: no such weights, or no matcher in what was given.
+            InputError: no such weights, no matcher in what was given, or an ``answer`` that these
+                weights cannot give.
         """
         found = None if weights is None else read_depth_weights(find_weights(weights))
+        if answer is not None:
+            set_answer(found, answer)
         own = None
         # Paths first: a Path has a method 'match' too, and would pass for a matcher.
         if isinstance(matcher, str | Path) and matcher not in ("psmnet", "sgbm"):
@@ -82,7 +96,7 @@ class FakestereoNet:
         terms = join_terms(*(held.facts for held in (found, own) if held is not None))
         say_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        chosen = _choose_matcher(weights, found, matcher, own, config)
+        chosen = choose_matcher(weights, found, matcher, own, config)
         if found is None or found.generator is None:
             return cls(chosen, terms=terms)
         return cls(chosen, make_synthesiser(found.generator, run.device), terms=terms)
@@ -135,6 +149,12 @@ class FakestereoNet:
         if pair.right is None:
             return self._estimate_alone([pair])[0]
         right = usable_right(pair)
+        if self.matcher is None:
+            raise InputError(
+                f"{pair.name}: there is a right image, and these weights answer one image alone: "
+                "a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; 'depthpose "
+                "weights pack G --matcher S --out W' makes one file of both."
+            )
         if with_check:
             refuse_unrectified(pair)
         match = self._match(pair.left, right, pair.camera)
@@ -186,8 +206,7 @@ class FakestereoNet:
     ) -> list[Match]:
         """Take the generator's own disparity, the matcher's, or both, as its weights say."""
         assert self.synthesiser is not None, "checked before"
-        config = self.synthesiser.config
-        answer = config.answer if isinstance(config, SelectionConfig) else "matched"
+        answer = self.synthesiser.config.answer
         matched = [] if answer == "own" else self._match_many(left, drawn.right, camera)
         if answer == "matched":
             return matched
@@ -205,6 +224,7 @@ class FakestereoNet:
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
     ) -> list[Match]:
         """Match at the focal length that the matcher's weights want, and come back."""
+        assert self.matcher is not None, "checked before"
         height, width = left.shape[2:]
         work_px = work_focal_px(self.matcher)
         size = (height, width)
@@ -235,40 +255,3 @@ class FakestereoNet:
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
         return self.synthesiser, image.camera
-
-
-def work_focal_px(matcher: Matcher) -> float | None:
-    """Focal length that the matcher's weights were trained at, where they say so [px]."""
-    return matcher.network_config.work_focal_px if isinstance(matcher, PSMNetMatcher) else None
-
-
-def _choose_matcher(
-    weights: str | Path | None,
-    found: DepthWeights | None,
-    matcher: str | Path | Matcher | None,
-    own: DepthWeights | None,
-    config: MatcherConfig | SGBMConfig | None,
-) -> Matcher:
-    run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-    if isinstance(config, SGBMConfig) and matcher != "sgbm":
-        raise InputError(
-            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
-        )
-    if matcher == "sgbm":
-        if found is not None and found.generator is None:
-            raise InputError(
-                f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of a "
-                "matcher. Leave one of the two away."
-            )
-        return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-    if matcher is not None and not isinstance(matcher, str | Path):
-        return matcher
-    found = found if own is None else own
-    if found is None or found.matcher is None:
-        raise InputError(
-            f"weights is {None if weights is None else str(weights)!r} and matcher is "
-            f"{None if matcher is None else str(matcher)!r}: there is no matcher in that. Give "
-            "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and a "
-            "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
-        )
-    return PSMNetMatcher(found.matcher, run)

@@ -24,6 +24,7 @@ from depthpose.depth.predictions import (
     read_confidence,
     read_disparity,
     read_drawn_view,
+    read_sky,
 )
 from depthpose.depth.types import DepthEstimate
 
@@ -92,6 +93,9 @@ def frame_result(
         raise InputError(f"{dataset.frames[index].name}: {prepared}; choose a frame that counts")
     rig = prepared.camera if isinstance(prepared.camera, StereoRig) else None
     depth_m = None if rig is None else depth_from_disparity(prepared.disparity_px, rig)
+    is_sky = read_sky(predictions, prepared.frame.name)
+    if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
+        depth_m = torch.where(is_sky, torch.nan, depth_m)
     if cap_m is None:
         compared = compare_disparity(prepared)
         error = (compared.predicted - compared.truth).abs()
@@ -105,6 +109,7 @@ def frame_result(
         disparity_px=prepared.disparity_px,
         confidence=prepared.confidence,
         right=read_drawn_view(predictions, prepared.frame.name),
+        is_sky=is_sky,
     )
     return FrameResult(estimate=estimate, compared=compared, error=error, true_depth_m=true_m)
 

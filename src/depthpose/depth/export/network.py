@@ -1,4 +1,4 @@
-"""PSMNet in operations that bake no size in: what the exporter is given."""
+"""The networks in operations that bake no size in: what the exporter is given."""
 
 import torch
 import torch.nn.functional as F
@@ -7,6 +7,10 @@ from torch import Tensor, nn
 
 from depthpose.depth.stereo.expectation import WINDOW_PX, interpolation_matrix, linear_taps
 from depthpose.depth.stereo.psmnet import PSMNet
+from depthpose.depth.synthesis import SelectionGenerator
+from depthpose.depth.synthesis.selection import read_logits
+
+Maps = Float[Tensor, "b rows columns"]
 
 
 class SizelessPSMNet(nn.Module):
@@ -40,6 +44,24 @@ class SizelessPSMNet(nn.Module):
         disparity_px = (probability * steps_px).sum(1)
         is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
+
+
+class SizelessSelection(nn.Module):
+    """The generator that selects, and what its logits say, at half of the image's sides."""
+
+    def __init__(self, generator: SelectionGenerator) -> None:
+        super().__init__()
+        self.generator = generator
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Maps, Maps, Maps, Maps, Maps]:
+        """Give log of disparity, sky and confidence of the left view; the first two of the right.
+
+        Disparity is counted in pixels of the image's width.
+        """
+        left, right = (
+            read_logits(logits, self.generator.planes) for logits in self.generator(image)
+        )
+        return *left, *right[:2]
 
 
 def gathered_volume(

@@ -14,7 +14,7 @@ from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
 from depthpose.depth.stereo import PSMNetMatcher
-from depthpose.depth.synthesis import make_synthesiser
+from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights
 
@@ -28,11 +28,22 @@ _LIMITS = {
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
 }
+_FLIPS = 1e-3
+"""Share of pixels that may be sky in one answer alone, with all that follows from it."""
+_SELECTION_LIMITS = {
+    **{
+        name: limit if limit.of == "mean" else dataclasses.replace(limit, flips=_FLIPS)
+        for name, limit in _LIMITS.items()
+    },
+    "is_sky": Limit(value=_FLIPS, of="mean"),
+}
 _PAIR_OUTPUTS = ("disparity_px", "confidence")
 _SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
 """Rows, columns, focal length over the one that the weights want, images: a multiple of what the
 networks take; one that is stretched to it; one that is enlarged; one that is padded."""
 _SHIFT_PX = 6
+_SKY = (0.72, 0.82, 0.95)
+"""RGB of the sky at its brightest."""
 _LEAST_PX = 1.0
 """Disparity from which depths are compared."""
 
@@ -41,7 +52,8 @@ def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]
     """Say what becomes of weights in a file.
 
     Args:
-        weights: of a generator and a matcher, or of a matcher alone.
+        weights: of a generator and a matcher, of a generator with an answer of its own, or of a
+            matcher alone.
         what: one image to depth, or a pair to disparity; None: the first that the weights can.
         facts: what else a user of the file must know.
     """
@@ -55,31 +67,38 @@ def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]
             facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
         )
     rig = {} if weights.generator is None else _rig_facts(weights)
+    selects = isinstance(weights.generator, SelectionGenerator)
     return Export(
         graph=lambda: image_graph(weights),
         cases=lambda: _image_cases(weights),
-        limits=_LIMITS,
+        limits=_SELECTION_LIMITS if selects else _LIMITS,
         facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
 
-def _rig_facts(weights: DepthWeights) -> dict[str, float]:
+def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
     assert weights.generator is not None
     rig = weights.generator.config
-    return {"virtual_focal_px": rig.virtual_focal_px, "virtual_baseline_m": rig.virtual_baseline_m}
+    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
+    return {name: getattr(rig, name) for name in names}
 
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
-    assert weights.generator is not None and weights.matcher is not None  # noqa: PT018
-    net = FakestereoNet(PSMNetMatcher(weights.matcher), make_synthesiser(weights.generator))
+    assert weights.generator is not None
+    matcher = None if weights.matcher is None else PSMNetMatcher(weights.matcher)
+    net = FakestereoNet(matcher, make_synthesiser(weights.generator))
+    sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
     for size in _SIZES:
-        images, _ = _scenes(*size)
+        scenes, _ = _scenes(*size)
+        images = _under_sky(scenes) if sky else scenes
         camera = _camera(size, weights.generator.config.virtual_focal_px)
         given = [StereoInput(name="proof", left=one, right=None, camera=camera) for one in images]
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
         # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
-        case = _case(inputs, net.estimate_many(given), ("depth_m", *_PAIR_OUTPUTS, "right"))
-        where = {"depth_m": case.expected["disparity_px"] >= _LEAST_PX}
+        found = net.estimate_many(given)
+        case = _case(inputs, found, ("depth_m", *_PAIR_OUTPUTS, "right", *sky))
+        is_near = case.expected["disparity_px"] >= _LEAST_PX
+        where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
         yield dataclasses.replace(case, where=where)
 
 
@@ -117,6 +136,14 @@ def _camera(size: tuple[int, int, float, int], focal_px: float) -> Camera:
     f = share * focal_px
     K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
     return Camera(width=columns, height=rows, K=K)
+
+
+def _under_sky(images: Tensor) -> Tensor:
+    """Lay a bright, smooth sky over the upper two fifths, for weights that know the sky."""
+    rows = images.shape[2] * 2 // 5
+    sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, rows)[:, None]
+    veiled = torch.lerp(images[:, :, :rows], sky, 0.97)
+    return torch.cat([veiled, images[:, :, rows:]], 2)
 
 
 def _scenes(rows: int, columns: int, share: float, count: int) -> tuple[Tensor, Tensor]:

@@ -105,17 +105,23 @@ class Selected:
 
 def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
     """Read disparity, sky and confidence off logits, and bring them to ``size``."""
-    logits = logits.float()
-    sky = logits.softmax(1)[:, :1]
-    shares = logits[:, 1:].softmax(1)
-    log_px = log_expectation(logits, planes)[:, None]
-    is_near = (planes.log()[:, None, None] - log_px).abs() <= math.log(_SURE_RATIO)
-    sure = (shares * is_near).sum(1, keepdim=True)
     log_px, sky, sure = (
-        F.interpolate(part, size, mode="bilinear", align_corners=False)[:, 0]
-        for part in (log_px, sky, sure)
+        F.interpolate(part[:, None], size, mode="bilinear", align_corners=False)[:, 0]
+        for part in read_logits(logits, planes)
     )
     return Selected(log_px.exp(), sky, torch.where(sky > 0.5, sky, sure * (1 - sky)))
+
+
+def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:
+    """Give the log of disparity, the sky, and what lies near that disparity, sky left out.
+
+    Each (b, rows, columns), at the size of the logits.
+    """
+    logits = logits.float()
+    log_px = log_expectation(logits, planes)
+    is_near = (planes.log()[:, None, None] - log_px[:, None]).abs() <= math.log(_SURE_RATIO)
+    sure = (logits[:, 1:].softmax(1) * is_near).sum(1)
+    return log_px, logits.softmax(1)[:, 0], sure
 
 
 def log_expectation(logits: Logits, planes: Planes) -> Float[Tensor, "b rows columns"]:
