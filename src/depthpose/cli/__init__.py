@@ -65,6 +65,10 @@ COMMANDS = {
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),
+    "reproduce all": (
+        "reproduce_all:reproduce_all",
+        "every table of a chapter, trainings and all, from KITTI or LineMOD on disk",
+    ),
     "reproduce 3.1": ("pose_reproduce:table_3_1", "the method beside its baselines, by object"),
     "reproduce 3.2": ("pose_reproduce:table_3_2", "LineMOD: published rows, ours, difference"),
     "reproduce 3.3": ("pose_reproduce:table_3_3", "RANSAC against least squares"),
