@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
@@ -45,16 +45,14 @@ def read_depth_weights(path: Path) -> DepthWeights:
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes {GENERATOR!r}, "
             f"{MATCHER!r} or {BOTH!r}."
         )
-    parts = _split(checkpoint) if checkpoint.kind == BOTH else {checkpoint.kind: checkpoint}
+    parts = _split(checkpoint, str(path)) if checkpoint.kind == BOTH else {checkpoint.kind: checkpoint}
     generator = matcher = None
     if GENERATOR in parts:
         config = config_from_dict(parts[GENERATOR].config, GeneratorConfig, source=str(path))
-        generator = UNetGenerator(config).eval()
-        load_weights(generator, parts[GENERATOR], str(path))
+        generator = build_network(lambda: UNetGenerator(config), parts[GENERATOR], str(path)).eval()
     if MATCHER in parts:
-        config = config_from_dict(parts[MATCHER].config, PSMNetConfig, source=str(path))
-        matcher = PSMNet(config).eval()
-        load_weights(matcher, parts[MATCHER], str(path))
+        knobs = config_from_dict(parts[MATCHER].config, PSMNetConfig, source=str(path))
+        matcher = build_network(lambda: PSMNet(knobs), parts[MATCHER], str(path)).eval()
     return DepthWeights(generator=generator, matcher=matcher, facts=checkpoint.facts)
 
 
@@ -114,7 +112,7 @@ def write_depth_weights(
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
 
 
-def _split(checkpoint: Checkpoint) -> dict[str, Checkpoint]:
+def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
     parts: dict[str, Checkpoint] = {}
     for kind in (GENERATOR, MATCHER):
         state = {
@@ -122,7 +120,9 @@ def _split(checkpoint: Checkpoint) -> dict[str, Checkpoint]:
             for key, tensor in checkpoint.state.items()
             if key.startswith(f"{kind}.")
         }
-        config = checkpoint.config.get(kind, {})
+        config = checkpoint.config.get(kind)
+        if not isinstance(config, Mapping):
+            raise InputError(f"{source}: its config has no {kind!r}; the file is damaged.")
         parts[kind] = Checkpoint(kind=kind, config=config, state=state)
     return parts
 
