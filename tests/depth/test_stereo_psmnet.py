@@ -164,8 +164,8 @@ def test_import_names_what_is_missing_unknown_and_misshaped() -> None:
         ({"max_disparity_px": 100}, "multiple of 16.*got 100; take 192"),
         ({"max_disparity_px": 0}, "multiple of 16.*got 0"),
         ({"width": 0}, "width must be 1 or more channels, got 0"),
-        ({"blocks": (1, 0, 1, 1)}, "each stage needs 1 block"),
-        ({"pools": ()}, "pools must hold windows"),
+        ({"blocks": (1, 0, 1, 1)}, "each stage needs 1 to 1000 blocks"),
+        ({"pools": ()}, "pools must hold 1 to 16 windows"),
     ],
 )
 def test_network_config_refuses_nonsense(knobs: dict, text: str) -> None:

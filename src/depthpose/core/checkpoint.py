@@ -4,19 +4,22 @@ import hashlib
 import json
 import pickle
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from depthpose.core.errors import InputError, Notice, nearest_name
-from depthpose.core.files.disk import write_bytes
+from depthpose.core.files.disk import refused_as, write_bytes
 from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
+
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
@@ -69,8 +72,9 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
         InputError: missing, truncated, not safetensors, without our metadata, or of another kind.
     """
     path = Path(path)
-    state, metadata = _read_safetensors(path)
-    return _interpreted(path, metadata, state, kind)
+    with _opened_safetensors(path) as file:
+        found, config, facts = _interpreted(path, dict(file.metadata() or {}), kind)
+        return Checkpoint(kind=found, config=config, state=_tensors(file), facts=facts)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -79,13 +83,38 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
     Raises:
         InputError: the first names that are missing, unexpected or of another shape.
     """
+    _refuse_misfits(network, checkpoint, source)
+    network.load_state_dict(dict(checkpoint.state))
+
+
+def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: str) -> NetworkT:
+    """Make a network and copy the weights into it, as :func:`load_weights` does.
+
+    Its shapes are compared before it takes memory: a config may say any size.
+
+    Args:
+        make: makes the network of the checkpoint's config.
+        checkpoint: its weights.
+        source: what to call them in errors.
+
+    Raises:
+        InputError: as there, or a config of which no network can be made.
+    """
+    with refused_as(source, "config of a network", "file and config are of different versions"):
+        with torch.device("meta"):
+            _refuse_misfits(make(), checkpoint, source)
+        network = make()
+    load_weights(network, checkpoint, source)
+    return network
+
+
+def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
     problems = misfits(network.state_dict(), checkpoint.state)
     if problems:
         raise InputError(
             f"{source}: {len(problems)} tensors do not fit the network of its config: "
             f"{'; '.join(problems[:3])}. File and config belong to different versions."
         )
-    network.load_state_dict(dict(checkpoint.state))
 
 
 def misfits(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
@@ -136,7 +165,10 @@ def read_published(path: Path) -> Mapping[str, Any]:
         InputError: missing, damaged, or holding pickled code.
     """
     path = Path(path)
-    return _read_safetensors(path)[0] if path.suffix == ".safetensors" else read_torch_file(path)
+    if path.suffix != ".safetensors":
+        return read_torch_file(path)
+    with _opened_safetensors(path) as file:
+        return _tensors(file)
 
 
 def find_weights(name: str | Path) -> Path:
@@ -221,23 +253,24 @@ def _only_weights(folder: Path) -> Path:
     )
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+@contextmanager
+def _opened_safetensors(path: Path) -> Iterator[Any]:
+    """Open the header of a file; whatever is raised of what it holds is an input error."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such weights file.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = dict(file.metadata() or {})
-            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
-        raise InputError(
-            f"{path}: not a readable safetensors file ({error}). A published checkpoint is brought "
-            "in by 'depthpose weights import'."
-        ) from error
+    remedy = "a published checkpoint is brought in by 'depthpose weights import'"
+    with refused_as(path, "safetensors file", remedy), safe_open(path, framework="pt") as file:
+        yield file
+
+
+def _tensors(file: Any) -> dict[str, Tensor]:  # noqa: ANN401  safetensors has no type of it
+    return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 
 def _interpreted(
-    path: Path, metadata: dict[str, str], state: dict[str, Tensor], kind: str | None
-) -> Checkpoint:
+    path: Path, metadata: dict[str, str], kind: str | None
+) -> tuple[str, dict[str, Any], dict[str, str]]:
+    """Give kind, config and card of a file, before its tensors are read."""
     if "kind" not in metadata or "config" not in metadata:
         raise InputError(
             f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A published "
@@ -248,8 +281,8 @@ def _interpreted(
         raise InputError(f"{path}: holds weights of kind {found!r}, but {kind!r} is needed here.")
     try:
         config = json.loads(metadata.pop("config"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):
         raise InputError(f"{path}: its 'config' is not a mapping.")
-    return Checkpoint(kind=found, config=config, state=state, facts=metadata)
+    return found, config, metadata

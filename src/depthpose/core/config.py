@@ -10,8 +10,15 @@ import yaml
 
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import atomic_write, read_text
+from depthpose.core.files.disk import refused_as
+from depthpose.core.files.text import YAML_LOADER, refuse_yaml_bomb
 
 ConfigT = TypeVar("ConfigT")
+
+_MAX_BYTES = 2**17
+"""Of a config: a hundred times the largest of ours."""
+_LONGEST = 500
+"""Letters of a value that an error shows."""
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
@@ -20,10 +27,10 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     Raises:
         InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
     """
-    try:
-        content = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(f"{path}: this is not YAML ({error}). Mend the file.") from error
+    text = read_text(path, _MAX_BYTES)
+    refuse_yaml_bomb(path, text)
+    with refused_as(path, "YAML file", "mend it there"):
+        content = yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
     if content is None:
         content = {}
     if not isinstance(content, Mapping):
@@ -46,11 +53,11 @@ def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source:
         return dacite.from_dict(kind, content, dacite.Config(cast=[tuple, float, Path]))
     except dacite.WrongTypeError as error:
         raise InputError(
-            f"{source}: {error.field_path} is {error.value!r}, which is not of type "
+            f"{source}: {error.field_path} is {_shown(error.value)}, which is not of type "
             f"{error.field_type}. Give a value of that type."
         ) from error
-    except (dacite.DaciteError, ValueError, TypeError) as error:
-        raise InputError(f"{source}: {error}") from error
+    except (dacite.DaciteError, ValueError, TypeError, OverflowError, AttributeError) as error:
+        raise InputError(f"{source}: {str(error)[:_LONGEST]}") from error
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
@@ -89,6 +96,11 @@ def _default_of(field: dataclasses.Field[Any]) -> object:
     return field.default
 
 
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
 def _plain_value(value: object) -> object:
     match value:
         case dict():
@@ -107,7 +119,8 @@ def _refuse_unknown_keys(content: Mapping[Any, Any], kind: type, source: str, pr
     for key, value in content.items():
         if key not in known:
             raise InputError(
-                f"{source}: unknown key {prefix + str(key)!r}; {nearest_name(str(key), known)}"
+                f"{source}: unknown key {_shown(prefix + str(key))}; "
+                f"{nearest_name(str(key)[:_LONGEST], known)}"
             )
         nested = _dataclass_in(hints[key])
         if nested is not None and isinstance(value, Mapping):

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
@@ -53,7 +53,8 @@ def read_depth_weights(path: Path) -> DepthWeights:
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
             f"{', '.join(map(repr, _NETWORKS))} or {BOTH!r}."
         )
-    parts = _split(checkpoint) if checkpoint.kind == BOTH else {checkpoint.kind: checkpoint}
+    is_both = checkpoint.kind == BOTH
+    parts = _split(checkpoint, str(path)) if is_both else {checkpoint.kind: checkpoint}
     built = {kind: _build(part, str(path)) for kind, part in parts.items()}
     return DepthWeights(
         generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
@@ -64,9 +65,8 @@ def read_depth_weights(path: Path) -> DepthWeights:
 
 def _build(part: Checkpoint, source: str) -> Any:  # noqa: ANN401 - any network of this package
     kind_of_config, kind_of_network = _NETWORKS[part.kind]
-    network = kind_of_network(config_from_dict(part.config, kind_of_config, source=source)).eval()
-    load_weights(network, part, source)
-    return network
+    config = config_from_dict(part.config, kind_of_config, source=source)
+    return build_network(lambda: kind_of_network(config), part, source).eval()
 
 
 def read_generator(path: Path) -> Generator:
@@ -127,7 +127,7 @@ def _kind_of(network: nn.Module) -> str:
     return next(kind for kind, (_, made) in _NETWORKS.items() if isinstance(network, made))
 
 
-def _split(checkpoint: Checkpoint) -> dict[str, Checkpoint]:
+def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
     """Take a file of several networks apart; its config names them."""
     parts: dict[str, Checkpoint] = {}
     for kind in (kind for kind in _NETWORKS if kind in checkpoint.config):
@@ -136,7 +136,17 @@ def _split(checkpoint: Checkpoint) -> dict[str, Checkpoint]:
             for key, tensor in checkpoint.state.items()
             if key.startswith(f"{kind}.")
         }
-        parts[kind] = Checkpoint(kind=kind, config=checkpoint.config[kind], state=state)
+        config = checkpoint.config[kind]
+        if not isinstance(config, Mapping):
+            raise InputError(f"{source}: its config has no {kind!r}; the file is damaged.")
+        parts[kind] = Checkpoint(kind=kind, config=config, state=state)
+    if not any(kind in parts for kind in _GENERATORS) or not any(
+        kind in parts for kind in _MATCHERS
+    ):
+        raise InputError(
+            f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a generator "
+            "and a matcher; the file is damaged."
+        )
     return parts
 
 

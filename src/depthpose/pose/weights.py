@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
+from depthpose.core.files.disk import refused_as
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.mesh import symmetries_from_bop, symmetries_to_bop
@@ -143,7 +144,9 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
 
 def known_numbers(path: Path) -> tuple[int, ...]:
     """Give the numbers of the objects that weights know, with or without their surfaces."""
-    return tuple(int(record["number"]) for record in read_checkpoint(path).config["models"])
+    records = read_checkpoint(path).config.get("models")
+    with refused_as(path, "file of pose weights", "it is damaged, or knows no objects"):
+        return tuple(int(record["number"]) for record in records or ())
 
 
 def read_pose_weights(path: Path) -> PoseWeights:
@@ -171,10 +174,11 @@ def read_pose_weights(path: Path) -> PoseWeights:
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
     made, kind = _NETWORKS[checkpoint.kind]
-    network = made(config_from_dict(parts["network"], kind, source=source))
+    config = config_from_dict(parts["network"], kind, source=source)
     held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
-    load_weights(network, held, source)
-    models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
+    network = build_network(lambda: made(config), held, source)
+    with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
+        models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
     _refuse_strays(checkpoint, len(models), source)
     return PoseWeights(
         network=network.eval(),

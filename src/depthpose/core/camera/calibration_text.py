@@ -16,7 +16,7 @@ Matrix = Float64[np.ndarray, "rows columns"]
 _KITTI_NAMES = (("P2", "P3"), ("P_rect_02", "P_rect_03"), ("P0", "P1"), ("P_rect_00", "P_rect_01"))
 _KITTI = re.compile(r"^(?:P|P_rect_0)[0-3]\s*:\s*[-+.\d]", re.MULTILINE)
 _MIDDLEBURY = re.compile(r"^cam0\s*=", re.MULTILINE)
-_PLAIN = re.compile(r"^\s*focal_px\s*:", re.MULTILINE)
+_PLAIN = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
 _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
 """Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
 _TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000

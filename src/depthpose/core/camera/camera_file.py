@@ -16,6 +16,7 @@ from depthpose.core.camera.storage import named, read_storage
 from depthpose.core.camera.stored_camera import facts_from_names, read_folder
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_text, write_json
+from depthpose.core.files.text import MAX_LIST_BYTES
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
@@ -91,7 +92,7 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 def _read_facts(path: AnyPath) -> CameraFacts:
     if Path(path).is_dir():
         return read_folder(Path(path))
-    text = read_text(path)
+    text = read_text(path, MAX_LIST_BYTES)
     if text.lstrip()[:1] in ("{", "["):
         content = read_json(path)
         return _storage_facts(content) or facts_from_json(content)

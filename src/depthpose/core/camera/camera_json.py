@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera.facts import CameraFacts, Size
+from depthpose.core.camera.model import MAX_SIDE_PX
 from depthpose.core.errors import InputError, nearest_name
 
 _NEEDED = ("width", "height", "K")
@@ -97,15 +98,15 @@ def _size(keys: dict[str, Any]) -> Size:
 
 def _whole(keys: dict[str, Any], key: str) -> int:
     value = keys[key]
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise InputError(f"{key!r} is {value!r}; give a whole number of pixels")
+    if not isinstance(value, int) or isinstance(value, bool) or abs(value) > MAX_SIDE_PX:
+        raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
     return value
 
 
 def _number(keys: dict[str, Any], key: str) -> float:
     value = keys[key]
     if not _is_number(value):
-        raise InputError(f"{key!r} is {value!r}; give a number")
+        raise InputError(f"{key!r} is {repr(value)[:80]}; give a number")
     return float(value)
 
 
@@ -115,7 +116,7 @@ def _matrix(value: object) -> Float[Tensor, "3 3"]:
     if not is_square or not all(_is_number(x) for row in rows for x in row):
         shown = repr(value)[:80]
         raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)
 
 
 def _is_number(value: object) -> bool:

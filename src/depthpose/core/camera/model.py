@@ -9,6 +9,8 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 
+MAX_SIDE_PX = 2**20
+"""Of an image: a number beyond is a mistake, and none that is computed with."""
 MAX_BASELINE_M = 100
 """No rig on the ground is this wide: such a number was in millimetres."""
 
@@ -34,8 +36,11 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, size in (("width", self.width), ("height", self.height)):
-            if size < 1:
-                raise InputError(f"{name} is {size}, but an image has a pixel at least; mend it")
+            if not 1 <= size <= MAX_SIDE_PX:
+                raise InputError(
+                    f"{name} is {str(size)[:20]}, but an image has 1 to {MAX_SIDE_PX} pixels in a "
+                    "row; mend it"
+                )
         check_intrinsics(self.K)
         if self.depth_unit_m is not None and not 0 < self.depth_unit_m < math.inf:
             raise InputError(

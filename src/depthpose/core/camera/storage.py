@@ -12,13 +12,15 @@ from depthpose.core.camera.facts import KNOWN_FILES
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
 from depthpose.core.files.disk import refused_as
+from depthpose.core.files.text import YAML_LOADER, refuse_yaml_bomb
 
 Names = dict[str, Any]
 """Values by name; names in small letters and digits alone, for everyone spells them otherwise."""
 
 _YAML_HEAD = re.compile(r"\A\s*%YAML[^\n]*\n")
 _DECLARATION = re.compile(r"<!(?!--)")
-_MAX_TEXT = 2**20
+_MAX_TEXT = 2**18
+"""Of YAML and XML: ten times the largest camera file."""
 
 
 def read_storage(path: AnyPath, text: str) -> Names | None:
@@ -31,8 +33,10 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
         return None
     if text.lstrip().startswith("<"):
         return _read_xml(path, text)
+    body = _YAML_HEAD.sub("", text)
     with refused_as(path, "camera file", f"mend it there; known are {KNOWN_FILES}"):
-        loader = _Loader(_YAML_HEAD.sub("", text))
+        refuse_yaml_bomb(path, body)
+        loader = _Loader(body)
         content = loader.get_data() if loader.check_data() else None
     return named(content) if isinstance(content, Mapping) else None
 
@@ -73,16 +77,11 @@ def numbers(value: object) -> list[float] | None:
     return found if found and len(found) == len(words) else None
 
 
-class _Loader(yaml.SafeLoader):
-    """Plain values, OpenCV's tags taken for what they stand on, and no references."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:  # noqa: ANN401  as PyYAML's own
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("a camera file refers to itself (*name); write the value out")
-        return super().compose_node(parent, index)
+class _Loader(YAML_LOADER):
+    """Plain values, OpenCV's tags taken for what they stand on."""
 
 
-def _of_opencv(loader: _Loader, _suffix: str, node: yaml.Node) -> object:
+def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:
     if isinstance(node, yaml.MappingNode):
         return loader.construct_mapping(node, deep=True)
     if isinstance(node, yaml.SequenceNode):

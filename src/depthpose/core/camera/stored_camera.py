@@ -12,6 +12,7 @@ from depthpose.core.camera.storage import Names, matrix, numbers, read_storage, 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 from depthpose.core.files.disk import refused_as
+from depthpose.core.files.text import MAX_LIST_BYTES
 
 _SUFFIXES = (".yaml", ".yml", ".xml")
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
@@ -66,7 +67,7 @@ def read_folder(folder: Path) -> CameraFacts:
     """
     with refused_as(folder, "folder", "check who may read it"):
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
-    found = [read_storage(path, read_text(path)) for path in files]
+    found = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
     if len(files) != 2 or None in found:
         raise InputError(
             f"a folder with {len(files)} files of {', '.join(_SUFFIXES)}; a camera of two files is "

@@ -1,6 +1,7 @@
 """Point clouds: PLY, PCD, NPY, text and KITTI's binary scans."""
 
 from dataclasses import dataclass
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,13 @@ from depthpose.core.files.maps import read_npy, to_float32
 from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
 from depthpose.core.files.ply import encode_ply, read_ply
 from depthpose.core.files.table import Columns, parse_rows
-from depthpose.core.files.text import read_text
+from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _READ = (".ply", ".pcd", ".npy", ".xyz", ".txt")
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
+_MAX_SCAN_BYTES = 2**26
+"""Of one scan of a LiDAR, thirty times KITTI's."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,7 +82,7 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
     Raises:
         InputError: the file is missing, empty, no whole number of rows, or not finite.
     """
-    data = read_bytes(path)
+    data = read_bytes(path, _MAX_SCAN_BYTES)
     if columns < 1 or not data or len(data) % (4 * columns):
         raise InputError(
             f"{path}: {len(data)} bytes are no whole number of rows of {columns} float32; it is "
@@ -92,9 +95,10 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
 
 
 def _read_rows(path: AnyPath) -> np.ndarray:
-    lines = (line.partition("#")[0] for line in read_text(path).splitlines())
-    rows = [line.replace(",", " ").replace(";", " ") for line in lines]
-    return parse_rows(path, [row for row in rows if row.strip()])
+    data = read_bytes(path, MAX_TEXT_BYTES)
+    lines = (line.partition("#")[0] for line in TextIOWrapper(BytesIO(data), "utf-8-sig"))
+    rows = (line.replace(",", " ").replace(";", " ") for line in lines)
+    return parse_rows(path, (row for row in rows if row.strip()))
 
 
 def _from_columns(path: AnyPath, columns: Columns) -> Cloud:

@@ -14,19 +14,23 @@ from depthpose.core.errors import InputError
 AnyPath = str | os.PathLike[str]
 """A path as users give it."""
 
-MAX_FILE_BYTES = 4 * 2**30
-"""Nothing that is read whole is this large; a bigger file is a mistake or an attack."""
+MAX_FILE_BYTES = 2**28
+"""Nothing that is read whole is larger; a bigger file is a mistake or an attack."""
 
 
-def read_bytes(path: AnyPath) -> bytes:
+def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
     """Read a regular file whole.
+
+    Args:
+        path: the file.
+        most: bytes beyond which it is refused unread: files of its kind are smaller.
 
     Raises:
         InputError: there is no such file, or it is a folder, a device, too large or unreadable.
     """
     try:
         status = Path(path).stat()
-        _refuse_irregular(path, status)
+        _refuse_irregular(path, status, most)
         return Path(path).read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
@@ -38,15 +42,15 @@ def read_bytes(path: AnyPath) -> bytes:
         raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
 
 
-def _refuse_irregular(path: AnyPath, status: os.stat_result) -> None:
+def _refuse_irregular(path: AnyPath, status: os.stat_result, most: int) -> None:
     if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path}: a folder where a file is needed; name a file inside it")
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: a device or pipe; save its content to a regular file first")
-    if status.st_size > MAX_FILE_BYTES:
+    if status.st_size > most:
         raise InputError(
-            f"{path}: {status.st_size} bytes, more than the {MAX_FILE_BYTES} that are read at "
-            "once; split it"
+            f"{path}: {status.st_size} bytes, more than the {most} that are read of such a file; "
+            "thin it out or split it"
         )
 
 

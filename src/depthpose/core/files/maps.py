@@ -24,6 +24,7 @@ _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+_MAX_DIMENSIONS, _MAX_VALUES = 8, 2**26
 _PFM_HEADER = re.compile(
     rb"P([fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?[0-9.]{1,32}(?:[eE][-+]?\d{1,3})?)(?:\r\n|\s)"
 )
@@ -85,16 +86,29 @@ def read_npy(path: AnyPath) -> np.ndarray:
         if version not in _HEADER_READERS:
             raise InputError(f"{path}: NPY version {version}; save plain floats with numpy.save")
         shape, is_fortran, dtype = _HEADER_READERS[version](stream)
-    if dtype.kind != "f" or dtype.itemsize > 8:
-        raise InputError(f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')")
-    body = stream.getbuffer()[stream.tell() :]
-    if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != len(body):
+        if dtype.kind != "f" or dtype.itemsize > 8:
+            raise InputError(
+                f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
+            )
+        body = stream.getbuffer()[stream.tell() :]
+        _check_shape(path, shape, dtype, len(body))
+        array = np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
+        return to_float32(array)
+
+
+def _check_shape(path: AnyPath, shape: tuple[int, ...], dtype: np.dtype, have: int) -> None:
+    if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
         raise InputError(
-            f"{path}: declares {dtype} {shape} but {len(body)} bytes follow; it is truncated or "
-            "damaged, save it again"
+            f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "
+            f"{_MAX_DIMENSIONS} at most"
         )
-    array = np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
-    return to_float32(array)
+    if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != have:
+        raise InputError(
+            f"{path}: declares {dtype} {str(shape)[:60]} but {have} bytes follow; it is truncated "
+            "or damaged, save it again"
+        )
+    if math.prod(shape) > _MAX_VALUES:
+        raise InputError(f"{path}: {math.prod(shape)} values, more than {_MAX_VALUES}; split it")
 
 
 def to_float32(array: np.ndarray) -> np.ndarray:

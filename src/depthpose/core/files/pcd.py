@@ -14,7 +14,8 @@ _CODES = {
     **{("U", size): f"u{size}" for size in "1248"},
 }
 _MAX_HEADER = 2**16
-_MAX_UNPACKED = 2**30
+_MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27
+"""Of compressed points, which are unpacked byte by byte: eight million points."""
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 
@@ -35,8 +36,7 @@ def read_pcd(path: AnyPath) -> Columns:
         return split_records(path, body, fields, count)
     if end[1] == b"binary_compressed":
         return _split_compressed(path, body, fields, count)
-    rows = [r for r in bytes(body).decode("latin-1").splitlines() if r.strip()]
-    return split_rows(path, rows, fields, count)
+    return split_rows(path, body, fields, count)
 
 
 def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:
@@ -113,10 +113,10 @@ def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], coun
     packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
     need_bytes(path, len(body) - 8, packed_size, "compressed points")
     declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
-    if size != declared or size > _MAX_UNPACKED:
+    if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
         raise InputError(
-            f"{path}: {size} bytes unpacked where the header needs {declared} (and "
-            f"{_MAX_UNPACKED} are allowed); save it as DATA binary"
+            f"{path}: {packed_size} bytes, {size} unpacked, where the header needs {declared} (and "
+            f"{_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
         )
     try:
         unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))

@@ -48,9 +48,8 @@ def read_ply(path: AnyPath) -> Columns:
         skipped = _bytes_of(path, before)
         need_bytes(path, len(body), skipped, "elements before the vertices")
         return split_records(path, body[skipped:], vertex.fields, vertex.count, order)
-    rows = [r for r in bytes(body).decode("latin-1").splitlines() if r.strip()]
     first = sum(e.count for e in before)
-    return split_rows(path, rows[first : first + vertex.count], vertex.fields, vertex.count)
+    return split_rows(path, body, vertex.fields, vertex.count, first)
 
 
 def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:

@@ -1,12 +1,15 @@
 """Named columns of numbers: what text and binary point files have in common."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import accumulate
+from io import BytesIO, TextIOWrapper
+from itertools import accumulate, islice
 
 import numpy as np
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath, refused_as
+from depthpose.core.files.text import MAX_TEXT_BYTES
 
 Columns = dict[str, np.ndarray]
 """One array a name, all equally long."""
@@ -36,24 +39,41 @@ def split_records(
         InputError: ``body`` is shorter than the records that the header declares.
     """
     # Named by place, since a file may use one name for several fields of padding.
-    dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
+    with refused_as(path, "list of fields", "save it again"):
+        dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
     need_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
     records = np.frombuffer(body, dtype, count)
     return {f.name: records[f"{i}"][:, 0] for i, f in enumerate(fields)}
 
 
-def split_rows(path: AnyPath, rows: list[str], fields: list[Field], count: int) -> Columns:
+def split_rows(
+    path: AnyPath, body: memoryview, fields: list[Field], count: int, first: int = 0
+) -> Columns:
     """Take ``count`` rows of text apart into columns of the declared types.
 
+    Args:
+        path: of the file, for errors.
+        body: what follows the header.
+        fields: the columns.
+        count: how many rows.
+        first: rows before them that are stepped over; empty ones do not count.
+
     Raises:
-        InputError: rows are missing or ragged, or a value does not fit its type.
+        InputError: rows are missing or ragged, a value does not fit its type, or there is more
+            text than is read.
     """
-    if len(rows) < count:
+    if len(body) > MAX_TEXT_BYTES:
         raise InputError(
-            f"{path}: declares {count} points but {len(rows)} rows follow; it is truncated, save "
+            f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
+            "binary"
+        )
+    lines = (line for line in TextIOWrapper(BytesIO(body), "latin-1") if line.strip())
+    table = parse_rows(path, islice(lines, first, first + count))
+    if len(table) < count:
+        raise InputError(
+            f"{path}: declares {count} points but {len(table)} rows follow; it is truncated, save "
             "it again"
         )
-    table = parse_rows(path, rows[:count])
     width = sum(f.count for f in fields)
     if count and table.shape[1] != width:
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
@@ -65,16 +85,15 @@ def split_rows(path: AnyPath, rows: list[str], fields: list[Field], count: int) 
     }
 
 
-def parse_rows(path: AnyPath, rows: list[str]) -> np.ndarray:
-    """Parse rows of equally many numbers, parted by blanks, to float64.
+def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
+    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time.
 
     Raises:
         InputError: a value is no number, or the rows are ragged.
     """
-    if not rows:
-        return np.empty((0, 0))
     with refused_as(path, "table of numbers", "give every row the same number of values"):
-        return np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
+        table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
+    return table if table.size else np.empty((0, 0))
 
 
 def need_bytes(path: AnyPath, have: int, need: int, what: str) -> None:

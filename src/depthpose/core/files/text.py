@@ -3,23 +3,45 @@
 import json
 import math
 import re
+from collections.abc import Mapping
 from typing import Any, NoReturn
+
+import yaml
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, write_bytes
+
+MAX_TEXT_BYTES = 2**26
+"""Of text and tables in it: a million points, ten thousand images of annotations."""
+MAX_LIST_BYTES = 2**20
+"""Of text that lists a few numbers: a calibration, a camera, a config."""
+_MOST_MEMORY = 700_000_000
+"""That JSON or YAML may take once it is read, as estimated from its signs."""
+_MOST_DEPTH = 50
+YAML_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""Plain values alone; ten times faster where PyYAML was built with libyaml, as its wheels are."""
+_OF_JSON = {b",": 60, b"[": 100, b"{": 100, b":": 200}
 
 _KEY_VALUE = re.compile(r"([^\s:=]+)\s*[:=](.*)")
 _BRACKETS = str.maketrans("[];,", "    ")
 
 
-def read_text(path: AnyPath) -> str:
+def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
     """Read UTF-8 text, with or without a byte order mark.
 
+    Args:
+        path: the file.
+        most: bytes beyond which it is refused unread.
+
     Raises:
-        InputError: the file is missing or not UTF-8 text.
+        InputError: the file is missing, too large or not UTF-8 text.
     """
+    return _decoded(path, read_bytes(path, most))
+
+
+def _decoded(path: AnyPath, data: bytes) -> str:
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not UTF-8 text (byte {error.start}: {error.reason}); save it as UTF-8"
@@ -31,9 +53,11 @@ def read_json(path: AnyPath) -> object:
 
     Raises:
         InputError: the file is missing or no JSON, holds NaN, infinity or a number beyond float64,
-            or gives a key twice.
+            gives a key twice, or would fill the memory.
     """
-    text = read_text(path)
+    data = read_bytes(path)
+    refuse_heavy(path, data, _OF_JSON)
+    text = _decoded(path, data)
     with refused_as(path, "JSON file", "mend it there"):
         return json.loads(
             text,
@@ -41,6 +65,43 @@ def read_json(path: AnyPath) -> object:
             parse_float=_finite,
             object_pairs_hook=_once_each,
         )
+
+
+def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
+    """Refuse a tree in text that would fill the memory.
+
+    Args:
+        path: of the file, for the error.
+        data: its content.
+        memory_of: bytes that a value takes once it is read, by the sign that stands beside it.
+
+    Raises:
+        InputError: together they are more than is allowed.
+    """
+    a_letter = 2 if data.isascii() else 5
+    need = a_letter * len(data) + sum(size * data.count(sign) for sign, size in memory_of.items())
+    if need > _MOST_MEMORY:
+        raise InputError(
+            f"{path}: {len(data)} bytes that would take about {need / 1e6:.0f} MB of memory, more "
+            f"than the {_MOST_MEMORY / 1e6:.0f} MB allowed; split it"
+        )
+
+
+def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
+    """Refuse YAML that refers to itself, or is so deep that a loader would crash.
+
+    Raises:
+        InputError: that is so, or it is no YAML.
+    """
+    depth = 0
+    with refused_as(path, "YAML file", "mend it there"):
+        for event in yaml.parse(text, YAML_LOADER):
+            if isinstance(event, yaml.AliasEvent):
+                raise InputError(f"{path}: refers to itself (*name); write the value out")
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MOST_DEPTH:
+                raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; mend it")
 
 
 def write_json(path: AnyPath, obj: object) -> None:
@@ -68,7 +129,7 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
             is not finite.
     """
     values: dict[str, list[float]] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, MAX_LIST_BYTES).splitlines(), start=1):
         text = line.strip()
         if not text or text.startswith("#"):
             continue

@@ -13,6 +13,7 @@
 
 import json
 from collections.abc import Mapping
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -107,15 +108,17 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     path = folder / _METRICS
     if not path.is_file():
         return []
-    *lines, rest = read_text(path).split("\n")
-    rows = [_row(line) for line in lines]
-    if None in rows:
-        raise InputError(
-            f"{path}: line {rows.index(None) + 1} is no step with numbers. Delete that line, or "
-            "the file: it holds curves alone, and no training goes on from it."
-        )
-    last = _row(rest)
-    return [row for row in (*rows, last) if row is not None]
+    rows: list[dict[str, Any]] = []
+    for number, line in enumerate(StringIO(read_text(path)), 1):
+        row = _row(line)
+        if row is not None:
+            rows.append(row)
+        elif line.endswith("\n"):
+            raise InputError(
+                f"{path}: line {number} is no step with numbers. Delete that line, or the file: it "
+                "holds curves alone, and no training goes on from it."
+            )
+    return rows
 
 
 def _row(line: str) -> dict[str, Any] | None:

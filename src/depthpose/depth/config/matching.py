@@ -33,17 +33,17 @@ class PSMNetConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if self.max_disparity_px < 16 or self.max_disparity_px % 16:
+        if not 16 <= self.max_disparity_px <= 2**14 or self.max_disparity_px % 16:
             raise InputError(
-                f"max_disparity_px must be a positive multiple of 16 (the volume is a quarter of "
-                f"it and is halved twice), got {self.max_disparity_px}; take 192"
+                f"max_disparity_px must be a multiple of 16 up to {2**14} (the volume is a quarter "
+                f"of it and is halved twice), got {self.max_disparity_px}; take 192"
             )
         if self.width < 1:
             raise InputError(f"width must be 1 or more channels, got {self.width}; take 32")
-        if min(self.blocks) < 1:
-            raise InputError(f"each stage needs 1 block or more, got blocks={self.blocks}")
-        if not self.pools or min(self.pools) < 1:
-            raise InputError(f"pools must hold windows of 1 pixel or more, got {self.pools}")
+        if not 1 <= min(self.blocks) <= max(self.blocks) <= 1000:
+            raise InputError(f"each stage needs 1 to 1000 blocks, got blocks={self.blocks}")
+        if not 1 <= len(self.pools) <= 16 or not 1 <= min(self.pools) <= max(self.pools) <= 1024:
+            raise InputError(f"pools must hold 1 to 16 windows of 1 to 1024 px, got {self.pools}")
         if self.work_focal_px is not None and self.work_focal_px <= 0:
             raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
 

@@ -19,6 +19,10 @@ from depthpose.core.camera.calibration_text import (
 from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections, make_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_key_values, read_text
+from depthpose.core.files.text import MAX_LIST_BYTES
+
+_MAX_PAIRS_BYTES = 2**24
+"""Of a text with a line for each pair of a folder."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +87,7 @@ def read_middlebury_calibration(path: Path) -> StereoRig:
     Raises:
         InputError: missing, or a value missing or not a number.
     """
-    return _rig(path, middlebury_facts(path, read_text(path)), None)
+    return _rig(path, middlebury_facts(path, read_text(path, MAX_LIST_BYTES)), None)
 
 
 def read_plain_calibration(path: Path, name: str, width: int, height: int) -> StereoRig:
@@ -95,8 +99,8 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     Raises:
         InputError: a value missing, or no line for this pair.
     """
-    text = read_text(path)
-    if re.search(r"^\s*focal_px\s*:", text, re.MULTILINE):
+    text = read_text(path, _MAX_PAIRS_BYTES)
+    if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
         keys = read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     own = [words for line in text.splitlines() if (words := line.split()) and words[0] == name]

@@ -27,6 +27,9 @@ _MONODEPTH_SHA256 = {
     "78b73fe7d2ef9c352b54e6e5dd0578bbbf62257280b3d5bfb1e30bd451a35006": "eigen-test",
 }
 
+_MAX_BYTES = 2**24
+"""Of a list of frames: twenty times KITTI's."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
@@ -65,11 +68,11 @@ def read_split(name: str | Path) -> Split:
     if not is_there:
         hint = nearest_name(str(name), SPLIT_NAMES)
         raise InputError(f"split {str(name)!r}: no such file; {hint}")
-    text = read_text(path)
+    text = read_text(path, _MAX_BYTES)
     known = _MONODEPTH_SHA256.get(hashlib.sha256(text.encode()).hexdigest())
     if known is not None:
         return _shipped(known)
-    lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
+    lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     frames = {_parse_line(path, i, line) for i, line in lines if line} - {None}
     if not frames:
         raise InputError(

@@ -12,6 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop.parse import (
     camera_from_bop,
+    entry_number,
     integer,
     number,
     pose_from_bop,
@@ -80,7 +81,7 @@ def bop_scenes(folder: Path, split: str) -> list[Path]:
             f"Here: {known}."
         )
     for scene in scenes:
-        if not scene.name.isdigit():
+        if entry_number(scene.name) is None:
             raise InputError(f"{scene}: scenes have numbers for names, as 000001; rename it")
     return scenes
 
@@ -144,6 +145,9 @@ def _picture(scene: Path, image: int) -> Path | None:
 
 
 def _image_number(key: str) -> int:
-    if not key.isdigit():
-        raise InputError(f"scene_gt.json: {key!r} is no number of an image; name images 0, 1, ...")
-    return int(key)
+    number = entry_number(key)
+    if number is None:
+        raise InputError(
+            f"scene_gt.json: {key[:80]!r} is no number of an image; name images 0, 1, ..."
+        )
+    return number

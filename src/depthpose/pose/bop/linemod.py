@@ -11,13 +11,17 @@ import yaml
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 from depthpose.core.files.disk import refused_as
+from depthpose.core.files.text import YAML_LOADER, refuse_heavy, refuse_yaml_bomb
 from depthpose.pose.bop.frames import Instance
-from depthpose.pose.bop.parse import camera_from_bop, integer, pose_from_bop
+from depthpose.pose.bop.parse import camera_from_bop, entry_number, integer, pose_from_bop
 from depthpose.pose.mesh import turn_about
 from depthpose.pose.types import Symmetries
 
-_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""Ten times faster than the loader in Python, where PyYAML was built with it."""
+_OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
+"""Bytes that a value takes while it is read, measured with PyYAML 6."""
+
+_MAX_BYTES = 2**22
+"""Of a list of images."""
 
 SYMMETRIC = (10, 11)
 """Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
@@ -46,8 +50,10 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         InputError: it cannot be read, or holds no mapping.
     """
     text = read_text(path)
+    refuse_heavy(path, text.encode(), _OF_YAML)
+    refuse_yaml_bomb(path, text)
     with refused_as(path, "YAML file", "mend it there"):
-        content = yaml.load(text, _LOADER)  # noqa: S506  a safe loader
+        content = yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
     return content
@@ -67,8 +73,8 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         if not listed.is_file():
             raise InputError(f"{listed}: no such list; the splits are train and test")
         truths, infos = read_yaml(scene / "gt.yml"), read_yaml(scene / "info.yml")
-        for line in read_text(listed).split():
-            if not line.isdigit():
+        for line in read_text(listed, _MAX_BYTES).split():
+            if entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
             yield _make_instance(scene, int(line), (truths, infos))
 

@@ -15,6 +15,8 @@ from depthpose.core.files.images import MAX_PIXELS, opened_image
 
 Runs = tuple[tuple[int, ...], int, int]
 """Run lengths, height and width."""
+_MOST_BITS = 40
+"""Of a run length in text: no image has as many pixels."""
 
 
 def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
@@ -94,17 +96,17 @@ def read_runs(entry: object, source: str) -> Runs:
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
     height, width = size
     text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
-    runs = _decompress(text) if isinstance(text, str) else text
+    runs = _decompress(text, what) if isinstance(text, str) else text
     if not _is_list_of_counts(runs) or sum(runs) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
     return tuple(runs), height, width
 
 
 def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
-    return isinstance(value, list) and all(isinstance(v, int) and v >= 0 for v in value)
+    return isinstance(value, list) and all(type(v) is int and v >= 0 for v in value)
 
 
-def _decompress(text: str) -> list[int]:
+def _decompress(text: str, what: str) -> list[int]:
     """Undo COCO's text form: five bits a character, runs as differences from the last but one."""
     runs: list[int] = []
     value = shift = 0
@@ -112,6 +114,8 @@ def _decompress(text: str) -> list[int]:
         bits = ord(character) - 48
         value |= (bits & 0x1F) << shift
         shift += 5
+        if shift > _MOST_BITS:
+            raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
         if bits & 0x20:
             continue
         if bits & 0x10:

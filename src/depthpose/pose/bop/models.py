@@ -7,7 +7,7 @@ from typing import Any
 
 from depthpose.core.errors import InputError
 from depthpose.pose.bop.linemod import is_linemod, linemod_symmetries, read_yaml
-from depthpose.pose.bop.parse import number, read_mapping
+from depthpose.pose.bop.parse import entry_number, number, read_mapping
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import read_model, symmetries_from_bop
 from depthpose.pose.types import ObjectModel
@@ -40,9 +40,11 @@ def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
         content = read_yaml(as_yaml)
     else:
         return {}
-    wrong = [k for k, v in content.items() if not str(k).isdigit() or not isinstance(v, dict)]
+    wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
     if wrong:
-        raise InputError(f"{home}: models_info entry {wrong[0]!r} is no object's; mend it")
+        raise InputError(
+            f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; mend it"
+        )
     return {int(key): entry for key, entry in content.items()}
 
 

@@ -1,6 +1,5 @@
 """Entries of BOP's JSON to numbers, poses and cameras; everything wrong is said with its place."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,16 @@ from depthpose.core.rigid import Rigid
 
 _ROTATION_SLACK = 1e-2
 """Published annotations are rounded; LineMOD's rotations are off by up to a few thousandths."""
+
+
+MOST = 10**9
+"""Of scenes, images and objects: their numbers name files."""
+
+
+def entry_number(key: object) -> int | None:
+    """Take the number that names a scene, an image or an object; None where it is none."""
+    text = str(key)
+    return int(text) if len(text) <= 9 and text.isascii() and text.isdecimal() else None
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -61,8 +70,10 @@ def integer(entry: object, key: str, source: str) -> int:
         InputError: it is something else, or missing.
     """
     found = entry.get(key) if isinstance(entry, Mapping) else None
-    if not isinstance(found, int) or isinstance(found, bool) or found < 0:
-        raise InputError(f"{source}: {key} is {_short(found)}, where a number of 0 or more belongs")
+    if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found <= MOST:
+        raise InputError(
+            f"{source}: {key} is {_short(found)}, where a number from 0 to {MOST} belongs"
+        )
     return found
 
 
@@ -125,7 +136,8 @@ def camera_from_bop(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"],
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # A whole number beyond 1e300 has no float.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _short(value: object) -> str:

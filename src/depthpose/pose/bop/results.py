@@ -8,10 +8,10 @@ from io import StringIO
 from pathlib import Path
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_text
-from depthpose.core.files.disk import write_bytes
+from depthpose.core.files.disk import read_bytes, refused_as, write_bytes
+from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop.parse import make_pose
+from depthpose.pose.bop.parse import MOST, make_pose
 
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 _SAME_TIME_S = 0.001
@@ -65,7 +65,10 @@ def read_results(path: str | Path) -> list[BopResult]:
     Raises:
         InputError: it is missing or damaged, or rows of an image have different times.
     """
-    rows = list(csv.reader(read_text(path).splitlines()))
+    data = read_bytes(path)
+    refuse_heavy(path, data, {b"\n": 300, b",": 60})
+    with refused_as(path, "results file", "write it anew"):
+        rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
     if not rows or [name.strip() for name in rows[0]] != _HEADER:
         raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
     results = [_read(row, f"{path}: line {i}") for i, row in enumerate(rows[1:], 2) if row]
@@ -83,6 +86,8 @@ def _read(row: list[str], source: str) -> BopResult:
     except ValueError as error:
         raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
     everything = [score, seconds, *R, *t_mm]
+    if not all(0 <= value <= MOST for value in (scene, image, wanted)):
+        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
     if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, everything)):
         raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
                          "finite ones belong")  # fmt: skip

@@ -15,6 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.pose.config import MeshConfig, Unit, metres_of
+from depthpose.pose.mesh.sizes import refuse_too_large
 from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
 from depthpose.pose.types import ObjectModel, Symmetries
 
@@ -27,6 +28,8 @@ _NO_AREA = 1e-12
 _LEAST_AREA = 1e-6
 """Of the square of the extent: all faces of less are no surface. A wire has 0.003."""
 _LARGEST_M, _SMALLEST_M = 20.0, 0.002
+_FARTHEST = 1e9
+"""A coordinate beyond belongs to no model, in whatever unit, and overflows in float32."""
 
 
 def read_model(
@@ -133,6 +136,7 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
     if suffix not in MESHES:
         raise refused_suffix(path, "model", (*MESHES, *CLOUDS))
     data = read_bytes(path)
+    refuse_too_large(path, suffix, data)
     with refused_as(path, "model", "export it again"):
         import trimesh
 
@@ -143,10 +147,10 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
             loaded = loaded.to_mesh()
         vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
-    if len(vertices) < 4 or not np.isfinite(vertices).all():
+    if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
         raise InputError(
-            f"{path}: holds {len(vertices)} points, or one that is not finite; a model needs 4 and "
-            "more. Export it again."
+            f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
+            f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
         )
     return vertices, _sound_faces(path, vertices, faces)
 

@@ -66,8 +66,11 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     Raises:
         InputError: an entry is no rigid transform or no axis.
     """
-    matrices = [_rigid_from_bop(row, source) for row in info.get("symmetries_discrete", ())]
-    axes = tuple(_axis_from_bop(entry, source) for entry in info.get("symmetries_continuous", ()))
+    turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
+    if not isinstance(turns, list) or not isinstance(lines, list):
+        raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
+    matrices = [_rigid_from_bop(row, source) for row in turns]
+    axes = tuple(_axis_from_bop(entry, source) for entry in lines)
     if not matrices:
         return Symmetries(continuous=axes)
     stacked = torch.stack(matrices)
@@ -92,15 +95,15 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
 def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
     try:
         matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f"{source}: the symmetry {row!r} is not 16 numbers; write a 4x4 matrix row by row"
+            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by row"
         ) from error
     R = matrix[:3, :3]
     is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
     if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
-            f"{source}: the symmetry {row!r} is no rigid motion; its upper left 3x3 is a rotation, "
+            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a rotation, "
             "its last row 0 0 0 1"
         )
     matrix[:3, 3] *= 0.001
@@ -114,9 +117,9 @@ def _axis_from_bop(entry: object, source: str) -> Axis:
         offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
         length = float(direction.norm())
         assert 0 < length < math.inf
-    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f'{source}: the continuous symmetry {entry!r} is not {{"axis": [x, y, z], "offset": '
+            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], "offset": '
             "[x, y, z]} with an axis of some length"
         ) from error
     return Axis(direction=direction / length, point_m=0.001 * offset_mm)

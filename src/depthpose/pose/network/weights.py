@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.pose.network.config import ResUNetConfig
 from depthpose.pose.network.resunet import ResUNet
@@ -33,6 +33,5 @@ def network_of(checkpoint: Checkpoint, source: str) -> ResUNet:
     Raises:
         InputError: weights that do not fit their own config.
     """
-    network = ResUNet(config_from_dict(checkpoint.config, ResUNetConfig, source=source))
-    load_weights(network, checkpoint, source)
-    return network.eval()
+    config = config_from_dict(checkpoint.config, ResUNetConfig, source=source)
+    return build_network(lambda: ResUNet(config), checkpoint, source).eval()

@@ -190,7 +190,7 @@ def _table(row: dict[str, Any], key: str, width: int, source: str) -> Tensor | N
 def _numbers(entry: object, width: int, source: str) -> Tensor:
     try:
         values = torch.tensor(entry, dtype=torch.float64).reshape(-1, width)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(f"{source} is not rows of {width} numbers; write them so") from error
     return values
 

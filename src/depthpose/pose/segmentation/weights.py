@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from depthpose.core.checkpoint import Checkpoint, load_weights, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.segmentation.config import SegmentationConfig
@@ -70,8 +70,8 @@ def read_segmentation(path: Path) -> SegmentationWeights:
             f"{path}: its config names {len(config.objects)} objects and {len(config.numbers)} "
             "numbers; each object has both. Export it again."
         )
-    network = FCN(len(config.objects), config.network)
-    load_weights(network, checkpoint, str(path))
+    count, knobs = len(config.objects), config.network
+    network = build_network(lambda: FCN(count, knobs), checkpoint, str(path))
     return SegmentationWeights(
         network=network.eval(),
         objects=config.objects,
