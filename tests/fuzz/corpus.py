@@ -48,7 +48,7 @@ from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.bop import open_bop, read_mask
 from depthpose.pose.bop.detections import read_detections
 from depthpose.pose.bop.linemod import read_yaml
-from depthpose.pose.bop.results import read_results, write_results, BopResult
+from depthpose.pose.bop.results import BopResult, read_results, write_results
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
@@ -350,7 +350,7 @@ def _bop() -> dict[str, Kind]:
         files = files_of(Path(home))
     with tempfile.TemporaryDirectory() as home:
         found = open_bop_results(Path(home))
-    scene = sorted(name for name in files if name.endswith("scene_gt.json"))[0].rpartition("/")[0]
+    scene = min(name for name in files if name.endswith("scene_gt.json")).rpartition("/")[0]
     readers = {f"{scene}/scene_gt.json": read_all, f"{scene}/scene_camera.json": read_all,
                f"{scene}/scene_gt_info.json": read_all,
                "models/models_info.json": read_objects}  # fmt: skip
@@ -366,9 +366,10 @@ def _bop() -> dict[str, Kind]:
 
 def open_bop_results(home: Path) -> dict[str, Kind]:
     """Results, detections and predictions of a data set."""
+    from tests.pose.made_frames import made_pose
+
     from depthpose.pose.bop.detections import Detection, write_detections
     from depthpose.pose.predictions import Prediction, write_predictions
-    from tests.pose.made_frames import made_pose
 
     pose = made_pose(0.1, 3)
     rows = [BopResult(scene_id=0, image_id=k, object_id=7, score=0.5, camera_from_model=pose,

@@ -16,7 +16,8 @@ Damage = Callable[[bytes, Random], bytes]
 WORDS = (
     "0", "-1", "nan", "inf", "-inf", "1e308", "-1e308", "1e999", "1e-320", "9" * 30, "9" * 400,
     "-" + "9" * 400, "9" * 5000, "4294967295", "9223372036854775808", "2147483648", "0x10", "1_0",
-    "", "true", "True", "null", "--1", "²", "é", "[]", "{}", "[[", "*a", "&a", "\x00", "1e", ".", "%",
+    "", "true", "True", "null", "--1", "²", "é", "[]", "{}", "[[", "*a", "&a", "\x00", "1e", ".",
+    "%",
 )  # fmt: skip
 VALUES: tuple[Any, ...] = (
     None, True, False, "", "x", "²", "1", "nan", [], {}, [[]], [None], {"a": 1}, 0, -1, 1, 0.5,
@@ -27,7 +28,7 @@ VALUES: tuple[Any, ...] = (
 _NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?|\w+")
 
 
-def hurt_bytes(good: bytes, random: Random) -> bytes:
+def hurt_bytes(good: bytes, random: Random) -> bytes:  # noqa: PLR0911 - one a kind of damage
     """Cut, flip, overwrite, repeat, leave out, or keep the first bytes alone."""
     at, size = random.randrange(len(good)), random.choice((1, 2, 4, 8, 64))
     match random.randrange(8):
@@ -73,7 +74,7 @@ def hurt_text(good: bytes, random: Random) -> bytes:
     return b"\n".join(lines)
 
 
-def hurt_tree(tree: Any, random: Random) -> Any:  # noqa: ANN401
+def hurt_tree(tree: Any, random: Random) -> Any:  # noqa: ANN401, C901 - one branch a kind of damage
     """Replace, leave out, rename or repeat something of JSON or YAML, in place; give it."""
     places: list[tuple[Any, Any]] = []
 

@@ -144,8 +144,8 @@ def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
         kind in parts for kind in _MATCHERS
     ):
         raise InputError(
-            f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a generator "
-            "and a matcher; the file is damaged."
+            f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a "
+            "generator and a matcher; the file is damaged."
         )
     return parts
 

@@ -81,7 +81,7 @@ class _Loader(YAML_LOADER):
     """Plain values, OpenCV's tags taken for what they stand on."""
 
 
-def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:
+def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: ANN401 - yaml's
     if isinstance(node, yaml.MappingNode):
         return loader.construct_mapping(node, deep=True)
     if isinstance(node, yaml.SequenceNode):

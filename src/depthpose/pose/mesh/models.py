@@ -15,8 +15,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.pose.config import MeshConfig, Unit, metres_of
-from depthpose.pose.mesh.sizes import refuse_too_large
 from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
+from depthpose.pose.mesh.sizes import refuse_too_large
 from depthpose.pose.types import ObjectModel, Symmetries
 
 MESHES = (".ply", ".stl", ".obj", ".glb")

@@ -97,14 +97,15 @@ def _rigid_from_bop(row: object, source: str) -> Float[Tensor, "4 4"]:
         matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by row"
+            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
+            "row"
         ) from error
     R = matrix[:3, :3]
     is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
     if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
-            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a rotation, "
-            "its last row 0 0 0 1"
+            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
+            "rotation, its last row 0 0 0 1"
         )
     matrix[:3, 3] *= 0.001
     return matrix
@@ -119,7 +120,7 @@ def _axis_from_bop(entry: object, source: str) -> Axis:
         assert 0 < length < math.inf
     except (AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], "offset": '
-            "[x, y, z]} with an axis of some length"
+            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
+            '"offset": [x, y, z]} with an axis of some length'
         ) from error
     return Axis(direction=direction / length, point_m=0.001 * offset_mm)
