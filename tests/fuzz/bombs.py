@@ -78,6 +78,7 @@ def packed_pcd(points: int) -> bytes:
 def many_nodes() -> bytes:
     """One mesh of twelve triangles, placed a million times."""
     good = trimesh.creation.box().export(file_type="glb")
+    assert isinstance(good, bytes)
     (size,) = struct.unpack("<I", good[12:16])
     tree = json.loads(good[20 : 20 + size])
     mesh = next(node["mesh"] for node in tree["nodes"] if "mesh" in node)

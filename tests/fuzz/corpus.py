@@ -321,7 +321,7 @@ def _configs() -> dict[str, Kind]:
     stages = {
         "depth/view.yaml": DEPTH_STAGES["view"][0],
         "depth/compact-stereo.yaml": DEPTH_STAGES["stereo"][0],
-        "depth/kitti-nc-finetune.yaml": DEPTH_STAGES["finetune"][0],
+        "depth/compact-finetune.yaml": DEPTH_STAGES["finetune"][0],
         "pose/linemod-four.yaml": POSE_STAGES["pose"][0],
         "pose/parts-masks.yaml": POSE_STAGES["segmentation"][0],
         "pose/linemod-four-pointnet.yaml": POSE_STAGES["pointnet"][0],
@@ -413,9 +413,10 @@ def _kitti() -> dict[str, Kind]:
     points = torch.tensor([[5.0, 0.1, 0.2, 0.5], [9.0, -1.0, 0.1, 0.5]])
     frame = RawFrame(
         left=image, right=image, rig=rig, disparity_px=torch.full((24, 64), 5.0),
-        occluded=torch.zeros(24, 64, dtype=torch.bool), points=points,
+        occluded=torch.zeros(24, 64, dtype=torch.bool),
+        is_sky=torch.zeros(24, 64, dtype=torch.bool), points=points,
         camera_from_velodyne=torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0],
-                                           [0, 0, 0, 1]], dtype=torch.float64),
+                                           [0, 0, 0, 1]], dtype=torch.float64).numpy(),
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as home:
         write_raw_frame(Path(home), "2100_01_01_drive_0000_sync", 0, frame)

@@ -86,7 +86,7 @@ def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: A
         return loader.construct_mapping(node, deep=True)
     if isinstance(node, yaml.SequenceNode):
         return loader.construct_sequence(node, deep=True)
-    return loader.construct_scalar(node)  # pyright: ignore[reportArgumentType]
+    return loader.construct_scalar(node)
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:opencv-", _of_opencv)
