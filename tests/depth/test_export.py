@@ -39,8 +39,9 @@ def calm_matcher() -> PSMNet:
     """A matcher of broad distributions: an untrained one jumps where a view changes little."""
     matcher = tiny_matcher(work_focal_px=70.0)
     with torch.no_grad():
-        for head in matcher.heads:
-            head.cost.weight.mul_(0.002)
+        for name, weight in matcher.named_parameters():
+            if name.endswith("cost.weight"):
+                weight.mul_(0.002)
     return matcher
 
 
