@@ -33,6 +33,7 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.streets import draw_street
+from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES, Run
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
@@ -174,6 +175,7 @@ class Bench:
         rows = []
         for mode in modes:
             network = read_generator(generator)
+            assert isinstance(network, UNetGenerator)
             network.config = replace(network.config, test_mode=mode)
             both = home / f"apart-{mode}.safetensors"
             matcher = read_matcher(self.matcher())

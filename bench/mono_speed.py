@@ -80,6 +80,13 @@ def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
         return count_flops(lambda: shadow(views[0], views[1]))
 
 
+def uses_matcher(net: FakestereoNet) -> bool:
+    """Whether depth from one image asks the matcher at all."""
+    assert net.synthesiser is not None
+    config = net.synthesiser.config
+    return isinstance(config, GeneratorConfig) or config.answer != "own"
+
+
 def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     """Measure one set in this process."""
     config = MatcherConfig(precision=precision, device=device)  # pyright: ignore[reportArgumentType]
@@ -100,15 +107,19 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     right = draw(left[None]).right[0]
     whole_s = seconds(lambda: net.estimate_pair(image), device)
     drawing = count_flops(lambda: draw(left[None]))
-    matching = matcher_flops(net, *size)
+    matching = matcher_flops(net, *size) if uses_matcher(net) else 0
     peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
+    matcher = net.matcher
+    match_s = 0.0
+    if matcher is not None and uses_matcher(net):
+        match_s = seconds(lambda: matcher.match(left, right), device)
     return {
         "set": weights,
         "precision": precision,
         "seconds": whole_s,
         "first_s": first,
         "draw_s": seconds(lambda: draw(left[None]), device),
-        "match_s": seconds(lambda: net.matcher.match(left, right), device),
+        "match_s": match_s,
         "memory_mb": memory / 1e6,
         "draw_gflop": drawing / 1e9,
         "match_gflop": matching / 1e9,

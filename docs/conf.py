@@ -12,7 +12,14 @@ author = "The depthpose authors"
 copyright = "The depthpose authors, MIT licence"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "imports", "names"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "imports",
+    "networks",
+    "names",
+]
 exclude_patterns = ["ext", "static"]
 source_suffix = {".md": "markdown"}
 

@@ -122,7 +122,7 @@ def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_matching_writes_every_file(pair_folder: Path, tmp_path: Path) -> None:
     assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--cloud") == 0
-    kinds = ("depth_m.npy", "disparity_px.npy", "depth.png", "color.png", "ply")
+    kinds = ("depth_m.npy", "disparity_px.npy", "depth.png", "color.png", "cloud.ply")
     assert all((tmp_path / "o" / f"{name}.{kind}").is_file() for name in "ab" for kind in kinds)
     depth_m = read_map(tmp_path / "o/a.depth_m.npy")
     png_m = read_depth_png(tmp_path / "o/a.depth.png")

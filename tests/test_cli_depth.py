@@ -2,6 +2,7 @@
 
 import json
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -61,13 +62,50 @@ def test_a_folder_of_images_becomes_depth(home: Path, tmp_path: Path) -> None:
     camera = ["--camera", str(home / "cam.json"), "--cloud"]
     assert predict(home, tmp_path, str(home / "images"), *camera) == 0
     endings = ("depth_m.npy", "depth.png", "disparity_px.npy", "confidence.npy", "right.png",
-               "color.png", "ply")  # fmt: skip
+               "color.png", "cloud.ply")  # fmt: skip
     for number in range(3):
         assert all((tmp_path / f"{number}.{ending}").is_file() for ending in endings)
     assert read_map(tmp_path / "0.depth_m.npy").shape == (48, 64)
     before = (tmp_path / "0.depth_m.npy").stat().st_mtime_ns
     assert predict(home, tmp_path, str(home / "images"), *camera) == 0
     assert (tmp_path / "0.depth_m.npy").stat().st_mtime_ns == before, "finished work is kept"
+
+
+@pytest.mark.parametrize("name", ["0.color.png", "0.cloud.ply", "report.html", "run.json"])
+def test_a_file_of_somebody_else_is_not_written_over(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    shutil.copy(home / "images" / "0.png", tmp_path)
+    (tmp_path / name).write_text('"mine"')
+    words = (str(tmp_path / "0.png"), "--camera", str(home / "cam.json"), "--cloud")
+    assert predict(home, tmp_path, *words) == 2
+    assert name in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == '"mine"'
+    (tmp_path / name).unlink()
+    (tmp_path / "run.json").unlink(missing_ok=True)
+    assert predict(home, tmp_path, *words) == 0
+    assert (tmp_path / "0.png").read_bytes() == (home / "images" / "0.png").read_bytes()
+
+
+def test_a_folder_of_images_takes_no_results(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(home / "images", tmp_path / "images")
+    words = ("--camera", str(home / "cam.json"))
+    for word in (tmp_path / "images", tmp_path / "images" / "*.png"):
+        assert predict(home, tmp_path / "images", str(word), *words) == 2
+        assert "the inputs lie there, and a second run would" in capsys.readouterr().err
+    assert len(list((tmp_path / "images").iterdir())) == 3
+
+
+def test_an_image_that_is_called_like_a_frame_of_a_video_is_refused(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_video(tmp_path / "drive.avi", [torch.rand(3, 48, 64) for _ in range(2)], 5.0)
+    shutil.copy(home / "images" / "0.png", tmp_path / "drive_000001.png")
+    words = [str(tmp_path / name) for name in ("drive.avi", "drive_000001.png")]
+    assert predict(home, tmp_path / "out", *words, "--focal-px", "70") == 2
+    assert "an input is called 'drive_000001', as a frame of a video" in capsys.readouterr().err
 
 
 def test_weights_that_answer_themselves_need_no_matcher(
@@ -239,7 +277,10 @@ def test_packing_writes_the_card_and_halves_the_file(
                      *words]) == 0  # fmt: skip
     theirs = read_checkpoint(find_weights("kitti-nc")).facts["terms"]
     assert read_checkpoint(named).facts["terms"] == f"research only {theirs}"
-    assert main(["weights", "pack", "kiti-nc", "--out", str(named), *words]) == 2
+    assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 2
+    assert "again.safetensors: is there already; delete it" in capsys.readouterr().err
+    new = str(tmp_path / "new.safetensors")
+    assert main(["weights", "pack", "kiti-nc", "--out", new, *words]) == 2
     assert "neither a file nor the name of weights" in capsys.readouterr().err
     assert out.stat().st_size < (home / "w.safetensors").stat().st_size
     image = str(home / "images" / "0.png")

@@ -77,9 +77,59 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     row = poses_of(out)["part"]
     assert {"network", "voting", "icp"} <= row["seconds"].keys()
     assert torch.tensor(row["covariance"]).shape == (6, 6)
-    beside = read_cloud(out / "part.ply")
+    beside = read_cloud(out / "part.pose.ply")
     assert len(beside.points) == len(cloud) + 5000
     assert beside.color is not None
+
+
+def test_results_never_take_the_place_of_inputs(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = frames(tmp_path)
+    one = tmp_path / "one"
+    one.mkdir()
+    for kind in ("depth", "mask"):
+        shutil.copy(tmp_path / kind / "seen.png", one / f"{kind}.png")
+    write_cloud(one / "scan.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    before = {path: path.read_bytes() for path in one.iterdir()}
+    depth = ["--depth", str(one / "depth.png"), "--mask", str(one / "mask.png"), *words[4:]]
+    cloud = ["--cloud", str(one / "scan.ply"), "--object", "bracket"]
+    end = ["--weights", str(weights), "--out", str(one)]
+    assert main(["pose", "predict", *depth, *end]) == 0
+    shutil.move(one / "run.json", tmp_path / "of_depth.json")  # a cloud has other settings
+    assert main(["pose", "predict", *cloud, *end]) == 2
+    assert "sources.json: is there already, and no run of this" in capsys.readouterr().err
+    for name in ("sources.json", "poses.json", "report.html"):
+        (one / name).unlink()
+    assert main(["pose", "predict", *cloud, *end]) == 0
+    assert (one / "depth.pose.png").is_file()
+    assert (one / "scan.pose.ply").is_file()
+    assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.parametrize("name", ["poses.json", "report.html", "part.pose.ply", "part.pose.png"])
+def test_a_file_of_somebody_else_is_not_written_over(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    write_cloud(tmp_path / "part.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    (tmp_path / name).write_text("mine")
+    words = ["pose", "predict", "--cloud", str(tmp_path / "part.ply"), "--object", "bracket"]
+    assert main([*words, "--weights", str(weights), "--out", str(tmp_path)]) == 2
+    assert f"{name}: is there already, and no run of this command wrote it" in (
+        capsys.readouterr().err
+    )
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_folder_of_inputs_takes_no_results(
+    weights: Path, made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = frames(tmp_path)
+    end = ["--weights", str(weights), "--out", str(tmp_path / "depth")]
+    assert main(["pose", "predict", *words, *end]) == 2
+    assert "the inputs lie there, and a second run would take the results" in (
+        capsys.readouterr().err
+    )
 
 
 def frames(folder: Path) -> list[str]:
@@ -106,9 +156,9 @@ def test_a_folder_of_depth_images_is_done_once(
     rows = poses_of(out)
     assert rows["hidden"]["reason"] == "the mask is empty: no pixel of it is the object"
     assert rows["hidden"]["camera_from_model"] is None
-    assert (out / "seen.ply").is_file()
-    assert not (out / "hidden.ply").exists()
-    blue = read_image(out / "seen.png")
+    assert (out / "seen.pose.ply").is_file()
+    assert not (out / "hidden.pose.ply").exists()
+    blue = read_image(out / "seen.pose.png")
     assert blue.shape == (3, 240, 320)
     assert int(((blue[2] > 0.9) & (blue[0] < 0.3)).sum()) > 100
     before = (out / "poses.json").read_text()
@@ -191,7 +241,7 @@ def test_a_data_set_gives_the_csv_and_pictures(
     results = read_results(out / f"depthpose_{made.folder.name}-test.csv")
     assert len(results) == len(answered) > 0
     images = {(p.place.scene_id, p.place.image_id) for p in answered if p.place is not None}
-    assert {f"{s:06d}_{i:06d}.png" for s, i in images} == {p.name for p in out.glob("*.png")}
+    assert {f"{s:06d}_{i:06d}.pose.png" for s, i in images} == {p.name for p in out.glob("*.png")}
     page = read_page(out / "report.html")
     assert page.texts["h2"][1:] == [instance.name for instance in made.instances]
     assert any(picture["alt"].startswith("picture; ") for picture in page.pictures)

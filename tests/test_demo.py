@@ -9,7 +9,9 @@ from tests.depth.made_selection import sure_of
 from tests.made_street import make_street
 
 from depthpose.core.camera import StereoRig, read_camera
+from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
+from depthpose.core.run import read_settings
 from depthpose.demo import make_demo
 from depthpose.demo.depth import _nets
 from depthpose.demo.motorcycle import read_motorcycle
@@ -73,6 +75,19 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert read_image(tmp_path / "street/left.png").shape == (3, camera.height, camera.width)
     depth_m = read_map(tmp_path / "fakestereo-net-compact/street.depth_m.npy")
     assert depth_m.shape == (camera.height, camera.width)
+    assert read_settings(tmp_path) == {"command": "demo"}
+    written = {path.name for path in tmp_path.iterdir()} - {"run.json"}
+    for k, name in enumerate(sorted(written)):  # nothing is written that was not claimed
+        (tmp_path / f"elsewhere{k}" / name).mkdir(parents=True)
+        with pytest.raises(InputError, match=f"{name}: is there already"):
+            make_demo(tmp_path / f"elsewhere{k}")
+
+
+def test_the_demo_writes_over_nothing_of_somebody_else(tmp_path: Path) -> None:
+    (tmp_path / "part").mkdir()
+    with pytest.raises(InputError, match="part: is there already, and no run of this command"):
+        make_demo(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["part"]
 
 
 def test_without_a_matcher_the_pair_is_left_to_opencv() -> None:

@@ -29,11 +29,13 @@ def test_core_imports_no_room() -> None:
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
-    assert not {"torch", "numpy", "tyro", "PIL"} & modules_after("import depthpose")
+    assert not {"torch", "numpy", "tyro", "PIL", "ray"} & modules_after("import depthpose")
 
 
 def test_the_command_line_loads_nothing_heavy() -> None:
-    assert not {"torch", "numpy", "PIL", "cv2"} & modules_after("import depthpose.cli.depth")
+    assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & modules_after(
+        "import depthpose.cli.depth, depthpose.cli.pose"
+    )
 
 
 def test_an_estimator_is_imported_when_asked_for() -> None:

@@ -29,7 +29,7 @@ def test_the_commands_that_need_no_data_run(demo_folder: Path) -> None:
     lines = [line for line in lines if "psmnet" not in line]
     assert len(lines) == 2
     assert [run(line) for line in lines] == [0] * len(lines)
-    assert (demo_folder / "out/predict/left.ply").is_file()
+    assert (demo_folder / "out/predict/left.cloud.ply").is_file()
 
 
 def test_the_commands_that_pose_run(demo_folder: Path) -> None:

@@ -6,10 +6,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.run import (
     Shard,
     claim_folder,
+    claim_names,
     environment,
     find_shard,
     own_device,
     read_settings,
+    refuse_among_inputs,
+    refuse_to_replace,
     wait_for,
 )
 
@@ -49,6 +52,56 @@ def test_a_foreign_record_is_refused(tmp_path: Path) -> None:
         claim_folder(tmp_path, {"a": 1})
     with pytest.raises(InputError, match="has no 'settings'"):
         read_settings(tmp_path)
+
+
+def test_what_no_run_wrote_is_never_written_over(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(InputError, match=r"report\.html: is there already, and no run of this"):
+        claim_folder(tmp_path, {"a": 1}, ["rows.json", "report.html"])
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    claim_folder(tmp_path, {"a": 1}, ["rows.json"])
+    claim_folder(tmp_path, {"a": 1}, ["rows.json", "report.html"])  # from here on the run's own
+
+
+def test_a_foreign_list_of_sources_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "sources.json").write_text("{}")
+    with pytest.raises(InputError, match=r"sources\.json: is there already"):
+        claim_folder(tmp_path, {"a": 1})
+
+
+def test_a_result_never_takes_the_name_of_a_file_that_is_there(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    claim_names(tmp_path, {"x": tmp_path / "x.png"}, [".color.png"])
+    for name in ("x.color.png", "y.color.png", "z.txt"):
+        (tmp_path / name).touch()
+    claim_names(tmp_path, {"x": tmp_path / "x.png", "z": tmp_path / "z.png"}, [".color.png"])
+    with pytest.raises(InputError, match=r"y\.color\.png: is there already, and no run of this"):
+        claim_names(tmp_path, {"y": tmp_path / "y.png"}, [".color.png"])
+
+
+def test_frames_of_a_video_take_no_name_either(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    (tmp_path / "drive_000003.color.png").touch()
+    claim_names(tmp_path, {"drive": tmp_path / "drive.png"}, [".color.png"])
+    (tmp_path / "drive2_000003.color.png").touch()
+    with pytest.raises(InputError, match=r"drive2_000003\.color\.png: is there already"):
+        claim_names(tmp_path, {"drive2": tmp_path / "drive2.mp4"}, [".color.png"], ["drive2"])
+
+
+def test_results_among_inputs_are_refused(tmp_path: Path) -> None:
+    files = [tmp_path / "a.png", tmp_path / "b.png"]
+    refuse_among_inputs(tmp_path, files, files)
+    refuse_among_inputs(tmp_path / "out", [tmp_path], files)
+    for word in (tmp_path, str(tmp_path / "*.png")):
+        with pytest.raises(InputError, match="the inputs lie there, and a second run would take"):
+            refuse_among_inputs(tmp_path, [word], files)
+
+
+def test_a_file_is_not_replaced_without_being_told(tmp_path: Path) -> None:
+    refuse_to_replace(tmp_path / "w.safetensors")
+    (tmp_path / "w.safetensors").touch()
+    with pytest.raises(InputError, match=r"w\.safetensors: is there already; delete it, or give"):
+        refuse_to_replace(tmp_path / "w.safetensors")
 
 
 def test_the_environment_names_versions_and_date() -> None:

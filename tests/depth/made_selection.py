@@ -24,8 +24,7 @@ def sure_of(plane: int, answer: Answer = "own") -> SelectionGenerator:
     """A network that says the same class of each pixel of both views: 0 is the sky, k a plane."""
     network = SelectionGenerator(dataclasses.replace(CONFIG, answer=answer)).eval()
     torch.nn.init.zeros_(network.head.weight)
-    with torch.no_grad():
-        network.head.bias.copy_(20.0 * F.one_hot(torch.tensor(plane), 5).repeat(2))
+    network.head.bias = nn.Parameter(20.0 * F.one_hot(torch.tensor(plane), 5).repeat(2))
     return network
 
 
@@ -41,6 +40,8 @@ def of_all_kinds(answer: Answer = "own") -> SelectionGenerator:
         network(image)
     network.eval()
     network.head.weight.mul_(20)
-    network.head.bias.sub_(torch.cat(network(image), 1).mean((0, 2, 3)))
-    network.head.bias[[0, CONFIG.planes + 1]] += 1.5
+    bias = network.head.bias
+    assert bias is not None
+    bias.sub_(torch.cat(network(image), 1).mean((0, 2, 3)))
+    bias[[0, CONFIG.planes + 1]] += 1.5
     return network

@@ -12,7 +12,7 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.estimator import resize_image
 from depthpose.depth.estimator.inputs import as_tensor
@@ -136,6 +136,7 @@ def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path)
+    assert net.matcher is not None
     match = net.matcher.match
 
     def spy(left: Tensor, right: Tensor) -> object:
@@ -321,7 +322,7 @@ def test_the_matcher_and_both_are_one_word_away() -> None:
     assert joined.disparity_px.tolist()[0] == pytest.approx([2.0, 4.0], rel=1e-4)
 
 
-def selection_file(folder: Path, answer: str = "own") -> Path:
+def selection_file(folder: Path, answer: Answer = "own") -> Path:
     """Weights of a generator that is sure of plane 3 (4 px), without a matcher."""
     path = folder / f"{answer}.safetensors"
     write_depth_weights(path, generator=sure_of(3, answer), facts={})
@@ -342,7 +343,7 @@ def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("answer", ["matched", "joined"])
-def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: str) -> None:
+def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: Answer) -> None:
     path = selection_file(tmp_path, answer)
     with pytest.raises(InputError, match="there is no matcher in that"):
         FakestereoNet.load(path)

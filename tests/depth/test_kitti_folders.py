@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
-from depthpose.depth.kitti import check_dataset, lidar_truth, open_dataset, read_split
+from depthpose.depth.kitti import (
+    check_dataset,
+    known_truths,
+    lidar_truth,
+    open_dataset,
+    read_split,
+)
 from depthpose.depth.kitti.calibration import read_object_calibration, read_plain_calibration
 
 W, H = 20, 12
@@ -165,6 +171,47 @@ def test_annotated_depth_is_found_beside_the_drives(tmp_path: Path) -> None:
     inside = f"{drive}/proj_depth/groundtruth/image_02/0000000007.png"
     write_depth_png(tmp_path / "val" / inside, torch.full((H, W), 5.0))
     assert open_dataset(tmp_path).frames[0].depth == tmp_path / "val" / inside
+
+
+@pytest.mark.parametrize("home", ["", "data_depth_velodyne/"])
+def test_a_scan_of_the_depth_prediction_set_stands_in_for_one_of_points(
+    home: str, tmp_path: Path
+) -> None:
+    """Its downloads hold drawn scans (16 bit, camera z) and no points."""
+    make_raw(tmp_path)
+    drive = "2011_09_26_drive_0002_sync"
+    for points in (tmp_path / f"2011_09_26/{drive}/velodyne_points/data").iterdir():
+        points.unlink()
+    inside = f"{home}train/{drive}/proj_depth/velodyne_raw/image_02/0000000007.png"
+    drawn = torch.full((H, W), torch.nan)
+    drawn[3, 4] = 7.5
+    write_depth_png(tmp_path / inside, drawn)
+    frame, other = open_dataset(tmp_path).frames
+    assert known_truths(other) == ()
+    assert known_truths(frame) == ("scan",)
+    assert lidar_truth(frame, "camera_z").nan_to_num(0.0).sum().item() == 7.5
+    assert lidar_truth(frame, "camera_z")[3, 4].item() == 7.5
+    with pytest.raises(InputError, match="no LiDAR scan of the kind velodyne_x"):
+        lidar_truth(frame, "velodyne_x")
+    report = check_dataset(tmp_path)
+    assert (report.counts["LiDAR scans"], report.problems) == (1, [])
+    write_depth_png(tmp_path / inside, drawn[:, 1:])
+    with pytest.raises(InputError, match="but its left image is"):
+        lidar_truth(frame, "camera_z")
+    assert "but its left image is" in check_dataset(tmp_path).problems[0].message
+
+
+def test_points_come_before_a_drawn_scan(tmp_path: Path) -> None:
+    """The published protocol draws the points itself."""
+    make_raw(tmp_path)
+    drive = tmp_path / "2011_09_26/2011_09_26_drive_0002_sync"
+    frame = open_dataset(tmp_path).frames[0]
+    own = lidar_truth(frame, "camera_z")
+    inside = "proj_depth/velodyne_raw/image_02/0000000007.png"
+    write_depth_png(drive / inside, torch.full((H, W), 50.0))
+    frame = open_dataset(tmp_path).frames[0]
+    assert frame.scan == drive / inside
+    torch.testing.assert_close(lidar_truth(frame, "camera_z"), own, equal_nan=True)
 
 
 def test_one_line_a_pair_gives_each_its_own_camera(tmp_path: Path) -> None:

@@ -5,13 +5,14 @@ from typing import Any
 
 import pytest
 import torch
-from tests.depth.test_kitti_folders import make_object, write
+from tests.depth.test_kitti_folders import make_object, make_raw, write
 
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_depth_png, write_disparity_png, write_image
 from depthpose.core.loop import LoopConfig
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
+from depthpose.depth.kitti import open_dataset
 from depthpose.depth.train import Run, TrainingPairs, train_stereo
 from depthpose.depth.train.config import StereoTraining
 
@@ -74,6 +75,19 @@ def test_an_annotated_map_no_longer_displaces_the_scan(tmp_path: Path) -> None:
         known(tmp_path)
     assert sorted(known(tmp_path, truth="scan")) == pytest.approx([18.5, 37.0], rel=1e-3)
     assert sorted(known(tmp_path, truth="annotated")) == pytest.approx([9.25], rel=1e-3)
+
+
+def test_a_scan_of_the_depth_prediction_set_is_learnt_from(tmp_path: Path) -> None:
+    make_raw(tmp_path)
+    drive = tmp_path / "2011_09_26/2011_09_26_drive_0002_sync"
+    for points in drive.glob("velodyne_points/data/*.bin"):
+        points.unlink()
+    drawn = drive / "proj_depth/velodyne_raw/image_02/0000000007.png"
+    write_depth_png(drawn, torch.full((12, 20), 20.0))
+    pair = open_dataset(tmp_path).read_rig(0)
+    assert pair is not None
+    wanted_px = float(pair.K[0, 0]) * pair.baseline_m / 20
+    assert sorted(known(tmp_path, truth="scan")) == pytest.approx([wanted_px], abs=0.01)
 
 
 def test_a_drawn_scan_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -201,6 +202,6 @@ def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) 
         ({"virtual_focal_px": 0.0}, "positive focal length"),
     ],
 )
-def test_sizes_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
+def test_sizes_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         SelectionConfig(**changes)

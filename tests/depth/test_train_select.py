@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -231,8 +232,8 @@ def test_it_is_tuned_through_the_matcher(pairs: PairsConfig, tmp_path: Path) -> 
     head = network.head.weight.grad
     assert head is not None
     assert float(head[TINY.planes + 1 :].abs().sum()) > 0
-    for name, part in (("generator", network), ("matcher", matcher)):
-        write_depth_weights(tmp_path / f"{name}.safetensors", **{name: part}, facts={})
+    write_depth_weights(tmp_path / "generator.safetensors", generator=network, facts={})
+    write_depth_weights(tmp_path / "matcher.safetensors", matcher=matcher, facts={})
     config = FinetuneTraining(
         generator=str(tmp_path / "generator.safetensors"),
         matcher=str(tmp_path / "matcher.safetensors"),
@@ -248,7 +249,10 @@ def test_it_is_tuned_through_the_matcher(pairs: PairsConfig, tmp_path: Path) -> 
 def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Path) -> None:
     zoom = dataclasses.replace(pairs.augment, scale=(1.0, 1.3))
     config = SelectTraining(
-        generator=TINY, pairs=dataclasses.replace(pairs, augment=zoom), loop=LOOP
+        generator=TINY,
+        with_fixed_start=False,
+        pairs=dataclasses.replace(pairs, augment=zoom),
+        loop=LOOP,
     )
     assert train_select(config, Run(folder=tmp_path)).is_file()
 
@@ -260,6 +264,12 @@ def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Pa
         ({"view_weight": -1.0}, "view_weight must be 0 or more"),
     ],
 )
-def test_weights_that_are_none_are_refused(changes: dict[str, float], message: str) -> None:
+def test_weights_that_are_none_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         SelectTraining(**changes)
+
+
+def test_fixed_layers_need_something_to_begin_with(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = SelectTraining(generator=TINY, pairs=pairs, loop=LOOP)
+    with pytest.raises(InputError, match="nothing says what they begin with: give --encoder"):
+        train_select(config, Run(folder=tmp_path))

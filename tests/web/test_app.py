@@ -94,7 +94,9 @@ def test_one_image_becomes_the_depth_that_python_gives(
     found = ask(page, "depth", samples, {"image": "left.png", "camera": "camera.json"}).json()
     assert found["ok"]
     names = [file["name"] for file in found["files"]]
-    assert {"left.depth_m.npy", "left.right.png", "left.confidence.png", "left.ply"} <= set(names)
+    assert {"left.depth_m.npy", "left.right.png", "left.confidence.png", "left.cloud.ply"} <= set(
+        names
+    )
     assert found["scene"]["layers"][0]["count"] > 1000
     data = page.get("/" + found["folder"] + "left.depth_m.npy").content
     expected = nets[0].estimate(samples / "left.png", samples / "camera.json").depth_m
@@ -116,7 +118,7 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
     (samples / "bare.txt").write_text("180.5 180.5 150.25 44.5")
     bare = ask(page, "depth", samples, {"image": "left.png", "camera": "bare.txt"}).json()
     answers = (by_file, by_fields, bare)
-    ways = [page.get("/" + a["folder"] + "left.ply").content for a in answers]
+    ways = [page.get("/" + a["folder"] + "left.cloud.ply").content for a in answers]
     assert ways[0] == ways[1] == ways[2]
 
 
@@ -315,7 +317,11 @@ def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: st
 def test_a_depth_image_is_posed(page: TestClient, samples: Path, truth: Rigid) -> None:
     found = ask(page, "pose", samples, VIEW, object=PART).json()
     assert_posed(page, found, truth, "depth")
-    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
+    assert [file["name"] for file in found["files"]] == [
+        "depth.pose.ply",
+        "depth.pose.png",
+        "poses.json",
+    ]
 
 
 def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(
@@ -333,8 +339,12 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
     assert not found["ok"]
     assert found["said"].startswith("Refused (")
     assert found["tables"] == {}
-    assert [file["name"] for file in found["files"]] == ["depth.ply", "depth.png", "poses.json"]
-    seen = page.get("/" + found["folder"] + "depth.ply").content
+    assert [file["name"] for file in found["files"]] == [
+        "depth.pose.ply",
+        "depth.pose.png",
+        "poses.json",
+    ]
+    seen = page.get("/" + found["folder"] + "depth.pose.ply").content
     layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
     count = layers["the object, as seen"]["count"]
     assert f"element vertex {count}\n".encode() in seen

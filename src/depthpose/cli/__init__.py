@@ -33,6 +33,10 @@ COMMANDS = {
         "made frames of your CAD files on a table, in BOP's layout",
     ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
+    "data label": (
+        "data:label",
+        "truth for pairs that have none, by a matcher, where both views agree",
+    ),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),

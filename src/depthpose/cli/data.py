@@ -74,7 +74,8 @@ def duplicates(
 
     from tqdm import tqdm
 
-    from depthpose.core.report import markdown_table, write_table
+    from depthpose.core.report import markdown_table, table_files, write_table
+    from depthpose.core.run import claim_folder
     from depthpose.depth.kitti import DUPLICATE_LIKENESS, find_duplicates, open_dataset
 
     threshold = DUPLICATE_LIKENESS if at_least is None else at_least
@@ -88,11 +89,65 @@ def duplicates(
     if rows:
         print(markdown_table(rows))
     if out is not None:
+        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
         write_table(out, rows, name="duplicates")
     likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
     what = f"{len(first)} x {len(second)} images"
     print(f"{what}: {len(rows)} pairs of likeness {threshold:g} or more; {likest}")
     return 1 if rows else 0
+
+
+def label(
+    path: tyro.conf.Positional[Path],
+    out: Path,
+    weights: str = "default",
+    device: str = "cpu",
+    max_difference_px: float = 1.0,
+    max_difference_share: float = 0.03,
+    min_confidence: float = 0.5,
+) -> int:
+    """Match pairs that have no truth both ways, and keep as truth what both views agree on.
+
+    What is written is a folder of pairs that every training takes. What comes of such labels is no
+    better than their matcher, and has its blind spots; a matcher that has seen evaluation frames
+    tells them on.
+
+        depthpose data label my-pairs --out my-pairs-labelled
+
+    Args:
+        path: a dataset with right views and calibration.
+        out: folder to write to.
+        weights: weights with a matcher, by name or file; the terms of theirs bind what comes of it.
+        device: cpu, cuda, cuda:1, ...
+        max_difference_px: largest difference of both views' disparities.
+        max_difference_share: the same as a share of the disparity; the larger limit holds.
+        min_confidence: least confidence of the matcher.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import file_sha256, find_weights
+    from depthpose.depth.config import MatcherConfig
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.kitti import open_dataset
+    from depthpose.depth.labels import LabelConfig, label_pairs
+
+    config = LabelConfig(
+        largest_difference_px=max_difference_px,
+        largest_share=max_difference_share,
+        least_confidence=min_confidence,
+    )
+    dataset = open_dataset(path)
+    settings = {
+        "dataset": dataset.name,
+        "weights_sha256": file_sha256(find_weights(weights)),
+        **asdict(config),
+    }
+    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
+    labelled = label_pairs(net, dataset, config, out, settings)
+    shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
+    known = f", {sum(shares) / len(shares):.0%} of their pixels are known" if shares else ""
+    print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
+    return 0
 
 
 def make_streets(
@@ -135,7 +190,8 @@ def make_streets(
         seed=seed, scale=scale, with_antialiasing=with_antialiasing, with_lidar=with_lidar
     )
     # Seeds have drives of their own, so they may share a folder.
-    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"})
+    days = [_day(day) for day in range(1, 6)]
+    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
     indices = range(first, first + number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
@@ -197,7 +253,8 @@ def make_objects(
     )
     said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
     files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
-    claim_folder(out, {**said, "cad": files, "unit": unit, "symmetries": symmetries})
+    settings = {**said, "cad": files, "unit": unit, "symmetries": symmetries}
+    claim_folder(out, settings, ["models", split])
     write_bop_models(out, models)
     scenes = [
         range(first, min(first + _FRAMES_A_SCENE, number))
@@ -235,7 +292,11 @@ def _is_made(split: Path, scene: int, frames: range) -> bool:
 
 
 def _drive(config: "StreetsConfig", day: int) -> str:
-    return f"2100_01_{day:02d}_drive_{config.seed:04d}_sync"
+    return f"{_day(day)}_drive_{config.seed:04d}_sync"
+
+
+def _day(day: int) -> str:
+    return f"2100_01_{day:02d}"
 
 
 def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> None:
@@ -249,6 +310,7 @@ def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> 
         rig=frame.rig,
         disparity_px=frame.disparity_px,
         occluded=frame.occluded,
+        is_sky=frame.is_sky,
         points=frame.lidar_points,
         camera_from_velodyne=camera_from_velodyne(),
     )

@@ -1,20 +1,22 @@
 """``depthpose depth ...``."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.depth.config import FloorName, MatcherConfig
 
 MatcherName = Literal["psmnet", "sgbm"]
 Precision = Literal["fp32", "bf16"]
+Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 def predict(
     images: tyro.conf.Positional[list[str]],
-    out: Path,
+    out: str,
     camera: Path | None = None,
     focal_px: float | None = None,
     weights: str = "default",
@@ -26,15 +28,16 @@ def predict(
     batch: int = 1,
     cloud: bool = False,
     view: str | None = None,
+    engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
 
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
     drawn view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
-    NAME.ply with --cloud. A video gives the files of each frame and
+    NAME.cloud.ply with --cloud. A video gives the files of each frame and
     NAME.color.mp4. report.html shows some of them, with the cloud in 3D. A rerun skips what is
-    finished; other settings need another --out.
+    finished; other settings need another --out. No file is written over that is not the run's own.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --focal-px 1100 --out out
@@ -53,8 +56,9 @@ def predict(
         max_memory: bound on the memory of the matcher, such as 1GB; exact.
         batch: images of one size that go through the networks together: for a GPU; a processor is
             busy with one.
-        cloud: write a coloured point cloud, NAME.ply.
+        cloud: write a coloured point cloud, NAME.cloud.ply.
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
+        engine: where the work is done.
     """
     from depthpose.cli import methods, predicting
 
@@ -67,18 +71,29 @@ def predict(
         raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
     if matcher == "sgbm" and config != MatcherConfig():
         raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
-    sources = predicting.find_sources(images)
+    look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
+    if engine.is_ray:
+        from depthpose.cli import engine_depth
+
+        recipe = engine_depth.NetRecipe(
+            weights=engine_depth.Weights.read(weights),
+            config=config,
+            with_right=False,
+            with_sgbm=matcher == "sgbm",
+        )
+        return engine_depth.predict(images, (camera, focal_px), recipe, look, out, engine)
+    sources = predicting.find_sources(images, Path(out))
     lens = predicting.read_lens(camera, focal_px, sources[0])
     method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
-    look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
-    return predicting.predict_all(sources, lens, method, out, look, view)
+    return predicting.predict_all(sources, lens, method, Path(out), look, view)
 
 
 def match(
     left: tyro.conf.Positional[str],
-    right: tyro.conf.Positional[str],
+    right: tyro.conf.Positional[str | None] = None,
+    *,
     camera: Path,
-    out: Path,
+    out: str,
     weights: str | None = None,
     matcher: MatcherName | None = None,
     device: str = "cpu",
@@ -88,18 +103,21 @@ def match(
     left_right_check: bool = False,
     cloud: bool = False,
     check: bool = True,
+    engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """Match real stereo pairs to metric depth.
 
     For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
-    NAME.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips what
-    is finished; other settings need another --out.
+    NAME.cloud.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips
+    what is finished; other settings need another --out. No file is written over that is not the
+    run's own.
 
         depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out out
 
     Args:
-        left: left image, a folder of them, or a quoted pattern such as 'left/*.png'.
+        left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
+            ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
         right: right image, folder or pattern; images are paired in sorted order.
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
@@ -112,10 +130,12 @@ def match(
         tile: match tiles of so many rows and columns: less memory and approximate. The first
             pair is matched whole as well, and the change of its disparity is said.
         left_right_check: match the mirrored pair too, which makes the confidence better.
-        cloud: write a coloured point cloud, NAME.ply.
+        cloud: write a coloured point cloud, NAME.cloud.ply.
         check: look at the first pair for swapped or unrectified images before any work.
+        engine: where the work is done.
     """
     from depthpose.cli import matching, methods
+    from depthpose.core.run import refuse_among_inputs
 
     if (weights is None) == (matcher != "sgbm"):
         raise InputError("match with --weights FILE (PSMNet), or with --matcher sgbm.")
@@ -131,7 +151,12 @@ def match(
             "--device, --precision, --max-memory, --tile and --left-right-check are for psmnet; "
             "sgbm takes none of them."
         )
+    if engine.is_ray:
+        return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
+    if right is None:
+        raise InputError(f"{left}: there is no right image beside it; give it as the second word")
     pairs = matching.Pairs.find(left, right, camera)
+    refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
     if check:
         matching.refuse_unusable_first(pairs)
     if weights is None:
@@ -140,7 +165,30 @@ def match(
         method = methods.weights_method(weights, config, with_right=True)
     if tile is not None:
         matching.say_tile_change(pairs, method)
-    return matching.match_all(pairs, method, out, with_cloud=cloud)
+    return matching.match_all(pairs, method, Path(out), with_cloud=cloud)
+
+
+def _match_on_ray(
+    left: str,
+    right: str | None,
+    camera: Path,
+    weights: str | None,
+    config: MatcherConfig,
+    out: str,
+    on: EngineOptions,
+    cloud: bool,
+    check: bool,
+) -> int:
+    from depthpose.cli import engine_depth
+
+    recipe = engine_depth.NetRecipe(
+        weights=None if weights is None else engine_depth.Weights.read(weights),
+        config=config,
+        with_right=True,
+        with_sgbm=False,
+    )
+    words = [left] if right is None else [left, right]
+    return engine_depth.match(words, camera, recipe, out, on, with_cloud=cloud, with_check=check)
 
 
 def evaluate(
@@ -148,7 +196,7 @@ def evaluate(
     out: Path,
     weights: tuple[str, ...] = (),
     matcher: MatcherName | None = None,
-    predictions: Path | None = None,
+    predictions: str | None = None,
     floor: tuple[FloorName, ...] = (),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
@@ -159,6 +207,7 @@ def evaluate(
     device: str = "cpu",
     precision: Precision = "fp32",
     max_memory: str | None = None,
+    engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
@@ -177,7 +226,8 @@ def evaluate(
         weights: files or names. Weights with a generator see the left view alone; 'both:NAME' shows
             their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one.
         matcher: sgbm measures OpenCV's StereoSGBM.
-        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy.
+        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
+            that 'depth predict|match --engine ray' left, path or URL.
         floor: what every method must beat: rows (the best constant depth of each image row) or
             nearest (the depth of the training image that looks most alike), or both.
         train: folders with the frames that a floor is fitted to.
@@ -191,8 +241,12 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
         precision: fp32 or bf16.
         max_memory: bound on the memory of activations, such as 1GB.
+        engine: where --predictions that are shards are measured; the numbers are the same.
     """
     from depthpose.cli import evaluating, methods
+    from depthpose.core.engine import is_job
+    from depthpose.core.report import table_files
+    from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
 
     if not weights and matcher is None and predictions is None and not floor:
@@ -211,6 +265,16 @@ def evaluate(
         training = evaluating.open_training(train, train_without)
         chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
     home = out / "predictions"
+    files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
+    claim_folder(out, {"command": "depth evaluate"}, files)
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
-    folders += [] if predictions is None else [predictions]
+    if predictions is not None and is_job(predictions):
+        from depthpose.cli.engine_evaluating import ShardTruth, measure_shards
+
+        truth = ShardTruth(data=str(data.resolve()), split=split, protocol=protocol, caps_m=cap)
+        ready = measure_shards(dataset, predictions, truth, out, engine)
+        return evaluating.measure(dataset, folders, protocol, cap, out, [ready])
+    if engine.is_ray:
+        raise InputError("--engine ray measures shards; give them by --predictions")
+    folders += [] if predictions is None else [Path(predictions)]
     return evaluating.measure(dataset, folders, protocol, cap, out)

@@ -69,13 +69,21 @@ def _read(dataset: Dataset, index: int, with_right: bool) -> StereoInput:
 
 
 def measure(
-    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float], out: Path
+    dataset: Dataset,
+    folders: Sequence[Path],
+    protocol: str,
+    caps_m: Sequence[float],
+    out: Path,
+    ready: Sequence[Evaluation] = (),
 ) -> int:
-    """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print."""
+    """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print.
+
+    Rows that are ``ready`` stand below the others.
+    """
     if find_shard().rank > 0:
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)
-    measured = join(each)
+    measured = join([*each, *ready])
     write_table(out, measured.rows)
     write_details(measured, out)
     page = out / "report.html"
@@ -105,17 +113,26 @@ def measure_each(
     found: list[Evaluation] = []
     for folder in folders:
         result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
-        who = _describe(folder)
-        name = {column: who[column] for column in ("method", "sees", "weights")}
-        found.append(
-            Evaluation(
-                rows=[who | row for row in result.rows],
-                per_frame=[name | row for row in result.per_frame],
-                deciles=[name | row for row in result.deciles],
-                skipped=result.skipped,
-            )
-        )
+        found.append(signed(result, folder.name, read_settings(folder)))
     return found
+
+
+def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+    """Let each row say whose predictions it is of.
+
+    Args:
+        result: of one set of predictions.
+        name: of their folder.
+        settings: that made them, where they are ours.
+    """
+    who = _describe(name, settings)
+    short = {column: who[column] for column in ("method", "sees", "weights")}
+    return Evaluation(
+        rows=[who | row for row in result.rows],
+        per_frame=[short | row for row in result.per_frame],
+        deciles=[short | row for row in result.deciles],
+        skipped=result.skipped,
+    )
 
 
 def join(each: Sequence[Evaluation]) -> Evaluation:
@@ -166,11 +183,10 @@ def _show_progress(frames: Sequence[int]) -> Iterable[int]:
     return tqdm(frames, unit=" frames", disable=None)
 
 
-def _describe(predictions: Path) -> dict[str, Any]:
+def _describe(name: str, settings: dict[str, Any] | None) -> dict[str, Any]:
     """Columns that say whose predictions these are."""
-    settings = read_settings(predictions)
     if settings is None:
-        return {"method": predictions.name, "sees": "", "weights": "", "weights_sha256": ""}
+        return {"method": name, "sees": "", "weights": "", "weights_sha256": ""}
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     suffix = holes.get(settings.get("with_filled_holes", ""), "")
     return {

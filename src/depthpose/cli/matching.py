@@ -8,16 +8,22 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_page import write_depth_page
+from depthpose.cli.depth_page import PAGE, write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.run import claim_folder, claim_names, find_shard
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
-from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
 from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +62,13 @@ class Pairs:
 
 def refuse_unusable_first(pairs: Pairs) -> None:
     """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    refuse_unrectified_pair(pairs.read(0))
+
+
+def refuse_unrectified_pair(pair: StereoInput) -> None:
+    """Refuse a pair that is swapped or not rectified, and name the option that takes it."""
     try:
-        refuse_unrectified(pairs.read(0))
+        refuse_unrectified(pair)
     except InputError as error:
         raise InputError(f"{error} (--no-check matches them all the same.)") from error
 
@@ -75,13 +86,13 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
 def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
     rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
-    claim_folder(out, {**method.settings, "camera": rig})
-    claim_names(out, {path.stem: path for path in pairs.left})
+    claim_folder(out, {**method.settings, "camera": rig}, [PAGE])
+    claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
     failures: list[str] = []
     mine = find_shard().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):
         name = pairs.left[index].stem
-        if is_finished(out, name) and (not with_cloud or (out / f"{name}.ply").is_file()):
+        if is_finished(out, name) and (not with_cloud or has_cloud(out, name)):
             continue
         try:
             pair = pairs.read(index)
@@ -91,15 +102,20 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
                 raise
             failures.append(str(error))
             continue
-        if with_cloud:
-            write_estimate_cloud(out, pair, estimate)
-        write_estimate(out, pair, estimate)
+        write_match(out, pair, estimate, with_cloud=with_cloud)
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
     if find_shard().rank == 0:
         _write_page(pairs, out, failures)
     return 1 if failures else 0
+
+
+def write_match(out: Path, pair: StereoInput, estimate: DepthEstimate, *, with_cloud: bool) -> None:
+    """Write the files of a matched pair; the disparity comes last."""
+    if with_cloud:
+        write_estimate_cloud(out, pair, estimate)
+    write_estimate(out, pair, estimate)
 
 
 def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:

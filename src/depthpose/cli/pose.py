@@ -1,8 +1,11 @@
 """``depthpose pose ...``."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.pose.config import (
     DiameterTable,
@@ -15,6 +18,7 @@ from depthpose.pose.config import (
 )
 
 Voting = Literal["ransac", "least-squares"]
+Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 def voting_method(word: Voting) -> VotingMethod:
@@ -23,12 +27,12 @@ def voting_method(word: Voting) -> VotingMethod:
 
 
 def predict(
-    out: Path,
+    out: str,
     weights: str = "parts",
-    cloud: Path | None = None,
+    cloud: str | None = None,
     unit: Unit | None = None,
-    depth: Path | None = None,
-    mask: Path | None = None,
+    depth: str | None = None,
+    mask: str | None = None,
     camera: Path | None = None,
     object: str | None = None,
     bop: Path | None = None,
@@ -40,15 +44,17 @@ def predict(
     batch: int = 16,
     device: str = "cpu",
     view: str | None = None,
+    engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
-    poses.json holds for each input camera_from_model (metres), its covariance, status and reason,
-    and the seconds of each stage. A cloud or depth image NAME gives NAME.ply, the posed model
-    beside the cloud, and NAME.png over the depth image; a data set gives
-    depthpose_DATASET-SPLIT.csv and SCENE_IMAGE.png. report.html shows some of them in 3D, and every
-    refusal. A rerun skips what is finished; other settings need another --out; processes of
-    torchrun share the work.
+    poses.json holds for each input camera_from_model (metres), its covariance (about this answer
+    alone; the risk is of being wrong altogether), status and reason, and the seconds of each stage.
+    A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv and
+    SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
+    what is finished; other settings need another --out; no file is written over that is not the
+    run's own. Processes of torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
@@ -76,11 +82,12 @@ def predict(
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
+        engine: where the work is done.
     """
     from depthpose.cli import pose_predicting as posing
     from depthpose.cli.pose_methods import pose_methods
     from depthpose.cli.pose_page import write_pose_page
-    from depthpose.core.run import claim_names, own_device
+    from depthpose.core.run import own_device
 
     _refuse_mixture(cloud, depth, bop)
     config = EstimateConfig(
@@ -88,33 +95,38 @@ def predict(
         with_icp=icp,
         device=own_device(device),
     )
+    if engine.is_ray:
+        return _predict_on_ray(
+            (cloud, depth, mask, camera), weights, config, (object, unit, batch), out, engine
+        )
     (method,) = pose_methods([weights], config)
     if bop is not None:
-        return _predict_bop(method, (bop, split, masks), out, batch, config.device, view)
+        return _predict_bop(method, (bop, split, masks), Path(out), batch, config.device, view)
     if cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
             "and --camera, or weights that vote"
         )
-    name = posing.object_named(object, method)
+    name, home = posing.object_named(object, method), Path(out)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
-        jobs = posing.cloud_jobs(cloud, unit or "m", name)
+        jobs = posing.cloud_jobs(Path(cloud), unit or "m", name, home)
         settings |= {"unit": unit or "m"}
     else:
         assert depth is not None
         if mask is None or camera is None:
             raise InputError("--depth needs --mask and --camera beside it")
-        jobs = posing.view_jobs(depth, mask, camera, name, unit)
-        settings |= {"camera": str(camera.resolve()), "mask": str(mask.resolve())}
+        jobs = posing.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
+        settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}
-    claim_names(out, {job.name: (cloud or depth or out) for job in jobs})
-    predictions = posing.predict_all(method, jobs, out, settings, batch, view)
+    settings = {**method.settings, **settings}
+    posing.claim(home, settings, jobs, Path(cloud or depth or out))
+    predictions = posing.predict_all(method, jobs, home, settings, batch, view)
     if predictions is None:
         return 0
-    posing.write_files(predictions, jobs, out, method)
-    write_pose_page(out, predictions, jobs, method)
-    return posing.say_result(predictions, out)
+    posing.write_files(predictions, jobs, home, method)
+    write_pose_page(home, predictions, jobs, method)
+    return posing.say_result(predictions, home)
 
 
 def evaluate(
@@ -163,10 +175,14 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
     """
     from depthpose.cli import pose_evaluating, pose_masks, pose_methods
+    from depthpose.core.report import table_files
+    from depthpose.core.run import claim_folder
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = pose_evaluating.open_instances(bop, split, objects, targets)
+    files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
+    claim_folder(out, {"command": "pose evaluate"}, files)
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
     )
@@ -198,7 +214,8 @@ def _predict_bop(
     (masks,) = find_masks([word], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = posing.bop_jobs(dataset, masks, method)
-    settings |= masks.settings
+    settings = {**method.settings, **settings, **masks.settings}
+    posing.claim_bop(out, settings, dataset)
     predictions = posing.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0
@@ -207,7 +224,38 @@ def _predict_bop(
     return posing.say_result(predictions, out)
 
 
-def _refuse_mixture(cloud: Path | None, depth: Path | None, bop: Path | None) -> None:
+def _predict_on_ray(
+    given: tuple[str | None, str | None, str | None, Path | None],
+    weights: str,
+    config: EstimateConfig,
+    details: tuple[str | None, Unit | None, int],
+    out: str,
+    on: EngineOptions,
+) -> int:
+    from depthpose.cli import engine_pose
+
+    (cloud, depth, mask, camera), (object, unit, batch) = given, details
+    if cloud is None and depth is None:
+        raise InputError(
+            "--engine ray takes --cloud, or --depth with --camera; leave it away for --bop"
+        )
+    if depth is not None and camera is None:
+        raise InputError("--depth needs --camera beside it")
+    files = engine_pose.CLOUD_FILES if depth is None else engine_pose.VIEW_FILES
+    work = engine_pose.PoseWork(
+        weights=engine_pose.Weights.read(weights),
+        config=config,
+        object=object or "",
+        unit=unit,
+        camera=None,
+        files=files,
+        batch=batch,
+    )
+    words = [word for word in (cloud, depth, mask) if word is not None]
+    return engine_pose.predict(words, files, work, camera, out, on)
+
+
+def _refuse_mixture(cloud: str | None, depth: str | None, bop: Path | None) -> None:
     given = sum(word is not None for word in (cloud, depth, bop))
     if given != 1:
         raise InputError(

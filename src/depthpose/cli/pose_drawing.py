@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.cli.pose_views import Views
+from depthpose.cli.reproducing import claim_figure
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image, write_image
 from depthpose.core.report import Picture, Section, write_page
@@ -47,6 +48,7 @@ class Panel(NamedTuple):
 
 def write_figure(number: str, text: str, panels: Sequence[Panel], out: Path, columns: int) -> int:
     """Write the figure, each panel, and a page that explains it."""
+    claim_figure(out, number)
     path = out / f"figure-{number}.png"
     write_image(path, arrange_grid([panel.image for panel in panels], columns))
     pictures: list[Picture] = []

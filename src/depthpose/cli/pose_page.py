@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.pose_methods import PoseMethod
-from depthpose.cli.pose_predicting import Unreadable
+from depthpose.cli.pose_predicting import PAGE, Unreadable
 from depthpose.core.files import read_image
 from depthpose.core.report import Section, write_page
 from depthpose.core.run import environment
@@ -23,7 +23,6 @@ from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import Job, Prediction, is_finished
 from depthpose.pose.types import PoseEstimate
 
-PAGE = "report.html"
 _MOST_ROWS = 1000
 _OF_TRUTH = (
     "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "

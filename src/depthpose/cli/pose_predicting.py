@@ -23,7 +23,14 @@ from depthpose.core.files import (
     write_cloud,
     write_image,
 )
-from depthpose.core.run import Shard, claim_folder, find_shard, wait_for
+from depthpose.core.run import (
+    Shard,
+    claim_folder,
+    claim_names,
+    find_shard,
+    refuse_among_inputs,
+    wait_for,
+)
 from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
@@ -31,6 +38,9 @@ from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud
 from depthpose.pose.predictions import (
+    CLOUD,
+    PICTURE,
+    POSES,
     Job,
     Prediction,
     is_finished,
@@ -44,6 +54,7 @@ from depthpose.pose.predictions import (
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
+PAGE = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +82,11 @@ def object_named(name: str | None, method: PoseMethod) -> str:
     return known[0] if name is None else name
 
 
-def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
+def cloud_jobs(word: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder.
 
     Raises:
-        InputError: there is none, or two of one name.
+        InputError: there is none, two of one name, or the folder is ``out`` too.
     """
     if word.is_dir():
         files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
@@ -84,18 +95,22 @@ def cloud_jobs(word: Path, unit: Unit, object: str) -> list[Job[Any]]:
     if not files:
         raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
-    return [_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+    refuse_among_inputs(out, [word], files)
+    return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
 
 
 def view_jobs(
-    depth: Path, mask: Path, camera: Path, object: str, unit: Unit | None = None
+    given: tuple[Path, Path, Path], object: str, unit: Unit | None, out: Path
 ) -> list[Job[Any]]:
-    """Take a depth image and its mask, or those of one name in two folders.
+    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
     Raises:
-        InputError: there is none, two have one name, or a depth image has no mask.
+        InputError: there is none, two have one name, a depth image has no mask, or a folder is
+            ``out`` too.
     """
+    depth, mask, camera = given
     depths, pictures = list_images(depth), _list_masks(mask)
+    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
     masks = {path.stem: path for path in pictures}
@@ -107,7 +122,9 @@ def view_jobs(
             f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
         )
     return [
-        _job(p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit))
+        input_job(
+            p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit)
+        )
         for p in depths
     ]
 
@@ -150,6 +167,25 @@ def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[
     return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
 
 
+def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Path) -> None:
+    """Make a folder the home of the poses of clouds or depth images.
+
+    Raises:
+        InputError: it is another run's, or holds a file of somebody else that would be written
+            over.
+    """
+    claim_folder(out, settings, [POSES, PAGE])
+    endings = [f".{end}" for end in (PICTURE, CLOUD)]
+    claim_names(out, {job.name: source for job in jobs}, endings)
+
+
+def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
+    """Make a folder the home of the poses of a data set; raises as :func:`claim`."""
+    images = {(i.scene_id, i.image_id) for i in dataset.instances}
+    pictures = (_picture_name(*image) for image in sorted(images))
+    claim_folder(out, settings, [POSES, PAGE, results_name(dataset), *pictures])
+
+
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
                 batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
     """Estimate what is not finished; several processes share the work and meet in the files.
@@ -158,19 +194,23 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
         All predictions in the order of the jobs; None in a process that is not the first.
     """
     shard = find_shard()
-    claim_folder(out, {**method.settings, **settings})
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
     done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
     if left:
         with open_viewer(None if shard.rank else view) as viewer:
             shown = method if viewer is None else viewer.watching(method)
-            names = predict(_safely(shown), left, home, {**method.settings, **settings}, batch)
+            names = predict(_safely(shown), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if shard.rank:
         return None
     return _gather(jobs, out, shard)
+
+
+def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
+    """Estimate some inputs together; what cannot be read has the status ``unreadable``."""
+    return list(_safely(method)([job.read() for job in jobs]))
 
 
 def say_result(predictions: list[Prediction], out: Path) -> int:
@@ -192,7 +232,7 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
 def write_files(
     predictions: list[Prediction], jobs: list[Job[Any]], out: Path, method: PoseMethod
 ) -> None:
-    """Write NAME.ply, and NAME.png where there is a depth image."""
+    """Write NAME.pose.ply, and NAME.pose.png where there is a depth image."""
     for prediction, job in zip(predictions, jobs, strict=True):
         estimate = prediction.estimate
         pose = estimate.camera_from_model
@@ -200,16 +240,16 @@ def write_files(
             continue
         given, model = job.read(), _model(method, estimate.object)
         points_m = object_points(given, model.diameter_m)
-        write_cloud(out / f"{job.name}.ply", posed_cloud(points_m, pose, model))
+        write_cloud(out / f"{job.name}.{CLOUD}", posed_cloud(points_m, pose, model))
         if isinstance(given, ViewInput):
             picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
-            write_image(out / f"{job.name}.png", picture)
+            write_image(out / f"{job.name}.{PICTURE}", picture)
 
 
 def write_bop_files(
     predictions: list[Prediction], dataset: BopDataset, out: Path, method: PoseMethod
 ) -> None:
-    """Write BOP's csv, and a picture SCENE_IMAGE.png of each image."""
+    """Write BOP's csv, and a picture SCENE_IMAGE.pose.png of each image."""
     write_bop_results(out / results_name(dataset), predictions)
     image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
     found: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
@@ -217,9 +257,13 @@ def write_bop_files(
         if prediction.place is not None and prediction.estimate.is_ok:
             found[prediction.place[:2]].append(prediction.estimate)
     for (scene, image), estimates in found.items():
-        path = out / f"{scene:06d}_{image:06d}.png"
+        path = out / _picture_name(scene, image)
         if not path.is_file():
             write_image(path, _overlay(image_of[scene, image], estimates, method))
+
+
+def _picture_name(scene: int, image: int) -> str:
+    return f"{scene:06d}_{image:06d}.{PICTURE}"
 
 
 def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
@@ -294,7 +338,8 @@ def _unread(given: Unreadable) -> PoseEstimate:
     )
 
 
-def _job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+def input_job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+    """Take one input; one that cannot be read stops no other."""
     return _safe(Job(name=name, read=read), object)
 
 

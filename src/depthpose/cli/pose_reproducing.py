@@ -15,6 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.report import (
     Section,
     markdown_table,
+    table_files,
     write_markdown,
     write_page,
     write_table,
@@ -31,6 +32,11 @@ from depthpose.pose.config import (
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.tables import TITLES, cases_of, compare_voting, join_by_object
+
+_RESULTS = (
+    *table_files("rows", "all", "instances", "risk"),
+    "report.md", "report.html", "predictions", "detections", "figures",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,7 +93,7 @@ def reproduce_by_object(
     """Predict what is missing, measure, set beside the print, and write everything."""
     dataset = order.dataset
     methods = pose_methods.pose_methods(weights, rule.estimate, tuple(dataset.objects.values()))
-    claim_folder(out, _settings(order, methods, rule))
+    claim_folder(out, _settings(order, methods, rule), _RESULTS)
     shown = pose_masks.find_masks(masks, dataset, out, rule.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], rule.evaluation)
@@ -111,6 +117,8 @@ def reproduce_voting(weights: str, source: Source, points: Sequence[int], out: P
     net = GeoPoseNet.load(path)
     views = open_views(net, source)
     facts = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12], **views.facts}
+    files = [*table_files("rows"), "report.md", "report.html"]
+    claim_folder(out, {"command": "reproduce 3.3"}, files)
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count))

@@ -114,8 +114,10 @@ def calibrate(
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.config import read_config
+    from depthpose.core.run import refuse_to_replace
     from depthpose.pose.train import PoseTraining, recalibrate
 
+    refuse_to_replace(out)
     chosen = PoseTraining() if config is None else read_config(config, PoseTraining)
     knobs = changed(chosen.calibration, max_wrong_share=max_wrong_share, number=number)
     chosen = dataclasses.replace(chosen, calibration=knobs)

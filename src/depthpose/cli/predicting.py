@@ -2,17 +2,18 @@
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_page import write_depth_page
+from depthpose.cli.depth_page import PAGE, write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.cli.viewing import Viewer, open_viewer
 from depthpose.core.camera import Camera, StereoRig, read_camera
@@ -27,10 +28,18 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.run import claim_folder, claim_names, find_shard
+from depthpose.core.run import claim_folder, claim_names, find_shard, refuse_among_inputs
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import is_finished, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
 from depthpose.depth.types import StereoInput
+
+_VIDEO = ".color.mp4"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +58,10 @@ class Lens:
         f = self.focal_px
         K = [[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]
         return Camera(width=width, height=height, K=torch.tensor(K, dtype=torch.float64))
+
+    def facts(self) -> dict[str, Any]:
+        """Give what is known as JSON values: it decides the results."""
+        return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,11 +92,12 @@ def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
     return Lens(camera=read, focal_px=focal_px)
 
 
-def find_sources(words: Sequence[str]) -> list[Path]:
+def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     """List images and videos.
 
     Raises:
-        InputError: nothing there, or two inputs whose results would have one name.
+        InputError: nothing there, two inputs whose results would have one name, or a folder of
+            inputs that is ``out`` too.
     """
     found: list[Path] = []
     for word in words:
@@ -92,6 +106,14 @@ def find_sources(words: Sequence[str]) -> list[Path]:
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice is not None:
         raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
+    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in found
+              if _is_video(path) for stem in stems]  # fmt: skip
+    if (frame := next(filter(None, frames), None)) is not None:
+        raise InputError(
+            f"an input is called {frame[0]!r}, as a frame of a video would be, and so would their "
+            "results; rename one of the two"
+        )
+    refuse_among_inputs(out, words, found)
     return found
 
 
@@ -99,18 +121,20 @@ def predict_all(
     sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
 ) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
-    known = lens.camera
-    facts = {"K": known.K.tolist()} if known else {"focal_px": lens.focal_px}
-    claim_folder(out, {**method.settings, "camera": facts, "color_range_m": list(look.range_m)})
-    claim_names(out, {source.stem: source for source in sources})
+    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
+    claim_folder(out, settings, [PAGE])
+    videos = [source.stem for source in sources if _is_video(source)]
+    endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
+    claim_names(out, {source.stem: source for source in sources}, endings, videos)
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
     with open_viewer(None if find_shard().rank else view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
-        done = predictor.predict_images([path for path in mine if not _is_video(path)])
+        images = {path.stem: path for path in mine if not _is_video(path)}
+        done = predictor.predict_images(images)
         for path in filter(_is_video, mine):
             done += predictor.predict_video(path)
-    failures = predictor.failures
+    failures = list(predictor.failures.values())
     if failures and len(sources) == 1:
         raise failures[0]
     for failure in failures:
@@ -140,17 +164,17 @@ def _write_page(
 
 @dataclass(frozen=True, kw_only=True)
 class Predictor:
-    """Images in, files out; what fails is remembered in ``failures``."""
+    """Images in, files out; what fails is remembered in ``failures``, by its name."""
 
     lens: Lens
     net: FakestereoNet
     out: Path
     look: Look
     viewer: Viewer | None = None
-    failures: list[InputError] = field(default_factory=list)
+    failures: dict[str, InputError] = field(default_factory=dict)
 
-    def predict_images(self, sources: list[Path]) -> int:
-        """Predict images; give how many are done."""
+    def predict_images(self, sources: Mapping[str, Path]) -> int:
+        """Predict images, each with the name of its results; give how many are done."""
         return len(self._predict(self._read(sources), len(sources), "images"))
 
     def predict_video(self, source: Path) -> int:
@@ -159,18 +183,18 @@ class Predictor:
             video = read_video(source)
             names = self._predict(iter(video), video.frames or None, source.name)
             colors = _colors(names, self.out, self.look)
-            write_video(self.out / f"{source.stem}.color.mp4", colors, video.fps)
+            write_video(self.out / f"{source.stem}{_VIDEO}", colors, video.fps)
         except InputError as error:
-            self.failures.append(error)
+            self.failures[source.name] = error
             return 0
         return len(names)
 
-    def _read(self, sources: list[Path]) -> Iterator[tuple[str, Tensor]]:
-        for source in sources:
+    def _read(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
+        for name, source in sources.items():
             try:
-                yield source.stem, read_image(source)
+                yield name, read_image(source)
             except InputError as error:
-                self.failures.append(error)
+                self.failures[name] = error
 
     def _predict(
         self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
@@ -199,13 +223,13 @@ class Predictor:
         except InputError as error:
             if len(inputs) > 1:
                 return [name for given in inputs for name in self._predict_chunk([given])]
-            self.failures.append(error)
+            self.failures[inputs[0].name] = error
             return []
         return [given.name for given in inputs]
 
     def _is_finished(self, name: str) -> bool:
-        has_cloud = not self.look.with_cloud or (self.out / f"{name}.ply").is_file()
-        return has_cloud and is_finished(self.out, name)
+        is_drawn = not self.look.with_cloud or has_cloud(self.out, name)
+        return is_drawn and is_finished(self.out, name)
 
 
 def _size_of(source: Path) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from depthpose.core.report import (
     Picture,
     Section,
     markdown_table,
+    table_files,
     write_markdown,
     write_page,
     write_table,
@@ -37,6 +38,10 @@ from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.depth.tables import PublishedTable, join_published
 
 _PICTURE_WIDTH_PX = 621
+_RESULTS = (
+    *table_files("rows", "frames", "confidence"),
+    "report.md", "report.html", "predictions", "figures",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +97,7 @@ def own_methods(
 
 def reproduce_table(order: Order, methods: Sequence[tuple[str, Method]], out: Path) -> int:
     """Predict what is missing, measure, set beside the print, and write everything."""
-    claim_folder(out, _settings(order, [method for _, method in methods]))
+    claim_folder(out, _settings(order, [method for _, method in methods]), _RESULTS)
     rule = find_protocol(order.protocol)
     home = out / "predictions"
     folders = [evaluating.predict_all(order.dataset, m, rule, home) for _, m in methods]
@@ -147,6 +152,7 @@ def write_figure(
     number: str, dataset: Dataset, indices: Sequence[int], method: Method, out: Path
 ) -> int:
     """Estimate the frames, draw the figure, and write it with a page that explains it."""
+    claim_figure(out, number)
     columns = [
         _draw_column(number, dataset, index, method)
         for index in tqdm(indices, unit=" frames", disable=None)
@@ -166,6 +172,16 @@ def write_figure(
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
+
+
+def claim_figure(out: Path, number: str) -> None:
+    """Make a folder the home of a figure.
+
+    Raises:
+        InputError: it is another command's, or holds files that would be written over.
+    """
+    files = (f"figure-{number}.png", "panels", "report.html")
+    claim_folder(out, {"command": f"figure {number}"}, files)
 
 
 def _draw_column(number: str, dataset: Dataset, index: int, method: Method) -> list[Panel]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.run import refuse_to_replace
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.pose.cloud import object_points
 from depthpose.pose.estimator.prepare import AnyInput
@@ -43,6 +44,8 @@ class Viewer:
             )
         if where != LIVE and not path.parent.is_dir():
             raise InputError(f"--view {where}: there is no folder {path.parent}; make it first")
+        if where != LIVE:
+            refuse_to_replace(path)
         try:
             self._rerun: Any = import_module("rerun")
         except ImportError as error:

@@ -80,6 +80,9 @@ def import_weights(
         classes: fcgf: how many objects the outputs are directions for; left out where they are
             descriptors.
     """
+    from depthpose.core.run import refuse_to_replace
+
+    refuse_to_replace(out)
     if kind == "fcgf":
         from depthpose.pose.network import import_fcgf
 
@@ -130,8 +133,10 @@ def pack_weights(
         half: store 16-bit floats: half the size.
     """
     from depthpose.core.checkpoint import bound_facts, find_weights, say_terms
+    from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
+    refuse_to_replace(out)
     found = read_depth_weights(find_weights(weights))
     made_of = [weights] if matcher is None else [weights, matcher]
     say_terms(bound_facts({}, made_of))
@@ -162,11 +167,13 @@ def complete_weights(
         unit: of a model file; BOP's are in mm.
     """
     from depthpose.core.checkpoint import find_weights
+    from depthpose.core.run import refuse_to_replace
     from depthpose.pose.bop.models import read_bop_models
     from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
     from depthpose.pose.weights import known_numbers
 
+    refuse_to_replace(out)
     path = find_weights(weights)
     numbers = known_numbers(path)
     if models.is_file() and len(numbers) == 1:

@@ -76,13 +76,26 @@ class Section:
     scenes: Sequence[Scene] = field(default_factory=tuple)
 
 
+def table_files(*names: str) -> list[str]:
+    """Name the files that :func:`write_table` writes."""
+    return [
+        f"{stem}.{ending}"
+        for name in names
+        for stem, ending in ((name, "json"), (name, "csv"), (_markdown_name(name), "md"))
+    ]
+
+
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
     """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
     write_json(folder / f"{name}.json", [dict(row) for row in rows])
     with atomic_write(folder / f"{name}.csv") as temporary:
         temporary.write_text(csv_table(rows))
-    with atomic_write(folder / f"{'table' if name == 'rows' else name}.md") as temporary:
+    with atomic_write(folder / f"{_markdown_name(name)}.md") as temporary:
         temporary.write_text(markdown_table(rows))
+
+
+def _markdown_name(name: str) -> str:
+    return "table" if name == "rows" else name
 
 
 def markdown_table(rows: Sequence[Row]) -> str:

@@ -2,9 +2,10 @@
 
 import os
 import platform
+import re
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -16,8 +17,9 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_json
 
-_RECORD = "run.json"
+RECORD = "run.json"
 _SOURCES = "sources.json"
+_FRAME = re.compile(r"_\d{6}$")
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 
@@ -99,34 +101,59 @@ def environment() -> dict[str, str]:
     return facts | ({"commit": found} if (found := _commit()) else {})
 
 
-def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+def claim_folder(
+    folder: Path, settings: Mapping[str, Any], results: Iterable[str | Path] = ()
+) -> None:
     """Make ``folder`` the home of a run with these settings, or continue such a run.
 
     Args:
         folder: made where it is missing.
         settings: JSON values that decide the results; compared with those of an earlier run.
+        results: files and folders that the run will write. They are its own where an earlier run
+            has left its record; without a record, somebody else wrote what is there.
 
     Raises:
-        InputError: the folder holds a run with other settings; the first difference is named.
+        InputError: the folder holds a run with other settings (the first difference is named), or
+            a file that is not the run's and would be written over.
     """
-    record = folder / _RECORD
+    record = folder / RECORD
+    if not record.exists():
+        there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
+        # Looked at again: another process may have begun the same run.
+        if there and not record.exists():
+            raise _not_ours(folder / there[0])
     if record.exists():
-        _refuse_other_settings(folder, read_json(record), dict(settings))
+        refuse_other_settings(folder, read_json(record), settings)
         return
-    write_json(record, {"settings": dict(settings), "environment": environment()})
+    write_json(record, run_record(settings))
 
 
-def claim_names(folder: Path, sources: Mapping[str, Path]) -> None:
+def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what ``run.json`` holds: the settings, and what they were run with."""
+    return {"settings": dict(settings), "environment": environment()}
+
+
+def claim_names(
+    folder: Path,
+    sources: Mapping[str, Path],
+    endings: Sequence[str] = (),
+    videos: Collection[str] = (),
+) -> None:
     """Reserve names of results for the files that they are made from.
 
     Args:
-        folder: where the results go.
+        folder: where the results go, claimed before (:func:`claim_folder`).
         sources: the file behind each name.
+        endings: what follows a name in the names of its results.
+        videos: those of the names whose results bear the number of a frame too.
 
     Raises:
-        InputError: an earlier run made a result of that name from another file.
+        InputError: an earlier run made a result of that name from another file, or a file that no
+            run wrote bears the name of a result.
     """
     record = folder / _SOURCES
+    # Listed before the record is read: what another process writes, its record names by then.
+    results = _results_there(folder, endings)
     there = read_json(record) if record.exists() else {}
     known = there if isinstance(there, dict) else {}
     wanted = {name: str(path.resolve()) for name, path in sources.items()}
@@ -136,13 +163,47 @@ def claim_names(folder: Path, sources: Mapping[str, Path]) -> None:
                 f"{folder}: {name!r} is the result of {known[name]}, not of {path}; two files of "
                 "one name need two folders: choose another"
             )
-    if known | wanted != known and find_shard().rank == 0:
+    new = wanted.keys() - known.keys()
+    for stem, file in results.items():
+        is_frame = _FRAME.sub("", stem) in new & set(videos)
+        if stem not in known and (stem in new or is_frame):
+            raise _not_ours(file)
+    if new:
         write_json(record, known | wanted)
+
+
+def refuse_to_replace(path: Path) -> None:
+    """Refuse to write one file over another that is there already.
+
+    Raises:
+        InputError: there is one.
+    """
+    if os.path.lexists(path):
+        raise InputError(f"{path}: is there already; delete it, or give another name")
+
+
+def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
+    """Refuse results in a folder whose files are inputs: the next run would take them for such.
+
+    Args:
+        out: where the results go.
+        words: as given: files, folders or patterns.
+        files: that they name.
+
+    Raises:
+        InputError: ``out`` holds such files, and they were not named one by one.
+    """
+    named = {Path(word) for word in words}
+    if any(path not in named and path.parent.resolve() == out.resolve() for path in files):
+        raise InputError(
+            f"--out {out}: the inputs lie there, and a second run would take the results for "
+            "inputs too; choose a folder of their own"
+        )
 
 
 def read_settings(folder: Path) -> dict[str, Any] | None:
     """Give the settings that made ``folder``, or None where no run claimed it."""
-    record = folder / _RECORD
+    record = folder / RECORD
     if not record.exists():
         return None
     content = read_json(record)
@@ -152,10 +213,33 @@ def read_settings(folder: Path) -> dict[str, Any] | None:
     return settings
 
 
-def _refuse_other_settings(folder: Path, record: object, settings: dict[str, Any]) -> None:
+def _not_ours(path: Path) -> InputError:
+    return InputError(
+        f"{path}: is there already, and no run of this command wrote it; choose another --out, or "
+        "move it away"
+    )
+
+
+def _results_there(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
+    """Find the files that have the names of results, by what stands before the ending."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return {
+        file.name.removesuffix(ending): file
+        for file in files
+        for ending in endings
+        if file.name.endswith(ending)
+    }
+
+
+def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[str, Any]) -> None:
+    """Refuse a folder whose record says that other settings made what it holds.
+
+    Raises:
+        InputError: the first difference is named.
+    """
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
-        raise InputError(f"{folder / _RECORD}: not a record of a run. Choose another folder.")
+        raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
     # A knob that one of the two does not know counts as None: a later version may add knobs.
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):

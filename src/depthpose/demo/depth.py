@@ -94,7 +94,7 @@ def _write_pair(folder: Path, sample: StereoSample) -> None:
     write_image(folder / "left.png", pair.left)
     write_image(folder / "right.png", pair.right)
     write_camera(folder / "camera.json", pair.camera)
-    write_image(folder / "depth.png", draw_depth(truth.depth_m, *_range_m(sample)))
+    write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *_range_m(sample)))
 
 
 def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _opening(folder: Path, sample: StereoSample, text: str, rows: list[dict[str,
         pictures=[
             Picture(path=folder / "left.png", caption="left image"),
             Picture(path=folder / "right.png", caption="right image"),
-            Picture(path=folder / "depth.png", caption="true depth; grey: none", scale=scale),
+            Picture(path=folder / "depth.color.png", caption="true depth; grey: none", scale=scale),
         ],
     )
 

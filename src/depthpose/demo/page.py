@@ -4,10 +4,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.report import write_page, write_table
-from depthpose.core.run import environment
+from depthpose.core.report import table_files, write_page, write_table
+from depthpose.core.run import claim_folder, environment
 from depthpose.demo.depth import show_depth
 from depthpose.demo.pose import show_poses
+
+_PAGE = "report.html"
+_FOLDERS = (
+    "street", "motorcycle", "fakestereo-net-compact", "psmnet-compact", "sgbm-holes-filled",
+    "part", "parts", "geo-posenet",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,12 +35,16 @@ def make_demo(
         weights: of the depth room, by name or file.
         parts: of the pose room, by name or file; they know made parts.
         scale: size of the street's images as a share of KITTI's.
+
+    Raises:
+        InputError: ``out`` holds files of somebody else that would be written over.
     """
+    claim_folder(out, {"command": "demo"}, [*_FOLDERS, *table_files("depths", "poses"), _PAGE])
     depths, of_depth = show_depth(out, weights, scale)
     poses, of_pose = show_poses(out, parts)
     write_table(out, depths, name="depths")
     write_table(out, poses, name="poses")
-    page = out / "report.html"
+    page = out / _PAGE
     title = "depthpose: images to metric depth, a depth sensor to poses"
     write_page(page, title, [*of_depth, *of_pose], environment())
     return DemoResult(page, depths, poses)

@@ -14,7 +14,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.objects import make_frames
 from depthpose.pose.overlay import draw_pose, grey_depth, pose_layers, posed_cloud
-from depthpose.pose.predictions import Prediction, place_of, write_predictions
+from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.types import ViewInput
 
 FRAMES_SEED = 9
@@ -73,19 +73,19 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
         if (pose := estimate.camera_from_model) is not None:
             picture = draw_pose(picture, pose, model, K)
             points_m = dataset.sample(instance).input.points_m
-            write_cloud(folder / f"{view.object}.ply", posed_cloud(points_m, pose, model))
+            write_cloud(folder / f"{view.object}.{CLOUD}", posed_cloud(points_m, pose, model))
             layers += pose_layers(pose, model)
         picture = draw_pose(picture, instance.camera_from_model, model, K, is_true=True)
         layers += pose_layers(instance.camera_from_model, model, is_true=True)
     write_image(folder / "poses.png", picture)
-    write_image(folder / "depth.png", grey_depth(frame.depth_m))
+    write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
     return rows, [
         Section(
             title="Parts on a table",
             text=_TEXT,
             rows=rows,
             pictures=[
-                Picture(path=folder / "depth.png", caption="depth image, near bright"),
+                Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
                 Picture(path=folder / "poses.png", caption="poses, estimated and true"),
             ],
             scenes=[Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)],

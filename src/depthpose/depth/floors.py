@@ -17,7 +17,7 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.kitti import Dataset, read_known_depth, shrink
+from depthpose.depth.kitti import Dataset, known_truths, read_known_depth, shrink
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 _CANONICAL_FOCAL_PX = 721.5377
@@ -100,11 +100,7 @@ class NearestImageFloor:
             InputError: none has.
         """
         frames = dataset.frames
-        indices = [
-            i
-            for i, frame in enumerate(frames)
-            if frame.calibration and (frame.velodyne or frame.depth or frame.disparity)
-        ]
+        indices = [i for i, frame in enumerate(frames) if frame.calibration and known_truths(frame)]
         if not indices:
             raise _nothing_to_learn(dataset)
         looks = [_look(read_image(frames[indices[k]].left)) for k in progress(range(len(indices)))]

@@ -37,6 +37,12 @@ class Estimator(Protocol):
 
 _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 
+CLOUD = "cloud.ply"
+ENDINGS = (
+    "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
+    "disparity_px.npy", CLOUD,
+)  # fmt: skip
+"""What follows ``NAME.`` in the names of the files of an estimate."""
 
 COLOR_RANGE_M = (3.0, 80.0)
 """Near and far end of the colours of depth, one for all pictures, so that they compare."""
@@ -77,8 +83,8 @@ def write_estimate(
 def write_estimate_cloud(
     folder: Path, pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0
 ) -> None:
-    """Write ``NAME.ply``: what :func:`estimate_cloud` gives."""
-    write_cloud(_file(folder / pair.name, "ply"), estimate_cloud(pair, estimate, far_m))
+    """Write ``NAME.cloud.ply``: what :func:`estimate_cloud` gives."""
+    write_cloud(_file(folder / pair.name, CLOUD), estimate_cloud(pair, estimate, far_m))
 
 
 def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
@@ -98,6 +104,11 @@ def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80
 def is_finished(folder: Path, name: str) -> bool:
     """Whether an earlier run left the estimate of this frame."""
     return _file(folder / name, "disparity_px.npy").is_file()
+
+
+def has_cloud(folder: Path, name: str) -> bool:
+    """Whether an earlier run left the cloud of this frame."""
+    return _file(folder / name, CLOUD).is_file()
 
 
 def has_prediction(folder: Path, name: str) -> bool:
@@ -188,7 +199,7 @@ def predict(
         folder: where the files go; refused if other settings made what it holds.
         settings: what decides the results.
     """
-    claim_folder(folder, settings)
+    claim_folder(folder, settings, (f"{name}.{end}" for name in names for end in ENDINGS))
     for read_input, name in zip(inputs, names, strict=True):
         if not is_finished(folder, name):
             pair = read_input()

@@ -112,7 +112,7 @@ def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
         tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
     if pose is not None and found.covariance is not None:
         turn_deg, origin_mm = spreads(pose, found.covariance)
-        tables["standard deviations along the camera's axes"] = [
+        tables["standard deviations along the camera's axes, about this answer alone"] = [
             ["", "x", "y", "z"],
             ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
             ["place of the model's origin [mm]", *(f"{v:.3f}" for v in origin_mm)],

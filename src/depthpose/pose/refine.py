@@ -50,7 +50,7 @@ class Refined:
         covariance: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from
             the curvature of the sum and the spread of the residuals, if the points were
             independent; what the surface does not fix (a turn of a ball) is far too uncertain to
-            be missed.
+            be missed. Local: of this minimum alone, whether it is the right one or not.
         residual_m: root mean square distance to the surface, of the points that count.
         inlier_share: share of the points within the last limit of the surface.
     """

@@ -205,7 +205,8 @@ class PoseFit:
         camera_from_model: the pose.
         covariance: of (rotation [rad], translation [m]), left perturbation in the camera frame:
             the true pose is ``R = exp(rotation) R_found``, ``t = exp(rotation) t_found +
-            translation``.
+            translation``. Local: it says how well the data fix the pose about this answer, and
+            nothing of other answers, such as a half-turn away, that explain the data as well.
         residual_m: root mean square distance of the keypoints that were used.
         misfit: squared distances in units of their covariance, over the degrees of freedom: about 1
             where the covariances of the keypoints are honest, far above where they break rigidity.
@@ -230,8 +231,9 @@ class PoseEstimate:
         reason: one sentence for people; empty where the status is ``ok``.
         camera_from_model: the pose; None where it is refused.
         keypoints_m: the found keypoints in the camera frame.
-        covariance: 6x6, order and frame as :class:`PoseFit` says. Finite: it leaves out the
-            motions of ``free_motions``.
+        covariance: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn
+            off may have one of 0.2 degrees; what speaks of such errors is ``risk``. Finite: it
+            leaves out the motions of ``free_motions``.
         free_motions: unit vectors of (rotation, translation) along which a declared continuous
             symmetry makes the variance infinite; no row where there is none.
         inlier_share: share of the votes that agree, 0..1.

@@ -20,7 +20,7 @@ from depthpose.pose.estimator import GeoPoseNet, Voted
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface
 from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
-from depthpose.pose.predictions import Prediction, write_predictions
+from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.web.answer import Answer, Shown, read_files
 from depthpose.web.form import Form, small_size
@@ -83,15 +83,15 @@ def _write(
     """Write ``poses.json``, the cloud with the posed model, and the picture that is shown."""
     pose = found.camera_from_model
     write_predictions(folder, [Prediction(estimate=found)])
-    write_cloud(folder / f"{given.name}.ply", posed_cloud(points_m, pose, model))
+    write_cloud(folder / f"{given.name}.{CLOUD}", posed_cloud(points_m, pose, model))
     if not isinstance(given, ViewInput):
         return []
     picture, caption = grey_depth(given.depth_m), "depth image, near bright"
     if pose is not None:
         picture = draw_pose(picture, pose, model, given.K.double())
         caption += ", with the posed model"
-    write_image(folder / f"{given.name}.png", picture)
-    return [Shown(file=f"{given.name}.png", caption=caption)]
+    write_image(folder / f"{given.name}.{PICTURE}", picture)
+    return [Shown(file=f"{given.name}.{PICTURE}", caption=caption)]
 
 
 def _target(form: Form, net: GeoPoseNet) -> _Target:

@@ -12,7 +12,7 @@ from depthpose.core.export.extra import import_export
 from depthpose.core.export.graph import OPSET, Graph
 from depthpose.core.export.proof import Case, Limit, Row, measure_differences, refuse_beyond
 from depthpose.core.files import atomic_write, write_json
-from depthpose.core.run import environment
+from depthpose.core.run import environment, refuse_to_replace
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,11 +39,14 @@ def freeze(path: Path, export: Export) -> list[Row]:
         The differences, a row for each input and output.
 
     Raises:
-        InputError: another suffix, a place that cannot be written, or answers that differ.
+        InputError: another suffix, a file that is there already, a place that cannot be written,
+            or answers that differ.
         MissingExtraError: the extra ``export`` is not installed.
     """
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
+    for file in (path, proof_path(path)):
+        refuse_to_replace(file)
     onnx = import_export()
     with atomic_write(path) as part:
         part.touch()  # a place that cannot be written is refused before the work

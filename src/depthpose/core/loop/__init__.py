@@ -2,7 +2,7 @@
 
 from depthpose.core.loop.card import card_text, held_out_text, leave_card
 from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam
-from depthpose.core.loop.journal import Journal, read_metrics
+from depthpose.core.loop.journal import Journal, read_metrics, run_files
 from depthpose.core.loop.loop import Interrupted, Progress, train
 from depthpose.core.loop.task import Evidence, Samples, Task, Turn, shuffled_index, ticket_generator
 
@@ -21,6 +21,7 @@ __all__ = [
     "leave_card",
     "make_adam",
     "read_metrics",
+    "run_files",
     "shuffled_index",
     "ticket_generator",
     "train",

@@ -19,13 +19,19 @@ from typing import Any
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refused_write
-from depthpose.core.loop.state import STATE, write_state
+from depthpose.core.loop.state import BEFORE, STATE, write_state
 from depthpose.core.loop.task import Evidence
 
 _METRICS = "metrics.jsonl"
 _PICTURES = "pictures"
 _MOST = 2**63
 """A whole number beyond is no count, and none that is shown."""
+
+
+def run_files(weights: str) -> list[str]:
+    """Name what a training leaves in its folder, with weights of this name."""
+    own = ["config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE]
+    return [*own, *(f"{weights}.{ending}" for ending in ("safetensors", "md", "json"))]
 
 
 class Journal:

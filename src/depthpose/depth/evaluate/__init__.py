@@ -5,7 +5,10 @@ two protocols do not compare; every row carries its protocol's name.
 """
 
 from depthpose.depth.evaluate.evaluate import Evaluation as Evaluation
+from depthpose.depth.evaluate.evaluate import Measured as Measured
 from depthpose.depth.evaluate.evaluate import evaluate as evaluate
+from depthpose.depth.evaluate.evaluate import measure_frame as measure_frame
+from depthpose.depth.evaluate.evaluate import summarise as summarise
 from depthpose.depth.evaluate.frames import FrameResult as FrameResult
 from depthpose.depth.evaluate.frames import clamped_depth as clamped_depth
 from depthpose.depth.evaluate.frames import frame_result as frame_result

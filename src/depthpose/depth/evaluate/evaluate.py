@@ -1,6 +1,6 @@
 """Each frame measured, and the means over frames."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -47,11 +47,23 @@ class Evaluation:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Measured:
-    """One frame's row of numbers, and its error by decile of confidence."""
+class Measured:
+    """One frame's row of numbers by one cap, and its error by decile of confidence."""
 
     row: dict[str, Any]
     deciles: Float[Tensor, "10"] | None
+
+    def to_values(self) -> dict[str, Any]:
+        """Give it as JSON values, exactly."""
+        deciles = None if self.deciles is None else self.deciles.tolist()
+        return {"row": self.row, "deciles": deciles}
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, Any]) -> "Measured":
+        """Read what :meth:`to_values` gave."""
+        deciles = values["deciles"]
+        made = None if deciles is None else torch.tensor(deciles, dtype=torch.float64)
+        return cls(row=values["row"], deciles=made)
 
 
 def evaluate(
@@ -73,15 +85,43 @@ def evaluate(
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
+    found = {
+        dataset.frames[index].name: measure_frame(dataset, index, predictions, protocol, caps_m)
+        for index in progress(range(len(dataset)))
+    }
+    return summarise(dataset, protocol, found)
+
+
+def measure_frame(
+    dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
+) -> list[Measured] | str:
+    """Measure one frame by each cap, or say why it does not count.
+
+    Raises:
+        InputError: an unknown protocol, or a missing or damaged prediction.
+    """
     rule = find_protocol(protocol)
-    measured: list[_Measured] = []
-    skipped: dict[str, str] = {}
-    for index in progress(range(len(dataset))):
-        prepared = prepare(dataset, index, predictions, rule)
-        if isinstance(prepared, str):
-            skipped[dataset.frames[index].name] = prepared
-            continue
-        measured += _measure(prepared, rule, caps_m)
+    prepared = prepare(dataset, index, predictions, rule)
+    return prepared if isinstance(prepared, str) else _measure(prepared, rule, caps_m)
+
+
+def summarise(
+    dataset: Dataset, protocol: str, found: Mapping[str, list[Measured] | str]
+) -> Evaluation:
+    """Make the rows of a table of its frames, the same ones wherever they were measured.
+
+    Args:
+        dataset: whose order of frames counts.
+        protocol: by which they were measured.
+        found: of each frame's name what :func:`measure_frame` gave.
+
+    Raises:
+        InputError: no frame has truth.
+    """
+    rule = find_protocol(protocol)
+    each = {frame.name: found[frame.name] for frame in dataset.frames}
+    skipped = {name: why for name, why in each.items() if isinstance(why, str)}
+    measured = [one for some in each.values() if not isinstance(some, str) for one in some]
     if not measured:
         raise InputError(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
@@ -98,13 +138,13 @@ def evaluate(
     )
 
 
-def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[_Measured]:
+def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[Measured]:
     if rule.truth == "disparity":
         return [_measure_disparity(prepared)]
     return [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
 
 
-def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> _Measured:
+def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured:
     compared = compare_depth(prepared, rule, cap_m)
     mask, row = _count(compared, {"frame": prepared.frame.name, "cap_m": cap_m})
     predicted_m, true_m = compared.predicted[mask], compared.truth[mask]
@@ -113,7 +153,7 @@ def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> _Measure
     return _score(row, relative, prepared.confidence, mask)
 
 
-def _measure_disparity(prepared: Prepared) -> _Measured:
+def _measure_disparity(prepared: Prepared) -> Measured:
     compared = compare_disparity(prepared)
     mask, row = _count(compared, {"frame": prepared.frame.name})
     predicted_px, true_px = compared.predicted[mask], compared.truth[mask]
@@ -140,12 +180,12 @@ def _score(
     error: Float[Tensor, " n"],
     confidence: Float[Tensor, "h w"] | None,
     mask: Bool[Tensor, "h w"],
-) -> _Measured:
+) -> Measured:
     """Add what the confidence is worth, where there is one."""
     if confidence is None:
-        return _Measured(row=row, deciles=None)
+        return Measured(row=row, deciles=None)
     score = asdict(score_confidence(error, confidence[mask]))
-    return _Measured(row=row | score, deciles=error_by_decile(error, confidence[mask]))
+    return Measured(row=row | score, deciles=error_by_decile(error, confidence[mask]))
 
 
 def _mean_rows(per_frame: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -161,7 +201,7 @@ def _mean_rows(per_frame: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _decile_rows(measured: list[_Measured], error_name: str) -> list[dict[str, Any]]:
+def _decile_rows(measured: list[Measured], error_name: str) -> list[dict[str, Any]]:
     """Ten rows a cap; each frame counts the same."""
     rows: list[dict[str, Any]] = []
     for cap in _caps([item.row for item in measured]):

@@ -56,12 +56,13 @@ def check_dataset(
 
 
 def _count(frames: list[Frame]) -> dict[str, int]:
-    parts = {"right views": "right", "calibrations": "calibration", "LiDAR scans": "velodyne",
-             "depth maps": "depth", "disparity maps": "disparity"}  # fmt: skip
+    parts = {"right views": ("right",), "calibrations": ("calibration",),
+             "LiDAR scans": ("velodyne", "scan"), "depth maps": ("depth",),
+             "disparity maps": ("disparity",)}  # fmt: skip
     counts = {"frames": len(frames)}
     return counts | {
-        what: sum(getattr(frame, part) is not None for frame in frames)
-        for what, part in parts.items()
+        what: sum(any(getattr(frame, part) for part in names) for frame in frames)
+        for what, names in parts.items()
     }
 
 
@@ -109,9 +110,9 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     yield from _check_calibration(frame)
     if frame.velodyne is not None:
         yield from _check_scan(frame.velodyne)
-    for path in (frame.depth, frame.disparity, frame.disparity_noc):
+    for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
-            yield from _check_truth(path, size, is_depth=path == frame.depth)
+            yield from _check_truth(path, size, is_depth=path in (frame.scan, frame.depth))
 
 
 def _look_at_image(

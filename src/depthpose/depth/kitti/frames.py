@@ -42,6 +42,8 @@ class Frame:
         calibration: file, or for ``raw`` the folder of the date.
         style: how the calibration is written.
         velodyne: one LiDAR scan, float32 x, y, z, reflectance.
+        scan: a LiDAR scan that was drawn into the left image already, 16-bit camera z, metres x
+            256 (``velodyne_raw`` of KITTI's depth-prediction set).
         depth: 16-bit depth of the left image, metres x 256.
         disparity: disparity of the left image, 16-bit PNG (x 256) or PFM, hidden pixels too.
         disparity_noc: that of the pixels alone that both views see.
@@ -54,6 +56,7 @@ class Frame:
     calibration: Path | None = None
     style: CalibrationStyle = "plain"
     velodyne: Path | None = None
+    scan: Path | None = None
     depth: Path | None = None
     disparity: Path | None = None
     disparity_noc: Path | None = None
@@ -131,7 +134,7 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
     """Say which kinds of truth a frame has."""
-    is_annotated = frame.depth is not None and not _has_drawn_scan(frame)
+    is_annotated = frame.depth is not None and not _is_plain(frame)
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
         "annotated": is_annotated,
@@ -142,21 +145,22 @@ def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
 
 def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
     """Whether :func:`lidar_truth` has something to draw."""
-    return frame.velodyne is not None or (depth == "camera_z" and _has_drawn_scan(frame))
+    return frame.velodyne is not None or (depth == "camera_z" and _drawn_scan(frame) is not None)
 
 
 def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
 
-    A plain folder holds no scan but a drawn one (``lidar_depth/``, camera z), which serves
-    ``camera_z`` as it is.
+    Where there is no scan but a drawn one (``lidar_depth/`` of a plain folder, ``velodyne_raw`` of
+    KITTI's depth-prediction set; camera z), it serves ``camera_z`` as it is.
 
     Raises:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
-    if frame.velodyne is None and frame.depth is not None and has_lidar(frame, depth):
-        depth_m = read_depth_png(frame.depth)
-        _check_size(frame.depth, depth_m, image_size(frame.left))
+    drawn = _drawn_scan(frame)
+    if frame.velodyne is None and drawn is not None and depth == "camera_z":
+        depth_m = read_depth_png(drawn)
+        _check_size(drawn, depth_m, image_size(frame.left))
         return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
@@ -171,8 +175,13 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
 
 
-def _has_drawn_scan(frame: Frame) -> bool:
-    return frame.style in ("plain", "camera") and frame.depth is not None
+def _drawn_scan(frame: Frame) -> Path | None:
+    return frame.depth if frame.scan is None and _is_plain(frame) else frame.scan
+
+
+def _is_plain(frame: Frame) -> bool:
+    """Whether the depth of a frame is a LiDAR scan, as that of plain folders of pairs is."""
+    return frame.style in ("plain", "camera")
 
 
 def _check_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:

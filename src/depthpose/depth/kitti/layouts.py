@@ -42,11 +42,12 @@ def _recognise(folder: Path) -> tuple[str, list[Frame]] | None:
 
 
 def _raw(folder: Path) -> Iterable[Frame]:
-    """KITTI raw: a root of dates, a date or a drive; annotated depth inside or beside."""
+    """KITTI raw: a root of dates, a date or a drive; its depth-prediction set inside or beside."""
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date = drive.parent
-        annotated = _annotated_folder(drive)
+        annotated = _depth_folder(drive, "groundtruth", "data_depth_annotated")
+        scans = _depth_folder(drive, "velodyne_raw", "data_depth_velodyne")
         for left in _images(drive / "image_02/data"):
             yield Frame(
                 name=f"{drive.name}_{left.stem}",
@@ -55,6 +56,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
                 calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
                 style="raw",
                 velodyne=_existing(drive / "velodyne_points/data" / f"{left.stem}.bin"),
+                scan=_existing(scans / f"{left.stem}.png"),
                 depth=_existing(annotated / f"{left.stem}.png"),
                 disparity=_existing(drive / "disp_occ" / f"{left.stem}.png"),
                 disparity_noc=_existing(drive / "disp_noc" / f"{left.stem}.png"),
@@ -62,11 +64,15 @@ def _raw(folder: Path) -> Iterable[Frame]:
             )
 
 
-def _annotated_folder(drive: Path) -> Path:
-    """Find the maps of a drive, wherever in the tree the dataset was opened."""
-    inside = "proj_depth/groundtruth/image_02"
+def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
+    """Find maps of a drive's left camera, wherever in the tree the dataset was opened.
+
+    KITTI's depth-prediction set holds them as ``train|val/DRIVE/proj_depth/KIND/image_02``, its
+    downloads each in a folder of the archive's name.
+    """
+    inside = f"proj_depth/{kind}/image_02"
     homes = (drive.parent, drive.parent.parent)
-    roots = [root for home in homes for root in (home, home / "data_depth_annotated")]
+    roots = [root for home in homes for root in (home, home / archive)]
     homes = [drive, *(root / part / drive.name for root in roots for part in ("train", "val"))]
     return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
 

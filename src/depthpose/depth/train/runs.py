@@ -10,7 +10,15 @@ import torch
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig, Progress, Task, held_out_text, leave_card, train
+from depthpose.core.loop import (
+    LoopConfig,
+    Progress,
+    Task,
+    held_out_text,
+    leave_card,
+    run_files,
+    train,
+)
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
@@ -79,6 +87,12 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
+    if config.with_fixed_start and config.encoder is None and config.start is None:
+        raise InputError(
+            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
+            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
+            "--start, or with_fixed_start: false with encoder_rate: 1.0."
+        )
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
@@ -165,7 +179,8 @@ def _walk(
         settings["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
-    claim_folder(run.folder, settings)
+    names = ("generator", "matcher", "fakestereo")
+    claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
     seconds = train(task, pairs, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
     return facts, seconds

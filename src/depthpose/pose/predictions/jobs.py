@@ -11,6 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.run import claim_folder
 from depthpose.pose.bop import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.predictions.records import (
+    POSES,
     Place,
     Prediction,
     is_finished,
@@ -63,7 +64,7 @@ def predict(
         settings: what decides the results.
         batch: how many inputs are handed over at once. Each then takes an equal share of the time.
     """
-    claim_folder(folder, settings)
+    claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
     done = {p.estimate.name: p for p in read_predictions(folder)} if is_started(folder) else {}
     finished = {name for name, prediction in done.items() if is_finished(prediction)}

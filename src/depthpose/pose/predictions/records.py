@@ -17,6 +17,8 @@ from depthpose.pose.bop.parse import integer, number, read_rows
 from depthpose.pose.types import PoseEstimate, Status
 
 POSES = "poses.json"
+PICTURE, CLOUD = "pose.png", "pose.ply"
+"""What follows ``NAME.`` in the names of the files that show a pose."""
 STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
@@ -66,7 +68,7 @@ def write_predictions(folder: Path, predictions: Iterable[Prediction]) -> None:
     Raises:
         InputError: the disk refuses.
     """
-    write_json(folder / POSES, [_row(prediction) for prediction in predictions])
+    write_json(folder / POSES, [prediction_row(prediction) for prediction in predictions])
 
 
 def read_predictions(folder: Path) -> list[Prediction]:
@@ -76,7 +78,7 @@ def read_predictions(folder: Path) -> list[Prediction]:
         InputError: the file is missing or damaged, or two estimates have one name.
     """
     path = folder / POSES
-    found = [_prediction(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+    found = [parse_prediction(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
     names: set[str] = set()
     for prediction in found:
         name = prediction.estimate.name
@@ -96,7 +98,8 @@ def score_of(estimate: PoseEstimate) -> float:
     return 1.0 if estimate.inlier_share is None else estimate.inlier_share
 
 
-def _row(prediction: Prediction) -> dict[str, Any]:
+def prediction_row(prediction: Prediction) -> dict[str, Any]:
+    """Give the JSON values of an entry of ``poses.json``."""
     estimate, place = prediction.estimate, prediction.place
     pose = estimate.camera_from_model
     row: dict[str, Any] = {"name": estimate.name, "object": estimate.object}
@@ -118,7 +121,16 @@ def _matrix(pose: Rigid) -> list[list[float]]:
     return [*top, [0.0, 0.0, 0.0, 1.0]]
 
 
-def _prediction(row: dict[str, Any], source: str) -> Prediction:
+def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
+    """Read what :func:`prediction_row` gave.
+
+    Args:
+        row: the values.
+        source: where they stand, for errors.
+
+    Raises:
+        InputError: a value is missing or impossible.
+    """
     name, what = row.get("name"), row.get("object")
     if not isinstance(name, str) or not isinstance(what, str):
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")

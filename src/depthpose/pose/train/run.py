@@ -8,7 +8,7 @@ from typing import Any
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
-from depthpose.core.loop import Progress
+from depthpose.core.loop import Progress, run_files
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.train.config import FramesConfig
@@ -56,7 +56,8 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     if config.start is not None:
         settings["start_sha256"] = file_sha256(find_weights(config.start))
         say_terms(bound_facts({}, [config.start]))
-    claim_folder(run.folder, settings)
+    names = ("pose", "pointnet", "depth-image", "segmentation")
+    claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
 
 

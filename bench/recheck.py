@@ -1,0 +1,289 @@
+"""Run the quick tables of docs/results.md again, and name every number that has moved.
+
+    DEPTHPOSE_DATA=SAMPLES python bench/recheck.py [--only NAME ...] [--out out/bench/recheck]
+
+A quick table takes minutes on one core and needs no weights but those that ship, and the published
+PSMNet of the samples. Numbers of time, of memory and of rounding errors are those of one machine
+and are left out; so are rows whose weights do not ship. A number has moved where it differs from
+the print by more than half of the last digit and a five-hundredth of itself, which is what another
+processor may do. The exit code is 1 where one has moved.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs/results.md"
+_PSMNET = (
+    "depthpose weights import psmnet SAMPLES/reference/psmnet/published_kitti2015.tar "
+    "--align-corners true --out OUT/psmnet.safetensors"
+)
+_EVALUATE = "depthpose depth evaluate --data SAMPLES/depth"
+_PAIRS = "SAMPLES/depth/street_pairs"
+_TRAIN = (
+    f"--train {_PAIRS}/kitti2015_train_drives {_PAIRS}/kitti_object_more --train-without "
+    "train_000007 train_000008 train_000009 train_000010 train_000013"
+)
+_DEPTH = {"AbsRel": "abs_rel", "SqRel": "sq_rel", "RMSE": "rmse", "RMSElog": "rmse_log"}
+_DELTAS = {"d1": "d1", "d2": "d2", "d3": "d3"}
+_SGBM = {"SGBM, holes filled": {"method": "sgbm (holes filled)"}}
+_FLOORS = {
+    "best constant depth of each row": {"method": "floor: rows"},
+    "nearest training image's depth": {"method": "floor: nearest"},
+}
+_STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of results.md, and what makes it again.
+
+    Attributes:
+        name: for ``--only``.
+        after: a part of results.md; the first table below it is meant.
+        commands: run in order; SAMPLES and OUT stand for folders.
+        files: JSON rows that they leave, under OUT.
+        numbers: columns that are compared, by name in results.md and in the rows.
+        key: columns that say which row it is, beside the first.
+        rows: what the first column means in the rows; rows that it does not name are not compared.
+            None: it is a column of the rows itself, named in ``key``.
+        tolerance: share of a number by which another processor may change it.
+    """
+
+    name: str
+    after: str
+    commands: tuple[str, ...]
+    files: tuple[str, ...]
+    numbers: Mapping[str, str]
+    key: Mapping[str, str] = field(default_factory=dict)
+    rows: Mapping[str, Mapping[str, str]] | None = None
+    tolerance: float = 0.002
+
+
+def _stereo(name: str, after: str, data: str, protocols: Sequence[str], **more: Any) -> Table:  # noqa: ANN401
+    runs = [
+        f"{_EVALUATE}/{data} --protocol {protocol} --matcher sgbm "
+        f"--weights OUT/psmnet.safetensors --out OUT/{name}/{protocol}"
+        for protocol in protocols
+    ]
+    files = tuple(f"{name}/{protocol}/rows.json" for protocol in protocols)
+    numbers = {**_DEPTH, **more.pop("numbers", {**_DELTAS, "AUSE": "ause"})}
+    return Table(name=name, after=after, commands=(_PSMNET, *runs), files=files, numbers=numbers,
+                 rows=_STEREO, **more)  # fmt: skip
+
+
+TABLES = (
+    _stereo("object-x", "## Real stereo, three frames of KITTI object", "kitti_object",
+            ["eigen-raw"], key={"cap": "cap_m"}),
+    _stereo("object-z", "The same by `eigen-raw-camera`", "kitti_object", ["eigen-raw-camera"],
+            key={"cap": "cap_m"}),
+    _stereo("raw", "The raw layout, frames 0 and 1", "kitti_raw",
+            ["eigen-raw", "eigen-raw-camera"], numbers={"d1": "d1"},
+            key={"cap": "cap_m", "protocol": "protocol"}),
+    Table(
+        name="mono",
+        after="25 real pairs of six Eigen test drives",
+        commands=(
+            f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
+            "--protocol eigen-raw-camera --matcher sgbm --floor rows nearest "
+            f"{_TRAIN} "
+            "--weights default both:default kitti-nc both:kitti-nc sgbm:kitti-nc --out OUT/mono",
+        ),
+        files=("mono/rows.json",),
+        numbers={**_DEPTH, **_DELTAS},
+        key={"cap": "cap_m"},
+        rows={
+            **_FLOORS,
+            "mono, fine-tuned (default)": {"weights": "default", "sees": "left view"},
+            "mono, fine-tuned (kitti-nc)": {"weights": "kitti-nc", "sees": "left view",
+                                            "method": "fakestereo"},
+            "kitti-nc's drawn view, matched by SGBM": {
+                "weights": "kitti-nc", "method": "fakestereo with sgbm (holes filled)"},
+            "real stereo, our matcher (default)": {"weights": "default", "sees": "both views"},
+            "real stereo, our matcher (kitti-nc)": {"weights": "kitti-nc", "sees": "both views"},
+            "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
+        },
+    ),
+    Table(
+        name="mono-0052",
+        after="Eight more frames, of one other Eigen test drive",
+        commands=(
+            f"{_EVALUATE}/kitti_raw/2011_09_26/2011_09_26_drive_0052_sync "
+            f"--protocol eigen-raw-camera --floor rows nearest {_TRAIN} --weights default kitti-nc "
+            "--out OUT/mono-0052",
+        ),
+        files=("mono-0052/rows.json",),
+        numbers={**_DEPTH, **_DELTAS},
+        key={"cap": "cap_m"},
+        rows={
+            **_FLOORS,
+            "mono, default": {"weights": "default"},
+            "mono, kitti-nc": {"weights": "kitti-nc"},
+        },
+    ),
+    Table(
+        name="disparity",
+        after="The same pairs by `--protocol kitti-2015`",
+        commands=(
+            f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
+            "--weights default both:default kitti-nc both:kitti-nc --matcher sgbm "
+            "--out OUT/disparity",
+        ),
+        files=("disparity/rows.json",),
+        numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
+        rows={
+            "mono, default": {"weights": "default", "sees": "left view"},
+            "mono, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
+            "both views, default": {"weights": "default", "sees": "both views"},
+            "both views, kitti-nc": {"weights": "kitti-nc", "sees": "both views"},
+            **_SGBM,
+        },
+    ),
+    Table(
+        name="votes",
+        after="### Voting",
+        commands=("python bench/voting_speed.py --points 500 2000 5000",),
+        files=("out/bench/voting_speed.json",),
+        numbers={"error, mm": "error_mm"},
+        key={"points": "points", "method": "method", "hypotheses": "hypotheses"},
+        tolerance=0.01,
+    ),
+    Table(
+        name="demo-depth",
+        after="## Demo",
+        commands=("depthpose demo --out OUT/demo",),
+        files=("demo/depths.json",),
+        numbers={"EPE [px]": "epe_px", "D1": "d1_all", "AbsRel": "abs_rel", "RMSE": "rmse",
+                 "d1": "d1"},
+        key={"scene": "scene", "method": "method"},
+    ),
+    Table(
+        name="demo-poses",
+        after="Over every pixel nearer than 80 m",
+        commands=("depthpose demo --out OUT/demo",),
+        files=("demo/poses.json",),
+        numbers={"visible": "visible_fraction", "error [mm]": "error_mm",
+                 "of the diameter": "of_diameter"},
+        key={"part": "object", "metric": "metric"},
+        tolerance=0.1,
+    ),
+)  # fmt: skip
+"""Every quick table."""
+
+
+def main() -> int:
+    """Run, compare, and print what has moved."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=[table.name for table in TABLES], default=())
+    parser.add_argument("--out", type=Path, default=Path("out/bench/recheck"))
+    arguments = parser.parse_args()
+    samples = os.environ.get("DEPTHPOSE_DATA", "")
+    text = RESULTS.read_text()
+    moved = 0
+    for table in TABLES:
+        if arguments.only and table.name not in arguments.only:
+            continue
+        if not samples and any("SAMPLES" in command for command in table.commands):
+            print(f"{table.name}: skipped, for $DEPTHPOSE_DATA names no samples", flush=True)
+            continue
+        rows = run(table, arguments.out.resolve(), samples)
+        differences, compared, left_out = compare(table, printed_rows(text, table.after), rows)
+        moved += len(differences)
+        print(f"{table.name}: {compared} numbers, {len(differences)} moved", flush=True)
+        print("".join(f"  {line}\n" for line in differences), end="")
+        print("".join(f"  not compared: {name}\n" for name in left_out), end="", flush=True)
+    return 1 if moved else 0
+
+
+def run(table: Table, out: Path, samples: str) -> list[dict[str, Any]]:
+    """Run the commands of a table in OUT, and give the rows that they leave."""
+    out.mkdir(parents=True, exist_ok=True)
+    for command in table.commands:
+        _execute(command.replace("SAMPLES", samples).replace("OUT", str(out)), out)
+    return [row for name in table.files for row in json.loads((out / name).read_text())]
+
+
+@cache
+def _execute(command: str, out: Path) -> None:
+    """Run a command, once for all tables that need it."""
+    program, *words = command.split()
+    start = ["-m", program] if program == "depthpose" else [str(ROOT / words.pop(0))]
+    subprocess.run([sys.executable, *start, *words], cwd=out, check=True, stdout=subprocess.DEVNULL)
+
+
+def printed_rows(text: str, after: str) -> list[dict[str, str]]:
+    """Read the first Markdown table below a part of a text: cells by column, without marks."""
+    assert text.count(after) == 1, f"{after!r} stands {text.count(after)} times in results.md"
+    lines = text[text.index(after) :].splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("|"))
+    last = next((k for k in range(first, len(lines)) if not lines[k].startswith("|")), len(lines))
+    cells = [[re.sub(r"[`*]", "", c).strip() for c in line.strip("| ").split("|")]
+             for line in lines[first:last]]  # fmt: skip
+    names, _, *rows = [line + [""] * (len(cells[0]) - len(line)) for line in cells]
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def compare(
+    table: Table, printed: Sequence[Mapping[str, str]], rows: Sequence[Mapping[str, Any]]
+) -> tuple[list[str], int, list[str]]:
+    """Give what has moved in words, how many numbers were compared, and rows that were not."""
+    moved: list[str] = []
+    left_out: list[str] = []
+    compared = 0
+    for line in printed:
+        name = " ".join([next(iter(line.values())), *(line[c] for c in table.key)])
+        wanted = _wanted(table, line)
+        if not wanted:
+            left_out.append(name)
+            continue
+        found = [row for row in rows if all(_same(row[k], v) for k, v in wanted.items())]
+        if len(found) != 1:
+            moved.append(f"{name}: {len(found)} rows are {wanted}")
+            continue
+        for column, place in table.numbers.items():
+            if line[column]:
+                compared += 1
+                if has_moved(line[column], found[0][place], table.tolerance):
+                    moved.append(f"{name}: {column} is {found[0][place]}, printed {line[column]}")
+    return moved, compared, left_out
+
+
+def has_moved(printed: str, now: float | None, tolerance: float) -> bool:
+    """Whether a number is not what is printed, ``0.472`` or ``68.8 %``.
+
+    Beyond half of the last printed digit it may be off by ``tolerance`` of itself.
+    """
+    number = re.match(r"-?\d*(?:\.(\d+))?", printed)
+    assert number is not None
+    if now is None:
+        return True
+    scale = 100 if printed.endswith("%") else 1
+    half_digit = 0.5 * 10 ** -len(number[1] or "")
+    return abs(scale * now - float(number[0])) > half_digit + tolerance * abs(scale * now)
+
+
+def _wanted(table: Table, line: Mapping[str, str]) -> dict[str, str]:
+    """Say which row a printed line is; nothing where it is none of ours."""
+    by_column = {place: line[column] for column, place in table.key.items()}
+    if table.rows is None:
+        return by_column
+    first = table.rows.get(next(iter(line.values())))
+    return {} if first is None else {**first, **by_column}
+
+
+def _same(value: object, printed: str) -> bool:
+    text = f"{value:g}" if isinstance(value, float | int) else str(value or "")
+    return text == printed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

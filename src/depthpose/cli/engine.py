@@ -1,0 +1,143 @@
+"""Options and summaries of commands that can run on a cluster."""
+
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:  # --help imports this module and must answer at once
+    from depthpose.core.engine import Done, Files, Item, Job, RayEngine
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """Where the work is done."""
+
+    engine: Literal["here", "ray"] = "here"
+    """here: in this process, a file for each result. ray: by workers of a Ray cluster (an extra),
+    many results to a shard, OUT/shards/*.tar or *.parquet, listed in OUT/manifest.csv; inputs and
+    OUT may be URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest
+    (*.parquet, *.csv)."""
+    address: str | None = None
+    """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
+    workers: int | None = None
+    """at most; by default as many as the cluster has room for."""
+    worker_cpus: float = 1.0
+    """cores that each worker asks for."""
+    worker_gpus: float = 0.0
+    """GPUs that each worker asks for (with --device cuda); 0.5 lets two share one."""
+    block: int = 64
+    """inputs to a shard: what the death of a worker costs at most."""
+    shards: Literal["tar", "parquet"] = "tar"
+    """format of the results."""
+
+    @property
+    def is_ray(self) -> bool:
+        """Whether a cluster does the work; other options mean nothing without."""
+        if self.engine == "here" and self != EngineOptions():
+            raise InputError(
+                "--address, --workers, --worker-cpus, --worker-gpus, --block and --shards are for "
+                "--engine ray; add it, or leave them away"
+            )
+        return self.engine == "ray"
+
+    def build(self) -> "RayEngine":
+        """Make the engine of these options.
+
+        Raises:
+            InputError: an option is out of its range.
+        """
+        from depthpose.core.engine import RayEngine
+
+        if (self.workers or 1) < 1 or self.block < 1 or min(self.worker_cpus, self.worker_gpus) < 0:
+            raise InputError(
+                f"--workers {self.workers}, --block {self.block}, --worker-cpus {self.worker_cpus} "
+                f"and --worker-gpus {self.worker_gpus}: take at least 1, 1, 0 and 0"
+            )
+        if not self.worker_cpus + self.worker_gpus:
+            raise InputError("a worker asks for no core and no GPU; give --worker-cpus 1")
+        return RayEngine(
+            address=self.address,
+            workers=self.workers,
+            worker_cpus=self.worker_cpus,
+            worker_gpus=self.worker_gpus,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What there is to do, found by the words of a command."""
+
+    items: "Sequence[Item]"
+    tars: Sequence[str]
+    files: "Files"
+
+    @classmethod
+    def find(cls, words: Sequence[str], files: "Files") -> "Inputs":
+        """List files, manifests and tar shards.
+
+        Raises:
+            InputError: nothing is there, sides that cannot be paired, or names that clash.
+        """
+        from depthpose.core.engine import find_items, find_tars, is_tar
+
+        tars = [word for word in words if is_tar(word)]
+        others = [word for word in words if not is_tar(word)]
+        items = find_items(others, files) if others else []
+        return cls(items=items, tars=find_tars(tars), files=files)
+
+    @contextmanager
+    def first(self) -> Iterator[Sequence[Path]]:
+        """Give the files of the first input, to look at before any work."""
+        from depthpose.core.engine import first_sample
+
+        with first_sample(self.items, self.tars, self.files) as sample:
+            yield sample.files
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """A weights file that travels to the workers; none where a method needs none."""
+
+    name: str = ""
+    data: bytes = field(default=b"", repr=False)
+
+    @classmethod
+    def read(cls, word: str) -> "Weights":
+        """Read what a path or name means here."""
+        from depthpose.core.checkpoint import find_weights
+
+        path = find_weights(word)
+        return cls(name=path.name, data=path.read_bytes())
+
+    @contextmanager
+    def unpacked(self) -> Iterator[str]:
+        """Give it as a file for as long as the block runs."""
+        with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
+            path = Path(folder) / self.name
+            path.write_bytes(self.data)
+            yield str(path)
+
+
+def run(job: "Job", options: EngineOptions, what: str) -> int:
+    """Do a job, name what failed, and give the exit code."""
+    from depthpose.core.engine import run_job
+
+    return say(run_job(job, options.build()), job.out, what)
+
+
+def say(every: "Sequence[Done]", out: str, what: str) -> int:
+    """Name what failed, say how much is done, and give the exit code."""
+    failures = [failure for done in every for failure in done.failures]
+    for name, reason in failures[:20]:
+        print(f"depthpose: failed: {name}: {reason}", file=sys.stderr)
+    if len(failures) > 20:
+        print(f"depthpose: {len(failures)} failed; all are in manifest.csv", file=sys.stderr)
+    total = sum(len(done.entries) for done in every)
+    print(f"{total - len(failures)} of {total} {what} are in {len(every)} shards of {out}")
+    return 1 if failures else 0

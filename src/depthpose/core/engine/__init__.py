@@ -1,0 +1,29 @@
+"""Big jobs: inputs divided into blocks, done by many workers, each block one shard of results.
+
+The engine knows files and names; what a worker does with them is a function that it is given.
+"""
+
+from depthpose.core.engine.items import Files as Files
+from depthpose.core.engine.items import Item as Item
+from depthpose.core.engine.items import find_items as find_items
+from depthpose.core.engine.items import find_tars as find_tars
+from depthpose.core.engine.items import is_tar as is_tar
+from depthpose.core.engine.items import stem as stem
+from depthpose.core.engine.job import Job as Job
+from depthpose.core.engine.job import is_job as is_job
+from depthpose.core.engine.job import read_job_settings as read_job_settings
+from depthpose.core.engine.job import read_results as read_results
+from depthpose.core.engine.job import result_items as result_items
+from depthpose.core.engine.job import run_job as run_job
+from depthpose.core.engine.job import shard_results as shard_results
+from depthpose.core.engine.on_ray import RayEngine as RayEngine
+from depthpose.core.engine.shard import ShardFormat as ShardFormat
+from depthpose.core.engine.shard import read_shard as read_shard
+from depthpose.core.engine.store import absolute as absolute
+from depthpose.core.engine.store import is_url as is_url
+from depthpose.core.engine.store import local_copy as local_copy
+from depthpose.core.engine.work import Done as Done
+from depthpose.core.engine.work import Function as Function
+from depthpose.core.engine.work import Sample as Sample
+from depthpose.core.engine.work import first_sample as first_sample
+from depthpose.core.engine.work import run_here as run_here

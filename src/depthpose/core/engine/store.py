@@ -1,0 +1,227 @@
+"""Files on a local disk or in an object store, by path or fsspec URL, published whole."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from fsspec.core import url_to_fs
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import atomic_write, read_bytes
+
+_DISK = "file"
+_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
+"""Stores in which an upload appears whole or not at all."""
+
+
+def is_url(path: str) -> bool:
+    """Whether a path names its file system: ``s3://bucket/key``."""
+    return "://" in path
+
+
+def local_path(url: str) -> Path | None:
+    """Give the local path behind a path or ``file://`` URL; None in an object store."""
+    if not is_url(url):
+        return Path(url)
+    protocol, _, rest = url.partition("://")
+    return Path(rest) if protocol in (_DISK, "local") else None
+
+
+def join(folder: str, *names: str) -> str:
+    """Name what lies in a folder."""
+    return "/".join([folder.rstrip("/"), *names])
+
+
+def absolute(path: str) -> str:
+    """Give a path that means the same in every process; URLs do already."""
+    found = local_path(path)
+    return path if found is None else str(found.absolute())
+
+
+def read_from(url: str) -> bytes:
+    """Read a file whole.
+
+    Raises:
+        InputError: it is not there, or cannot be read.
+    """
+    path = local_path(url)
+    if path is not None:
+        return read_bytes(path)
+    with _refused(url, "read"):
+        fs, inner = url_to_fs(url)
+        return fs.cat_file(inner)
+
+
+def exists(url: str) -> bool:
+    """Whether there is a file.
+
+    Raises:
+        InputError: the store does not answer.
+    """
+    path = local_path(url)
+    if path is not None:
+        return path.is_file()
+    with _refused(url, "looked for"):
+        fs, inner = url_to_fs(url)
+        fs.invalidate_cache()
+        return bool(fs.isfile(inner))
+
+
+def read_all(folder: str, suffix: str) -> dict[str, bytes]:
+    """Read the files of a folder, not below it, whose names end so; none where there is no folder.
+
+    Raises:
+        InputError: the store does not answer.
+    """
+    path = local_path(folder)
+    if path is not None:
+        return {p.name: read_bytes(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
+    with _refused(folder, "listed"):
+        fs, inner = url_to_fs(folder)
+        fs.invalidate_cache()
+        found = [p for p in _entries(fs, inner) if p.endswith(suffix)]
+        contents = fs.cat(found) if found else {}
+        return {PurePosixPath(p).name: contents[p] for p in sorted(contents)}
+
+
+def publish(file: Path, url: str) -> None:
+    """Put a finished local file under its final name, whole or not at all.
+
+    On a disk it is copied beside the place and renamed; an object store shows an upload only when
+    it is complete.
+
+    Raises:
+        InputError: the place cannot be written to, or its kind of store may show half a file.
+    """
+    path = local_path(url)
+    if path is not None:
+        with atomic_write(path) as part:
+            shutil.copyfile(file, part)
+        return
+    refuse_unsafe(url)
+    with _refused(url, "written"):
+        fs, inner = url_to_fs(url)
+        fs.put_file(str(file), inner)
+
+
+def publish_bytes(data: bytes, url: str) -> None:
+    """Put bytes under a name, whole or not at all; see :func:`publish`."""
+    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+        file = Path(scratch) / "part"
+        file.write_bytes(data)
+        publish(file, url)
+
+
+def refuse_unsafe(url: str) -> None:
+    """Refuse a place for results where a killed upload may leave half a file.
+
+    Raises:
+        InputError: neither a disk nor a known object store.
+    """
+    protocol = url.partition("://")[0]
+    if local_path(url) is None and protocol not in _STORES:
+        raise InputError(
+            f"{url}: {protocol}:// may show half a file when an upload is cut off; write results "
+            f"to a local path, or to one of {', '.join(f'{name}://' for name in _STORES)}"
+        )
+
+
+@contextmanager
+def local_copy(url: str, scratch: Path) -> Iterator[Path]:
+    """Give a file as a local path: itself on a disk, else a copy for as long as the block runs.
+
+    Errors inside the block name the URL, not the copy.
+
+    Raises:
+        InputError: it is not there, or cannot be read.
+    """
+    path = local_path(url)
+    if path is not None:
+        yield path
+        return
+    copy = Path(tempfile.mkdtemp(dir=scratch)) / PurePosixPath(url).name
+    with _refused(url, "read"):
+        fs, inner = url_to_fs(url)
+        fs.get_file(inner, str(copy))
+    try:
+        yield copy
+    except InputError as error:
+        raise InputError(str(error).replace(str(copy), url)) from error
+    finally:
+        shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+@contextmanager
+def opened(url: str) -> Iterator[Any]:
+    """Open a file for reading from its beginning to its end.
+
+    Raises:
+        InputError: it is not there.
+    """
+    with _refused(url, "read"):
+        fs, inner = url_to_fs(url)
+        file = fs.open(inner, "rb")
+    with file:
+        yield file
+
+
+def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
+    """List files by their suffixes: a file itself, those of a folder, or those of a pattern.
+
+    Args:
+        path: a path or URL of a file, a folder, or a pattern with ``*``, ``?`` or ``**``.
+        suffixes: in lower case, with the dot.
+
+    Returns:
+        Paths or URLs in the order of their names; hidden files are left out.
+
+    Raises:
+        InputError: nothing was found.
+    """
+    with _refused(path, "listed"):
+        fs, inner = url_to_fs(path)
+        fs.invalidate_cache()
+        if any(mark in inner for mark in "*?["):
+            found = fs.glob(inner)
+        else:
+            found = [inner] if fs.isfile(inner) else _entries(fs, inner)
+    kept = sorted(p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p))
+    if not kept:
+        raise InputError(
+            f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"
+        )
+    prefix = f"{path.partition('://')[0]}://" if is_url(path) else ""
+    return [f"{prefix}{p}" for p in kept]
+
+
+def _entries(fs: Any, folder: str) -> list[str]:  # noqa: ANN401  fsspec carries no types
+    try:
+        entries = fs.ls(folder, detail=True)
+    except FileNotFoundError:
+        return []
+    return [entry["name"] for entry in entries if entry["type"] == "file"]
+
+
+def _shown(path: str) -> bool:
+    return not PurePosixPath(path).name.startswith(".")
+
+
+@contextmanager
+def _refused(url: str, done: str) -> Iterator[None]:
+    """Turn what a file system raises into an :class:`InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"{url}: no such file; check the path") from error
+    except ImportError as error:
+        raise InputError(f"{url}: its file system is not installed: {error}") from error
+    except Exception as error:  # each file system raises errors of its own
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(
+            f"{url}: cannot be {done} ({said}); check the address and the credentials"
+        ) from error

@@ -1,0 +1,257 @@
+"""One block of inputs to one shard of results, whole or not at all."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path, PurePosixPath
+from typing import Protocol, runtime_checkable
+
+from depthpose.core.engine.items import Files, Item, refuse_name
+from depthpose.core.engine.plan import Block
+from depthpose.core.engine.shard import ShardFormat, read_tar, shard_writer
+from depthpose.core.engine.store import exists, join, local_copy, publish, publish_bytes, read_from
+from depthpose.core.errors import InputError
+
+SHARDS = "shards"
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One input, its files at hand.
+
+    Attributes:
+        name: that of its results.
+        files: local paths, in the order of the roles.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+
+
+Function = Callable[[Sequence[Sample], Path], Sequence[str]]
+"""Writes ``NAME.ENDING`` for each sample into a folder; gives for each "" or why it failed."""
+
+
+@runtime_checkable
+class Work(Protocol):
+    """What a job does; it is sent to every worker, which starts it once."""
+
+    @property
+    def files(self) -> Files:
+        """What an input is made of."""
+        ...
+
+    @property
+    def endings(self) -> Sequence[str]:
+        """Of the files of a result."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """Samples that are handed over at once."""
+        ...
+
+    def start(self) -> Function:
+        """Load what all samples need, such as a network."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Done:
+    """What became of a block.
+
+    Attributes:
+        shard: name of the shard, with its suffix.
+        entries: name and "" or the reason of its failure, for each input.
+        endings: that the files of a result may have.
+    """
+
+    shard: str
+    entries: tuple[tuple[str, str], ...]
+    endings: tuple[str, ...] = ()
+
+    @property
+    def failures(self) -> list[tuple[str, str]]:
+        """Inputs without a result."""
+        return [entry for entry in self.entries if entry[1]]
+
+    def to_json(self) -> str:
+        """Write it as one line."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> "Done":
+        """Read what :meth:`to_json` wrote."""
+        row = json.loads(text)
+        entries = tuple((name, reason) for name, reason in row["entries"])
+        return cls(shard=row["shard"], entries=entries, endings=tuple(row["endings"]))
+
+
+class Runner:
+    """Does blocks one after the other; what the work needs is loaded at the first.
+
+    Args:
+        work: what is done.
+        out: folder of the results.
+        form: of the shards.
+    """
+
+    def __init__(self, work: Work, out: str, form: ShardFormat) -> None:
+        self._work, self._out = work, out
+        self._form: ShardFormat = form
+        self._function: Function | None = None
+
+    def run(self, block: Block) -> Done:
+        """Do a block, unless a shard of it without failures is there.
+
+        The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
+
+        Raises:
+            InputError: the place of the results refuses.
+        """
+        record = join(self._out, SHARDS, f"{block.shard}.json")
+        if exists(record):
+            done = Done.from_json(read_from(record))
+            if not done.failures:
+                return done
+        with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+            file = Path(scratch) / f"{block.shard}.{self._form}"
+            entries = tuple(self._write(block, file, Path(scratch)))
+            publish(file, join(self._out, SHARDS, file.name))
+        done = Done(shard=file.name, entries=entries, endings=tuple(self._work.endings))
+        publish_bytes(done.to_json().encode(), record)
+        return done
+
+    def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:
+        """Write the results of a block, and give each name with "" or the reason of a failure."""
+        self._function = self._function or self._work.start()
+        samples = _samples(block, self._work.files, scratch)
+        results = scratch / "results"
+        results.mkdir()
+        with shard_writer(file, self._form, self._work.endings) as writer:
+            while chunk := list(islice(samples, self._work.batch)):
+                reasons = iter(self._function([one.sample for one in chunk if one.sample], results))
+                for one in chunk:
+                    reason = next(reasons) if one.sample else one.reason
+                    files = _take(results, one.name, self._work.endings)
+                    writer.add(one.name, {} if reason else files, reason)
+                    yield one.name, reason
+                    one.close()
+
+
+def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
+    """Do blocks in this process, one after the other: the engine that needs no cluster."""
+    runner = Runner(work, out, form)
+    for block in blocks:
+        yield runner.run(block)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Opened:
+    """An input whose files are at hand, or the reason why not."""
+
+    name: str
+    sample: Sample | None = None
+    reason: str = ""
+    close: Callable[[], None] = lambda: None
+
+
+@contextmanager
+def first_sample(items: Sequence[Item], tars: Sequence[str], files: Files) -> Iterator[Sample]:
+    """Give the first input, to look at before any work.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    block = Block("", tuple(items[:1])) if items else Block("", tar=tars[0])
+    with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+        one = next(_samples(block, files, Path(scratch)))
+        if one.sample is None:
+            raise InputError(one.reason)
+        yield one.sample
+
+
+def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[_Opened]:
+    if block.tar is not None:
+        yield from _tar_samples(block.tar, wanted, scratch)
+        return
+    for item in block.items:
+        stack = ExitStack()
+        try:
+            files = tuple(stack.enter_context(local_copy(url, scratch)) for url in item.files)
+        except InputError as error:
+            stack.close()
+            yield _Opened(name=item.name, reason=str(error))
+            continue
+        yield _Opened(name=item.name, sample=Sample(item.name, files), close=stack.close)
+
+
+def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
+    """Group the members of a WebDataset shard by their key, which neighbours share."""
+    key, files = "", dict[str, Path]()
+    try:
+        for member, data in read_tar(tar):
+            found, ending = _split_key(member)
+            if found != key and key:
+                yield _grouped(tar, key, files, wanted)
+                files = {}
+            key = found
+            role, suffix = _role(ending, wanted)
+            if role is not None:
+                files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}{suffix}"
+                files[role].write_bytes(data)
+        if key:
+            yield _grouped(tar, key, files, wanted)
+    except InputError as error:
+        yield _Opened(name=PurePosixPath(tar).name, reason=str(error))
+
+
+def _split_key(member: str) -> tuple[str, str]:
+    path = PurePosixPath(member)
+    key, _, ending = path.name.partition(".")
+    return str(path.parent / key), ending
+
+
+def _role(ending: str, wanted: Files) -> tuple[str | None, str]:
+    role, dot, suffix = f".{ending}".rpartition(".")
+    name = role.removeprefix(".") or (wanted.roles[0] if len(wanted.roles) == 1 else "")
+    is_ours = name in wanted.roles and f"{dot}{suffix}".lower() in wanted.suffixes
+    return (name if is_ours else None), f"{dot}{suffix}"
+
+
+def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Opened:
+    missing = [role for role in wanted.roles if role not in files]
+
+    def close() -> None:
+        for file in files.values():
+            with suppress(OSError):
+                file.unlink(missing_ok=True)
+                file.parent.rmdir()
+
+    try:
+        refuse_name(key, tar)
+    except InputError as error:
+        close()
+        return _Opened(name=key, reason=str(error))
+    if missing:
+        close()
+        return _Opened(
+            name=key,
+            reason=f"{tar}: {key!r} has no {missing[0]}; a sample holds {', '.join(wanted.roles)}",
+        )
+    sample = Sample(key, tuple(files[role] for role in wanted.roles))
+    return _Opened(name=key, sample=sample, close=close)
+
+
+def _take(results: Path, name: str, endings: Sequence[str]) -> dict[str, bytes]:
+    """Take the files of one result out of the folder."""
+    found: dict[str, bytes] = {}
+    for ending in endings:
+        path = results / f"{name}.{ending}"
+        if path.is_file():
+            found[ending] = path.read_bytes()
+            path.unlink()
+    return found

@@ -1,0 +1,112 @@
+"""Truth for pairs that have none: what a matcher finds in both views, kept where they agree."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import StereoRig
+from depthpose.core.errors import InputError
+from depthpose.core.files import atomic_write, write_disparity_png, write_image
+from depthpose.core.run import claim_folder
+from depthpose.depth.disparity import left_right_difference_px
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.kitti import Dataset
+from depthpose.depth.types import StereoInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelConfig:
+    """What counts as known.
+
+    Attributes:
+        largest_difference_px: of the disparities of both views at one point, at the image's size.
+        largest_share: of the same in shares of the disparity; the larger of both limits holds.
+        least_confidence: of the matcher in the left view, where it has one.
+    """
+
+    largest_difference_px: float = 1.0
+    largest_share: float = 0.03
+    least_confidence: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse limits that keep nothing."""
+        if min(self.largest_difference_px, self.largest_share) < 0:
+            raise InputError(
+                "largest_difference_px and largest_share must be 0 or more, got "
+                f"{self.largest_difference_px} and {self.largest_share}"
+            )
+        if not 0 <= self.least_confidence < 1:
+            raise InputError(
+                f"least_confidence must be from 0, and below 1; got {self.least_confidence}"
+            )
+
+
+def label_pairs(
+    net: FakestereoNet,
+    dataset: Dataset,
+    config: LabelConfig,
+    folder: Path,
+    settings: dict[str, object],
+) -> Iterator[tuple[str, float]]:
+    """Write a plain folder of pairs with pseudo-truth, and yield each name and what share is known.
+
+    ``left/`` and ``right/`` repeat the images, ``disp_occ/`` holds the disparity, ``calib.txt``
+    the rigs. A rerun goes on where it was.
+
+    Args:
+        net: the matcher; a network that has seen evaluation frames must not be used.
+        dataset: the pairs; frames without right view or calibration are left out.
+        config: what counts as known.
+        folder: where to write; refused if other settings made what it holds.
+        settings: what decides the result.
+
+    Raises:
+        InputError: no frame has both, or a frame that cannot be matched.
+    """
+    usable = [n for n, frame in enumerate(dataset.frames) if frame.right and frame.calibration]
+    if not usable:
+        raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
+    claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
+    _write_calibration(folder / "calib.txt", dataset, usable)
+    for number in usable:
+        name = dataset.frames[number].name
+        path = folder / "disp_occ" / f"{name}.png"
+        if path.is_file():
+            continue
+        pair = dataset.read_input(number)
+        assert pair.right is not None
+        known_px = label_pair(net, pair, config)
+        write_image(folder / "left" / f"{name}.png", pair.left)
+        write_image(folder / "right" / f"{name}.png", pair.right)
+        write_disparity_png(path, known_px)
+        yield name, float(known_px.isfinite().float().mean())
+
+
+def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Float[Tensor, "h w"]:
+    """Match a pair both ways; NaN where the two disagree, or the matcher is not sure [px]."""
+    assert pair.right is not None
+    mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
+    one, other = net.estimate_pair(pair), net.estimate_pair(mirrored)
+    left_px, right_px = one.disparity_px, other.disparity_px.flip(-1)
+    difference_px = left_right_difference_px(left_px, right_px)
+    limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
+    is_known = difference_px <= limit_px
+    if one.confidence is not None:
+        is_known &= one.confidence >= config.least_confidence
+    return torch.where(is_known, left_px, torch.nan)
+
+
+def _write_calibration(path: Path, dataset: Dataset, usable: list[int]) -> None:
+    lines = []
+    for number in usable:
+        rig = dataset.read_rig(number)
+        assert isinstance(rig, StereoRig)
+        values = (rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m)
+        numbers = " ".join(f"{float(value):.9g}" for value in values)
+        lines.append(f"{dataset.frames[number].name} {rig.width} {rig.height} {numbers}")
+    with atomic_write(path) as part:
+        part.write_text("\n".join(lines) + "\n")

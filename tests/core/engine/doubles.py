@@ -1,0 +1,72 @@
+"""What stands for real work and for a cluster in the tests of the engine."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from depthpose.core.engine import Done, Files, Function, Sample
+from depthpose.core.engine.plan import Block
+from depthpose.core.engine.shard import ShardFormat
+from depthpose.core.engine.work import Runner, Work
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_text
+
+TEXTS = Files(roles=("text",), suffixes=(".txt",))
+
+
+@dataclass(frozen=True)
+class ReverseWork:
+    """Turns the letters of text files round; a file with "bad" in it fails. Each call is logged."""
+
+    log: str
+    batch: int = 2
+    files: Files = TEXTS
+    endings: Sequence[str] = ("back.txt", "length")
+
+    def start(self) -> Function:
+        self._note("start")
+        return self._reverse
+
+    def _reverse(self, samples: Sequence[Sample], out: Path) -> list[str]:
+        return [self._one(sample, out) for sample in samples]
+
+    def _one(self, sample: Sample, out: Path) -> str:
+        self._note(sample.name)
+        try:
+            text = "".join(read_text(path) for path in sample.files)
+        except InputError as error:
+            return str(error)
+        if "bad" in text:
+            return f"{sample.files[0]}: is bad"
+        target = out / f"{sample.name}.back.txt"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text[::-1])
+        (out / f"{sample.name}.length").write_text(str(len(text)))
+        return ""
+
+    def _note(self, word: str) -> None:
+        with Path(self.log).open("a") as file:
+            file.write(f"{word}\n")
+
+
+class InProcessEngine:
+    """A test double of a cluster: one runner in this process; it may die before a block."""
+
+    def __init__(self, dies_at: int | None = None) -> None:
+        self.dies_at = dies_at
+
+    def __call__(
+        self, blocks: Sequence[Block], work: Work, out: str, form: ShardFormat
+    ) -> Iterator[Done]:
+        runner = Runner(work, out, form)
+        for number, block in enumerate(blocks):
+            if number == self.dies_at:
+                raise InputError("the double died, as it was asked to")
+            yield runner.run(block)
+
+
+def write_texts(folder: Path, texts: dict[str, str]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / f"{name}.txt").write_text(text)
+    return folder

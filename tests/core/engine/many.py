@@ -1,0 +1,59 @@
+"""Run the engine on Ray over a manifest of N rows that repeats one small file; print peak memory.
+
+python -m tests.core.engine.many N FOLDER
+"""
+
+import json
+import resource
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from tests.core.engine.doubles import TEXTS
+
+from depthpose.core.engine import Files, Function, Job, RayEngine, Sample, find_items, run_job
+
+
+@dataclass(frozen=True)
+class PeakWork:
+    """Gives for each input the peak memory of the process that took it, in kB."""
+
+    batch: int = 16
+    files: Files = TEXTS
+    endings: Sequence[str] = ("peak_kb",)
+
+    def start(self) -> Function:
+        return partial(_write_peaks)
+
+
+def _write_peaks(samples: Sequence[Sample], out: Path) -> list[str]:
+    for sample in samples:
+        assert sample.files[0].read_text() == "small"
+        (out / f"{sample.name}.peak_kb").write_text(str(_peak_kb()))
+    return [""] * len(samples)
+
+
+def _peak_kb() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def main(total: int, home: Path) -> None:
+    (home / "small.txt").write_text("small")
+    rows = [f"small.txt,{k:06d}" for k in range(total)]
+    (home / "list.csv").write_text("\n".join(["text,name", *rows]))
+    job = Job(
+        work=PeakWork(),
+        items=find_items([str(home / "list.csv")], TEXTS),
+        out=str(home / "out"),
+        settings={},
+        block=500,
+    )
+    done = run_job(job, RayEngine(workers=2))
+    said = {"inputs": sum(len(one.entries) for one in done), "command_kb": _peak_kb()}
+    sys.stdout.write(f"{json.dumps(said)}\n")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), Path(sys.argv[2]))

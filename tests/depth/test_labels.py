@@ -1,0 +1,93 @@
+"""Pseudo-truth of pairs: what both views agree on, and nothing else."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tests.made_street import make_street, write_pairs
+from torch import Tensor
+
+from depthpose import FakestereoNet
+from depthpose.cli import main
+from depthpose.core.errors import InputError
+from depthpose.depth.kitti import open_dataset
+from depthpose.depth.labels import LabelConfig, label_pair, label_pairs
+from depthpose.depth.stereo import CallableMatcher
+
+
+def brightness_matcher() -> FakestereoNet:
+    """Disparity is brightness x 10: right where both views are drawn with it."""
+    return FakestereoNet(CallableMatcher(lambda left, _: 10 * left.mean(0)))
+
+
+def test_what_both_views_say_is_kept_and_the_rest_is_unknown() -> None:
+    """Disparity 4 everywhere; the right view claims 8 in its columns 10 to 19."""
+    left = torch.full((3, 6, 40), 0.4)
+    right = left.clone()
+    right[..., 10:20] = 0.8
+    pair = replace(make_street(0.1).input, left=left, right=right, camera=None)
+    known_px = label_pair(brightness_matcher(), pair, LabelConfig())
+    row = known_px[0]
+    assert bool(row[:4].isnan().all()), "outside the right view"
+    assert torch.equal(row[4:14], torch.full((10,), 4.0))
+    assert bool(row[14:24].isnan().all())
+    assert torch.equal(row[24:], torch.full((16,), 4.0))
+
+
+def test_an_unsure_matcher_labels_nothing() -> None:
+    class Unsure:
+        def match(self, left: Tensor, right: Tensor):  # noqa: ANN202, ARG002
+            from depthpose.depth.types import Match
+
+            size = left.shape[1:]
+            return Match(disparity_px=torch.full(size, 4.0), confidence=torch.full(size, 0.2))
+
+    pair = replace(
+        make_street(0.1).input, left=torch.rand(3, 6, 20), right=torch.rand(3, 6, 20), camera=None
+    )
+    net = FakestereoNet(Unsure())
+    assert bool(label_pair(net, pair, LabelConfig()).isnan().all())
+    assert not bool(label_pair(net, pair, LabelConfig(least_confidence=0.1)).isnan().all())
+
+
+def test_a_labelled_folder_trains_and_is_gone_on_with(tmp_path: Path) -> None:
+    dataset = open_dataset(write_pairs(tmp_path / "pairs", (0.2, 0.25)))
+    out = tmp_path / "out"
+    settings: dict[str, object] = {"weights": "none"}
+    labelled = label_pairs(brightness_matcher(), dataset, LabelConfig(), out, settings)
+    assert next(labelled)[0] == "00"  # and no more of it
+    rest = list(label_pairs(brightness_matcher(), dataset, LabelConfig(), out, settings))
+    assert [name for name, _ in rest] == ["01"]
+    found = open_dataset(out)
+    for index in range(2):
+        one, other = dataset.read_rig(index), found.read_rig(index)
+        assert one is not None
+        assert other is not None
+        assert other.baseline_m == pytest.approx(one.baseline_m, rel=1e-6)
+        torch.testing.assert_close(found.read_input(index).left, dataset.read_input(index).left)
+        assert found.read_truth(index).disparity_px is not None
+    with pytest.raises(InputError, match="weights"):
+        list(label_pairs(brightness_matcher(), dataset, LabelConfig(), out, {"weights": "other"}))
+
+
+def test_pairs_without_calibration_are_refused(tmp_path: Path) -> None:
+    folder = write_pairs(tmp_path / "pairs", (0.1,))
+    (folder / "calib.txt").unlink()
+    with pytest.raises(InputError, match="no frame has a right view and a calibration"):
+        list(label_pairs(brightness_matcher(), open_dataset(folder), LabelConfig(), tmp_path, {}))
+
+
+def test_the_command_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_pairs(tmp_path / "pairs", (0.25,))
+    assert main(["data", "label", str(folder), "--out", str(tmp_path / "out")]) == 0
+    assert "1 pairs labelled, " in capsys.readouterr().out
+    assert (tmp_path / "out/disp_occ/00.png").is_file()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"largest_difference_px": -1.0}, {"largest_share": -0.1}, {"least_confidence": 1.0}]
+)
+def test_limits_that_keep_nothing_are_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="must be"):
+        LabelConfig(**changes)
