@@ -172,7 +172,7 @@ def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path, answer: 
         depth_export(lone, None, {}).graph()
 
 
-def test_another_sky_is_no_proof(selection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_sky_is_no_proof(selection: Path) -> None:
     """What is held to the limits is the sky too: the proof must fail where it is another."""
     limits = depth_export(
         DepthWeights(generator=of_all_kinds(), matcher=None, facts=TERMS), None, {}

@@ -15,16 +15,17 @@ def export_depth(
     """Write the depth networks as one file that runs without torch, and prove that it agrees.
 
     The graph does all that the estimator does, at any size: from one image and its K, the virtual
-    rig, the drawn right view, the match, and metres; or from a pair, disparity and confidence. Its
-    answers are compared with PyTorch's at several sizes; beyond the limit nothing is written, else
-    the differences stand in NAME.proof.json. Needs the extra export.
+    rig, the drawn right view, the match, sky and metres; or from a pair, disparity and confidence.
+    Its answers are compared with PyTorch's at several sizes; beyond the limit nothing is written,
+    else the differences stand in NAME.proof.json. Needs the extra export.
 
         depthpose export depth --out depth.onnx
         depthpose export depth --weights psmnet.safetensors --out psmnet.onnx
 
     Args:
         out: the .onnx file to write.
-        weights: of a generator and a matcher, or of a matcher alone, by name or file.
+        weights: of a generator and a matcher, of a generator with an answer of its own, or of a
+            matcher alone, by name or file.
         what: image: one image to depth; pair: a rectified pair to disparity. By default the first
             that the weights can.
         format: of the file.
