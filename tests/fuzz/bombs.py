@@ -6,8 +6,6 @@ prints a line of JSON for each: what was said, the peak of memory (MB) and proce
 process of its own.
 """
 
-import contextlib
-import io
 import json
 import os
 import resource
@@ -19,7 +17,6 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
 import trimesh
 from safetensors.torch import save
@@ -141,6 +138,7 @@ BOMBS: dict[str, Bomb] = {
                                 read_cloud),
     "PNG of 8192x8192": ("x.png", lambda: png(8192, 8192), look),
     "PNG of 60,000 columns": ("x.png", lambda: png(60_000, 1000), look),
+    "PNG of 5792x5792": ("x.png", lambda: png(5792, 5792), look),
     "PNG of 8192x8192, read": ("x.png", lambda: png(8192, 8192), read_image),
     "mask of 8192x8192": ("x.png", lambda: png(8192, 8192, 0), read_mask),
     "BMP of 30000x30000": ("x.bmp", lambda: b"BM" + struct.pack("<IIIIiiHH", 0, 0, 54, 40, 30000,
@@ -198,16 +196,14 @@ BOMBS: dict[str, Bomb] = {
     "weights of another kind": ("w.safetensors", lambda: save({"a": torch.zeros(2**27)},
                                 {"x": "y"}), read_checkpoint),
 }  # fmt: skip
-assert np.float32  # the readers' own imports are paid before any bomb
 
 
 def blow(path: Path, read: Callable[[Path], object]) -> dict[str, object]:
     """Read a file; say how it ended and what it took."""
     began = time.process_time()
     try:
-        with contextlib.redirect_stdout(io.StringIO()) as shown:
-            said = str(read(path)) and shown.getvalue()
-        outcome = "odd" if "odd:" in said else "read"
+        found, said = read(path), ""
+        outcome = "odd" if isinstance(found, int) and found == 1 else "read"
     except InputError as error:
         outcome, said = "refused", str(error)
     except BaseException as error:  # noqa: BLE001 - what comes is what is looked for

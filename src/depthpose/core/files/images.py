@@ -54,10 +54,13 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     with opened_image(path) as image:
         turn = _UPRIGHT.get(_orientation(image))
         pixels = _rgb_or_grey(path, image if turn is None else image.transpose(turn))
-    scale = 65535 if pixels.dtype.itemsize == 2 else 255
-    values = torch.from_numpy(pixels.astype(np.float32)).div_(scale)
-    channels = values.permute(2, 0, 1) if values.ndim == 3 else values.expand(3, -1, -1)
-    return channels.contiguous()
+    if pixels.ndim == 2:
+        scale = 65535 if pixels.dtype.itemsize == 2 else 255
+        grey = torch.from_numpy(pixels.astype(np.float32)).div_(scale)
+        return grey.expand(3, -1, -1).contiguous()
+    # Channels are parted while a pixel is a byte: the floats are there once.
+    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+    return torch.from_numpy(planes.astype(np.float32)).div_(255)
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:

@@ -20,11 +20,13 @@ from typing import Any
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refused_write
+from depthpose.core.files.text import refuse_heavy
 from depthpose.core.loop.state import BEFORE, STATE, write_state
 from depthpose.core.loop.task import Evidence
 
 _METRICS = "metrics.jsonl"
 _PICTURES = "pictures"
+_MEMORY_OF = {b"{": 250, b",": 60}
 _MOST = 2**63
 """A whole number beyond is no count, and none that is shown."""
 
@@ -109,7 +111,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     rows: list[dict[str, Any]] = []
-    for number, line in enumerate(StringIO(read_text(path)), 1):
+    text = read_text(path)
+    refuse_heavy(path, text.encode(), _MEMORY_OF)
+    for number, line in enumerate(StringIO(text), 1):
         row = _row(line)
         if row is not None:
             rows.append(row)
