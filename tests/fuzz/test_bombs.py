@@ -1,4 +1,4 @@
-"""What a small file may cost: refused in seconds and below a gigabyte, measured in child processes."""
+"""What a small file may cost: refused in seconds, below a gigabyte, measured in child processes."""
 
 import json
 import os
