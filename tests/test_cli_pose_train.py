@@ -60,7 +60,7 @@ def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
     config.write_text("held_out: {number: 1, occlusions: [0.0]}\ncalibration: {number: 20}\n")
     other = str(tmp_path / "other.safetensors")
     for words, said in (
-        ([own, "--out", str(own)], "name another file than the weights"),
+        ([own, "--out", str(own)], "is there already; delete it, or give another name"),
         ([own, "--out", str(tmp_path / "bold")], "ending in .safetensors"),
         ([own, "--out", other, "--number", "0"], "there is nothing to choose by; take 600"),
         ([blind, "--out", other], "answered not one made view"),

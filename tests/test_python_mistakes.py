@@ -52,7 +52,7 @@ MISTAKES = {
 }
 GPU_MISTAKES = {
     "pose device": ("GeoPoseNet.load('parts', config=EstimateConfig(device='cuda'))", "'cuda'"),
-    "view device": ("Synthesiser(UNetGenerator(GeneratorConfig()), 'cuda')", "'cuda'"),
+    "view device": ("make_synthesiser(UNetGenerator(GeneratorConfig()), 'cuda')", "'cuda'"),
 }
 PROGRAM = """
 import json, sys
@@ -62,7 +62,7 @@ from depthpose import FakestereoNet, GeoPoseNet
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig
-from depthpose.depth.synthesis import Synthesiser, UNetGenerator
+from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.pose.config import EstimateConfig, EvaluationConfig, VotingConfig
 from depthpose.pose.mesh import read_model
 

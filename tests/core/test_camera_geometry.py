@@ -182,9 +182,9 @@ def matrix(*rows: list[float]) -> torch.Tensor:
 
 
 BAD: list[Change] = [
-    ("width", 0, "width is 0, but an image has a pixel at least"),
-    ("height", -3, "height is -3, but an image has a pixel at least"),
-    ("K", K.float(), r"K is torch\.float32, not float64; pass K\.double\(\)"),
+    ("width", 0, "width is 0, but an image has 1 to"),
+    ("height", -3, "height is -3, but an image has 1 to"),
+    ("K", K.float(), r"K is of torch\.float32, not torch\.float64; pass K\.double\(\)"),
     ("K", K / 0, r"K is .*, not finite; write"),
     ("K", K * 2, r"K is .*; write \[\[fx, skew, cx\], \[0, fy, cy\], \[0, 0, 1\]\]"),
     ("K", matrix([7, 0, 0], [0, 7, 0], [6, 1, 1]), "it looks transposed; write"),

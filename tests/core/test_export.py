@@ -103,16 +103,23 @@ def test_a_share_may_flip_and_is_said(wrong: float, tmp_path: Path) -> None:
     assert not (tmp_path / "other.onnx").exists()
 
 
-def test_an_interrupt_leaves_no_half_file_and_the_old_one(tmp_path: Path) -> None:
+def test_an_interrupt_leaves_no_half_file(tmp_path: Path) -> None:
     path = tmp_path / "line.onnx"
-    path.write_bytes(b"old")
 
     def stopped() -> Graph:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         freeze(path, line_export(graph=stopped))
-    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"old"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_older_file_is_not_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "line.onnx"
+    path.write_bytes(b"old")
+    with pytest.raises(InputError, match=r"line\.onnx: is there already"):
+        freeze(path, line_export(graph=never))
+    assert path.read_bytes() == b"old"
 
 
 def never() -> Graph:
@@ -124,7 +131,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
     with pytest.raises(InputError, match="cannot be written"):
         freeze(tmp_path / "file" / "line.onnx", line_export(graph=never))
     (tmp_path / "folder.onnx").mkdir()
-    with pytest.raises(InputError, match="a folder or device"):
+    with pytest.raises(InputError, match="is there already"):
         freeze(tmp_path / "folder.onnx", line_export(graph=never))
     with pytest.raises(InputError, match=r"line\.pt: the graph is written as ONNX; end the name"):
         freeze(tmp_path / "line.pt", line_export(graph=never))

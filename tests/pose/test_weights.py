@@ -68,9 +68,13 @@ def test_meshes_that_were_kept_back_are_put_in_again(
     torch.testing.assert_close(mine.vertices_m, theirs.vertices_m, rtol=0, atol=1e-6)
     assert torch.equal(mine.keypoints_m, theirs.keypoints_m)
     file = write_part("bracket", tmp_path)
+    assert main([*words[:-1], str(file), "--out", str(whole)]) == 2
+    assert "is there already; delete it" in capsys.readouterr().err
+    whole.unlink()
     assert main([*words[:-1], str(file), "--out", str(whole)]) == 0
     assert len(read_pose_weights(whole).models[0].faces) > 0
     write_bop_models(tmp_path / "other", [make_part("mug", 3)])
+    whole.unlink()
     assert main([*words[:-1], str(tmp_path / "other"), "--out", str(whole)]) == 2
     assert "another object, frame or unit" in capsys.readouterr().err
     write_bop_models(tmp_path / "few", [bottle()])

@@ -212,8 +212,7 @@ def test_weights_that_match_pairs_as_they_are_have_a_limit_too(
 def test_the_matcher_may_want_a_larger_picture_than_the_generator(
     nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    synthesiser = nets[0].synthesiser
-    assert synthesiser is not None
+    synthesiser = make_synthesiser(sure_of(3, "matched"))
     focal_px = synthesiser.config.virtual_focal_px
     monkeypatch.setattr("depthpose.web.depth.work_focal_px", lambda _: 100 * focal_px)
     app = make_app(FakestereoNet(nets[0].matcher, synthesiser), nets[1])
