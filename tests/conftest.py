@@ -3,6 +3,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +24,8 @@ def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with contextlib.chdir(folder):
         assert main(["demo"]) == 0
     return folder
+
+
+# How long an example takes is the machine's, not the code's.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
