@@ -45,6 +45,17 @@ def test_a_checkpoint_survives_the_file(tmp_path: Path) -> None:
     torch.testing.assert_close(other.weight, network.weight, rtol=0, atol=0)
 
 
+def test_equal_weights_are_equal_files(tmp_path: Path) -> None:
+    """A checksum names weights, and a rerun asks for the same: safetensors orders by chance."""
+    state = nn.Linear(3, 2).state_dict()
+    facts = {"licence": "MIT", "terms": "für alle \n\t\x7f", "trained_on": "a", "stage": "b"}
+    for number in range(8):
+        made = Checkpoint(kind="toy", config={"width": 3}, state=state, facts=facts)
+        save_checkpoint(tmp_path / f"{number}.safetensors", made)
+    assert len({file_sha256(path) for path in tmp_path.iterdir()}) == 1
+    assert read_checkpoint(tmp_path / "0.safetensors").facts == facts
+
+
 @pytest.mark.parametrize(
     ("every", "joined"),
     [

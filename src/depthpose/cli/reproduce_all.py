@@ -25,12 +25,14 @@ class Step(NamedTuple):
         words: what follows ``depthpose``.
         makes: the file that is there when it is done.
         of: files of earlier steps that it reads; where one is newer, it is not done.
+        is_replaced: an older ``makes`` is deleted first, as the command takes the place of nothing.
     """
 
     what: str
     words: Sequence[str]
     makes: Path
     of: Sequence[Path] = ()
+    is_replaced: bool = False
 
     @property
     def is_done(self) -> bool:
@@ -134,7 +136,7 @@ def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
     return [
         trained("view", generator),
         trained("stereo", matcher),
-        Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher)),
+        Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher), True),
         table("2.1", apart),
         table("2.2", matcher),
         trained("finetune", tuned, *begin, of=(generator, matcher)),
@@ -191,6 +193,8 @@ def walk(steps: Sequence[Step]) -> int:
             print(f"{head}: done, {step.makes}", flush=True)
             continue
         print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
+        if step.is_replaced:
+            step.makes.unlink(missing_ok=True)
         found = main(step.words)
         if found > 1:
             return found

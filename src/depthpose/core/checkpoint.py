@@ -58,7 +58,21 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
     # Its own writer says of a full disk what only it understands.
-    write_bytes(path, save(state, metadata={**checkpoint.facts, **metadata}))
+    write_bytes(path, _in_order(save(state, metadata={**checkpoint.facts, **metadata})))
+
+
+def _in_order(content: bytes) -> bytes:
+    """Sort the header of a safetensors file.
+
+    Its writer puts the metadata in an order by chance: equal weights would have another checksum
+    each time that they are written.
+    """
+    size = int.from_bytes(content[:8], "little")
+    header = json.dumps(
+        json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":"), ensure_ascii=False
+    ).encode()
+    assert len(header) <= size, "the same entries, no longer than before"
+    return b"".join([content[:8], header.ljust(size), memoryview(content)[8 + size :]])
 
 
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
