@@ -92,7 +92,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"width": None}, "'width' is None; give a whole number of pixels"),
     ({"width": 1242.0}, r"'width' is 1242\.0; give a whole number of pixels"),
     ({"height": True}, "'height' is True; give a whole number"),
-    ({"height": 0}, "height is 0, but an image has a pixel at least"),
+    ({"height": 0}, "height is 0, but an image has 1 to 1048576 pixels"),
     ({"K": 721.5}, r"'K' is 721\.5; write \[\[fx, skew, cx\]"),
     ({"K": [[1, 2, 3], [4, 5, 6]]}, r"'K' is \[\[1, 2, 3\], \[4, 5, 6\]\]; write"),
     ({"K": [721, 0, 609, 0, 721, 172, 0, 0, 1]}, r"'K' is \[721, 0, .*; write"),

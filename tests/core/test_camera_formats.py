@@ -181,7 +181,7 @@ WRONG: dict[str, tuple[str, str]] = {
     "no camera": ("hello: world\n", r"no camera that is known; it begins with 'hello: world'\. K"),
     "prose": ("It was a dark: and stormy: night", "not a readable camera file .* known are our J"),
     "bytes": ("\x00\x01", "not a readable camera file"),
-    "reference": ("a: &a [1]\nK: *a\n", r"refers to itself \(\*name\)"),
+    "reference": ("a: &a [1]\nK: &k [*k]\n", r"refers to itself \(\*k\)"),
     "entity": ("<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "XML with declarations"),
     "other XML": ("<html><body/></html>", "no camera that is known"),
     "NaN": ("K: [.nan, 0, 1, 0, 1, 1, 0, 0, 1]", "holds NaN or infinity; calibrate again"),

@@ -63,7 +63,7 @@ def test_the_record_holds_plain_values() -> None:
         ("inner: {rate: fast}", "could not convert string to float"),
         ("inner: {rate: -1}", "rate must be 0 or more, got -1.0"),
         ("[1, 2]", "holds a list, but a config is a mapping"),
-        ("a: [", "this is not YAML"),
+        ("a: [", "not a readable YAML file"),
         ("inner: 3", "inner is 3"),
     ],
 )

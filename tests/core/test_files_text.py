@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_key_values, read_text, write_json
+from depthpose.core.files.text import parse_yaml
 
 JSON = st.recursive(
     st.none()
@@ -56,3 +58,27 @@ def test_numbers_survive_json_exactly(tmp_path: Path) -> None:
     values = [math.pi, 1e-308, 0.1, 1 / 3]
     write_json(tmp_path / "x.json", values)
     assert read_json(tmp_path / "x.json") == values
+
+
+def test_yaml_may_refer_to_what_stands_above(tmp_path: Path) -> None:
+    text = "a: &a [1, {b: &b 2}]\nc: [*a, *b]\n"
+    assert parse_yaml(tmp_path / "x.yaml", text) == {"a": [1, {"b": 2}], "c": [[1, {"b": 2}], 2]}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: &a [*a]", r"x\.yaml: refers to itself \(\*a\); write it out"),
+        ("[" * 60 + "]" * 60, "lists of lists, 50 deep"),
+        (
+            "a0: &a0 [1]\n"
+            + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9)),
+            r"references \(\*name\) make more than 2000000 values",
+        ),
+        ("a: *b", r"refers to itself|not a readable YAML file"),
+        ("a: [", "not a readable YAML file"),
+    ],
+)
+def test_yaml_beyond_bounds_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_yaml(tmp_path / "x.yaml", text)

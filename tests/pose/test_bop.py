@@ -182,7 +182,7 @@ def test_a_model_in_metres_is_told(made: Path) -> None:
         (lambda c: c["0"][0].update(cam_R_m2c=[2, 0, 0, 0, 1, 0, 0, 0, 1]), "is none: its determ"),
         (lambda c: c["0"][0].update(cam_R_m2c=[1, 2]), "where 9 numbers belong"),
         (lambda c: c["0"][0].update(cam_t_m2c="far"), "where 3 numbers belong"),
-        (lambda c: c["0"][0].update(obj_id=-1), "where a number of 0 or more belongs"),
+        (lambda c: c["0"][0].update(obj_id=-1), "where a number from 0 to 1000000000 belongs"),
         (lambda c: c.update({"0": 3}), "is no list of annotations"),
         (lambda c: c.update({"8": []}), "has no entry in scene_camera.json"),
         (lambda c: c.update({"x": []}), "is no number of an image"),

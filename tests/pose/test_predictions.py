@@ -130,7 +130,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         ({"camera_from_model": flipped}, "camera_from_model is no rigid transform; write 4 rows"),
         ({"covariance": [[1.0, "x"]]}, "covariance is not rows of 6 numbers"),
         ({"seconds": [0.1]}, "where names to numbers belong"),
-        ({"im_id": None}, "im_id is None, where a number of 0 or more belongs"),
+        ({"im_id": None}, "im_id is None, where a number from 0 to 1000000000 belongs"),
     ):
         path.write_text(json.dumps([row | change]))
         with pytest.raises(InputError, match=rf"poses.json: entry 0: .*{said}"):

@@ -10,8 +10,7 @@ import yaml
 
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import atomic_write, read_text
-from depthpose.core.files.disk import refused_as
-from depthpose.core.files.text import YAML_LOADER, refuse_yaml_bomb
+from depthpose.core.files.text import parse_yaml
 
 ConfigT = TypeVar("ConfigT")
 
@@ -27,10 +26,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     Raises:
         InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
     """
-    text = read_text(path, _MAX_BYTES)
-    refuse_yaml_bomb(path, text)
-    with refused_as(path, "YAML file", "mend it there"):
-        content = yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
+    content = parse_yaml(path, read_text(path, _MAX_BYTES))
     if content is None:
         content = {}
     if not isinstance(content, Mapping):

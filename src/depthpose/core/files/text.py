@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NoReturn
 
 import yaml
@@ -18,6 +19,8 @@ MAX_LIST_BYTES = 2**20
 _MOST_MEMORY = 700_000_000
 """That JSON or YAML may take once it is read, as estimated from its signs."""
 _MOST_DEPTH = 50
+_MOST_VALUES = 2_000_000
+"""Of YAML whose references are written out."""
 YAML_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Plain values alone; ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _OF_JSON = {b",": 60, b"[": 100, b"{": 100, b":": 200}
@@ -87,21 +90,62 @@ def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> 
         )
 
 
-def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
-    """Refuse YAML that refers to itself, or is so deep that a loader would crash.
+def parse_yaml(path: AnyPath, text: str) -> object:
+    """Parse YAML of plain values; references (``*name``) are followed within a bound.
+
+    Args:
+        path: of the file, for the error.
+        text: its content.
 
     Raises:
-        InputError: that is so, or it is no YAML.
+        InputError: it is no YAML, refers to itself, is so deep that a loader would crash, or would
+            fill the memory once its references are followed.
     """
-    depth = 0
+    refuse_yaml_bomb(path, text)
     with refused_as(path, "YAML file", "mend it there"):
+        return yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
+
+
+def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
+    """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references.
+
+    What is no YAML passes: the parser that comes next says so.
+
+    Raises:
+        InputError: that is so.
+    """
+    sizes: dict[str, int] = {}
+    unfinished: list[tuple[str | None, int]] = []
+    with suppress(yaml.YAMLError):
         for event in yaml.parse(text, YAML_LOADER):
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(f"{path}: refers to itself (*name); write the value out")
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _MOST_DEPTH:
-                raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; mend it")
+            if isinstance(event, yaml.CollectionStartEvent):
+                unfinished.append((event.anchor, 1))
+                if len(unfinished) > _MOST_DEPTH:
+                    raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; mend it")
+                continue
+            if isinstance(event, yaml.AliasEvent) and event.anchor not in sizes:
+                raise InputError(f"{path}: refers to itself (*{event.anchor}); write it out")
+            anchor, size = _finished(event, sizes, unfinished)
+            if anchor is not None:
+                sizes[anchor] = size
+            if unfinished:
+                unfinished[-1] = (unfinished[-1][0], unfinished[-1][1] + size)
+            if size > _MOST_VALUES:
+                raise InputError(
+                    f"{path}: its references (*name) make more than {_MOST_VALUES} values of it; "
+                    "write them out"
+                )
+
+
+def _finished(
+    event: yaml.Event, sizes: dict[str, int], unfinished: list[tuple[str | None, int]]
+) -> tuple[str | None, int]:
+    """Tell the name of what ends with an event, if it has one, and how many values it holds."""
+    if isinstance(event, yaml.CollectionEndEvent):
+        return unfinished.pop()
+    if isinstance(event, yaml.AliasEvent):
+        return None, sizes[event.anchor]
+    return (event.anchor, 1) if isinstance(event, yaml.ScalarEvent) else (None, 0)
 
 
 def write_json(path: AnyPath, obj: object) -> None:

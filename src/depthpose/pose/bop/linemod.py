@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
-from depthpose.core.files.disk import refused_as
-from depthpose.core.files.text import YAML_LOADER, refuse_heavy, refuse_yaml_bomb
+from depthpose.core.files.text import parse_yaml, refuse_heavy
 from depthpose.pose.bop.frames import Instance
 from depthpose.pose.bop.parse import camera_from_bop, entry_number, integer, pose_from_bop
 from depthpose.pose.mesh import turn_about
@@ -51,9 +49,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """
     text = read_text(path)
     refuse_heavy(path, text.encode(), _OF_YAML)
-    refuse_yaml_bomb(path, text)
-    with refused_as(path, "YAML file", "mend it there"):
-        content = yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
+    content = parse_yaml(path, text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds a {type(content).__name__}, where names to values belong")
     return content
