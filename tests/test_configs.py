@@ -9,9 +9,12 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
+from depthpose.depth.estimator import focal_size
 from depthpose.depth.kitti import open_dataset, read_split
 from depthpose.depth.stereo import PSMNet
+from depthpose.depth.streets import kitti_rig
 from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.synthesis.synthesiser import ROWS_SHARE
 from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 
@@ -104,6 +107,17 @@ def test_the_thesis_settings_are_the_defaults(name: str) -> None:
             del found[part], default[part]
     del found["loop"]["workers"], default["loop"]["workers"]
     assert found == default
+
+
+@pytest.mark.parametrize("name", ["view", "compact-view"])
+def test_a_crop_is_the_whole_height_of_every_rig(name: str) -> None:
+    """So a frame at test is resized by 3 % at most and never mirrored, whatever KITTI's day."""
+    config = read_config(FOLDER / f"{name}.yaml", ViewTraining)
+    crop_rows = config.pairs.augment.crop_px[0]
+    assert crop_rows % config.generator.side_multiple_px == 0
+    for number in range(5):
+        rows, _ = focal_size(kitti_rig(number), config.generator.virtual_focal_px)
+        assert crop_rows <= rows <= (1 + ROWS_SHARE) * crop_rows
 
 
 def pair(height: int, width: int) -> TrainingPair:

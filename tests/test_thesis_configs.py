@@ -186,7 +186,7 @@ def test_the_generator_is_trained_as_printed(
     assert found.steps == 200 * 23_488 // 4
     assert found.samples.needs == {"needs_truth": False, "baseline_m": 0.5327}
     pairs = found.samples.config
-    assert pairs.focal_px == found.task.generator.config.virtual_focal_px == 721.5377
+    assert pairs.focal_px == found.task.generator.config.virtual_focal_px == 493.0
     assert sum(isinstance(m, nn.Dropout) for m in found.task.generator.modules()) == 3
     augment = {"crop_px": (256, 512), "scale": (1.0, 1.0), "jitter": 0.2, "flip_share": 0.5}
     assert dataclasses.asdict(pairs.augment) == augment
@@ -231,7 +231,7 @@ def test_fine_tuning_moves_the_generator_alone(
     assert found.rates("generator", 0, 59) == [1e-4, 1e-4]
     assert found.config.l1_weight == 0.0
     assert (len(found.samples), found.steps) == (23_488, 352_320)
-    assert found.samples.config.focal_px == 721.5377
+    assert found.samples.config.focal_px == 493.0
 
 
 def test_the_pose_network_is_the_published_one(

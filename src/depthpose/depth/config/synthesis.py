@@ -30,8 +30,9 @@ class GeneratorConfig:
     test_mode: Literal["running", "batch"] = "running"
     """Norm at test: the statistics of training without dropout, or the image's own with it."""
 
-    virtual_focal_px: float = 721.5377
-    """Focal length of the imitated rig [px]; KITTI's by default."""
+    virtual_focal_px: float = 493.0
+    """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
+    rows of the thesis's crops: what is trained on parts of the height must guess at the horizon."""
 
     virtual_baseline_m: float = 0.5327
     """Baseline of the imitated rig [m]."""

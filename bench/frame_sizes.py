@@ -1,0 +1,153 @@
+"""What it costs to draw the right view of a frame that is no multiple of what the generator takes.
+
+    python bench/frame_sizes.py --data PAIRS/kitti_object_more --weights painted.safetensors
+
+Each way to bring a frame to sides that the U-Net takes is held against the same truth: AbsRel and
+d1 of the depth that comes of it (eigen-raw-camera, cap 80 m), and L1 of the drawn view.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from depthpose import FakestereoNet
+from depthpose.core.camera import StereoRig
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.report import markdown_table
+from depthpose.depth.config import MatcherConfig
+from depthpose.depth.estimator.virtual import focal_size, resize_image
+from depthpose.depth.evaluate import evaluate
+from depthpose.depth.kitti import Dataset, join_datasets, open_dataset
+from depthpose.depth.predictions import predict
+from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.synthesis.synthesiser import Drawn, draw_right, pad_to_multiple
+from depthpose.depth.weights import read_depth_weights
+
+Draw = Callable[[UNetGenerator, Tensor], Tensor]
+
+
+def run(generator: UNetGenerator, left: Tensor) -> Tensor:
+    """Draw views whose sides are multiples."""
+    return (generator(2 * left - 1) + 1) / 2
+
+
+def mirrored(generator: UNetGenerator, left: Tensor) -> Tensor:
+    """Mirror the right and lower border up to multiples."""
+    height, width = left.shape[-2:]
+    padded = pad_to_multiple(left, generator.config.side_multiple_px)
+    return run(generator, padded)[..., :height, :width]
+
+
+def of_rows(count: int) -> Draw:
+    """Resize to ``count`` rows (disparity is left alone), mirror the columns."""
+
+    def draw(generator: UNetGenerator, left: Tensor) -> Tensor:
+        height, width = left.shape[-2:]
+        rows = resize_image(left[0], count, width)[None]
+        return resize_image(mirrored(generator, rows)[0], height, width)[None]
+
+    return draw
+
+
+def of_crops(rows: int, columns: int) -> Draw:
+    """Draw overlapping crops of the size of training; each counts less towards its borders."""
+
+    def draw(generator: UNetGenerator, left: Tensor) -> Tensor:
+        height, width = left.shape[-2:]
+        down, across = min(rows, height), min(columns, width)
+        total, weight = torch.zeros_like(left), torch.zeros_like(left[:, :1])
+        ramp = torch.minimum(torch.arange(1, across + 1), torch.arange(across, 0, -1) / 2).float()
+        fall = torch.minimum(torch.arange(1, down + 1), torch.arange(down, 0, -1)).float()
+        counts = fall[:, None] * ramp
+        for top in starts(height, down):
+            for first in starts(width, across):
+                window = (..., slice(top, top + down), slice(first, first + across))
+                total[window] += draw_right(generator, left[window]) * counts
+                weight[window] += counts
+        return total / weight
+
+    return draw
+
+
+def starts(side: int, crop: int) -> list[int]:
+    """Where crops begin that overlap by a half at least and end with the side."""
+    count = 1 if side == crop else -(-(side - crop) // (crop // 2)) + 1
+    return [round(k * (side - crop) / max(count - 1, 1)) for k in range(count)]
+
+
+class Drawer:
+    """A synthesiser that brings frames to size in a given way."""
+
+    def __init__(self, generator: UNetGenerator, way: Draw) -> None:
+        self.generator, self.way = generator, way
+        self.config = generator.config
+
+    @torch.no_grad()
+    def draw(self, left: Tensor) -> Drawn:
+        """Draw right views one by one."""
+        right = [self.way(self.generator, image[None]).clamp(0, 1) for image in left]
+        return Drawn(right=torch.cat(right))
+
+
+def first_camera(dataset: Dataset) -> StereoRig:
+    """Rig of the first frame."""
+    rig = dataset.read_rig(0)
+    assert rig is not None
+    return rig
+
+
+def measure(dataset: Dataset, net: FakestereoNet) -> dict[str, float]:
+    """Numbers of one way, over all frames."""
+    names = [frame.name for frame in dataset.frames]
+    readers = [lambda k=k: replace(dataset.read_input(k), right=None) for k in range(len(dataset))]
+    with tempfile.TemporaryDirectory() as home:
+        for _ in tqdm(predict(net, readers, names, Path(home) / "p", {}), total=len(names)):
+            pass
+        (row,) = evaluate(dataset, Path(home) / "p", "eigen-raw-camera", (80.0,)).rows
+    return {name: round(row[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}
+
+
+def main() -> None:
+    """Print a row a way."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="pairs with LiDAR")
+    parser.add_argument("--weights", required=True, help="with a U-Net generator")
+    parser.add_argument("--matcher", default="default", help="weights of the matcher")
+    parser.add_argument("--crop", type=int, nargs=2, default=(192, 448), help="of the training")
+    parser.add_argument("--without", nargs="*", default=(), help="names of frames to leave out")
+    options = parser.parse_args()
+    generator = read_depth_weights(find_weights(options.weights)).generator
+    network = read_depth_weights(find_weights(options.matcher)).matcher
+    assert isinstance(generator, UNetGenerator)
+    assert network is not None
+    dataset = join_datasets([open_dataset(options.data)], options.without)
+    rows, columns = options.crop
+    multiple = generator.config.side_multiple_px
+    height, _ = focal_size(first_camera(dataset), generator.config.virtual_focal_px)
+    fewer = height // multiple * multiple
+    more = fewer + multiple
+    ways: dict[str, Draw] = {
+        "as shipped: near a multiple resized, else mirrored": draw_right,
+        "mirrored": mirrored,
+        f"rows resized to {fewer}": of_rows(fewer),
+        f"rows resized to {more}": of_rows(more),
+        f"crops of {rows}x{columns}": of_crops(rows, columns),
+    }
+    matcher = PSMNetMatcher(network, MatcherConfig())
+    found = []
+    for name, draw in ways.items():
+        net = FakestereoNet(matcher, Drawer(generator.eval(), draw))
+        found.append({"way": name, **measure(dataset, net)})
+        print(found[-1], flush=True)
+    print(markdown_table(found))
+
+
+if __name__ == "__main__":
+    main()
