@@ -1,5 +1,6 @@
 """``depth predict`` and ``depth train``, as a user runs them."""
 
+import dataclasses
 import json
 import random
 import shutil
@@ -131,6 +132,40 @@ def test_weights_that_answer_themselves_need_no_matcher(
     pair = [image, image, "--camera", str(rig), "--weights", weights, "--no-check"]
     assert main(["depth", "match", *pair, "--out", str(tmp_path / "pair")]) == 2
     assert "holds no matcher, which a pair needs" in capsys.readouterr().err
+
+
+def test_an_image_unlike_the_known_is_refused_unless_asked_for(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = sure_of(1)
+    network.config = dataclasses.replace(network.config, least_confidence=0.99)
+    network.head.bias = torch.nn.Parameter(torch.tensor([1.0, 3, 0, 0, 0] * 2))
+    write_depth_weights(tmp_path / "g.safetensors", generator=network, facts={})
+    words = [str(home / "images/0.png"), "--camera", str(home / "cam.json")]
+    words += ["--weights", str(tmp_path / "g.safetensors"), "--out"]
+    assert main(["depth", "predict", *words, str(tmp_path / "a")]) == 2
+    assert "0: unlike the images that these weights know" in capsys.readouterr().err
+    assert not (tmp_path / "a/0.depth_m.npy").exists()
+    assert main(["depth", "predict", *words, str(tmp_path / "b"), "--with-unlike"]) == 0
+    assert "warning: 0: unlike the images" in capsys.readouterr().err
+    assert "its depth is a guess" in (tmp_path / "b/0.warning.txt").read_text()
+    assert "its depth is a guess" in (tmp_path / "b/report.html").read_text()
+
+
+def test_a_threshold_is_chosen_on_a_folder(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given, out = tmp_path / "g.safetensors", tmp_path / "c.safetensors"
+    write_depth_weights(given, generator=sure_of(1), facts={})
+    shutil.copytree(home / "images", tmp_path / "pairs/left")
+    lines = [f"{number} 64 48 70 31.5 23.5 0.5\n" for number in range(3)]
+    (tmp_path / "pairs/calib.txt").write_text("".join(lines))
+    words = [str(given), "--data", str(tmp_path / "pairs"), "--out", str(out)]
+    assert main(["depth", "calibrate", *words]) == 2
+    assert "3 images cannot tell what refuses a share of 0.01" in capsys.readouterr().err
+    assert main(["depth", "calibrate", *words, "--alarm-share", "0.5"]) == 0
+    assert "3 images: mean confidence 1.000 to 1.000" in capsys.readouterr().out
+    assert read_checkpoint(out).config["least_confidence"] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_processes_share_a_folder_of_images(

@@ -1,16 +1,18 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
+import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
-from torch import Tensor
+from torch import Tensor, nn
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.checkpoint import LicenceNotice
+from depthpose.core.checkpoint import LicenceNotice, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
@@ -18,9 +20,10 @@ from depthpose.depth.estimator import resize_image
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
-from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
+from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
-from depthpose.depth.weights import write_depth_weights
+from depthpose.depth.unlike import calibrate, measure_familiarity
+from depthpose.depth.weights import read_generator, write_depth_weights
 
 
 @pytest.fixture(scope="module")
@@ -370,3 +373,57 @@ def test_the_answer_may_be_another_than_the_weights_say(
         FakestereoNet.load(painting, matcher=given, answer="own")
     with pytest.raises(InputError, match="answer is 'joined'"):
         FakestereoNet.load(matcher=given, answer="joined")
+
+
+def unsure(least: float) -> SelectionGenerator:
+    """A network that says sky with a probability of 0.3 and one disparity with 0.7."""
+    network = sure_of(1)
+    network.config = dataclasses.replace(network.config, least_confidence=least)
+    network.head.bias = nn.Parameter(torch.tensor([20 + math.log(0.3 / 0.7), 20, 0, 0, 0] * 2))
+    return network
+
+
+def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
+    image, lens = torch.rand(3, 40, 60), camera(60, 40, FOCAL_PX)
+    known = FakestereoNet(None, make_synthesiser(unsure(0.6))).estimate(image, lens)
+    assert known.familiarity == pytest.approx(0.7)
+    assert known.warning == ""
+    synthesiser = make_synthesiser(unsure(0.8))
+    with pytest.raises(InputError, match=r"cup: unlike .* below 0\.80\), .* with_unlike=True"):
+        FakestereoNet(None, synthesiser).estimate(image, lens, name="cup")
+    guess = FakestereoNet(None, synthesiser, with_unlike=True).estimate(image, lens, name="cup")
+    assert guess.warning.startswith("unlike the images that these weights know")
+    torch.testing.assert_close(guess.depth_m, known.depth_m)
+
+
+def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
+    given, out = tmp_path / "w.safetensors", tmp_path / "c.safetensors"
+    write_depth_weights(given, generator=unsure(0.0), facts={"licence": "MIT"})
+    images = [
+        StereoInput(name=str(k), left=torch.rand(3, 40, 60), right=None,
+                    camera=camera(60, 40, FOCAL_PX))
+        for k in range(5)
+    ]  # fmt: skip
+    known = measure_familiarity(FakestereoNet.load(given, with_unlike=True), images)
+    least = calibrate(given, [*known, 0.1, 0.9], 0.2, out)
+    assert least == pytest.approx(0.7, abs=1e-4)
+    found = read_generator(out)
+    assert isinstance(found, SelectionGenerator)
+    assert found.config.least_confidence == least
+    assert read_checkpoint(out).facts == read_checkpoint(given).facts
+    with pytest.raises(InputError, match=r"7 images cannot tell what refuses a share of 0\.01"):
+        calibrate(given, [*known, 0.1, 0.9], 0.01, out)
+
+
+def test_a_generator_without_confidence_cannot_be_calibrated(
+    generator: UNetGenerator, tmp_path: Path
+) -> None:
+    given = tmp_path / "w.safetensors"
+    write_depth_weights(given, generator=generator, facts={})
+    with pytest.raises(InputError, match="holds no generator that selects"):
+        calibrate(given, [0.5, 0.6], 0.5, tmp_path / "c.safetensors")
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    image = StereoInput(name="a", left=torch.rand(3, 40, 60), right=None,
+                        camera=camera(60, 40, FOCAL_PX))  # fmt: skip
+    with pytest.raises(InputError, match="no generator with a confidence of its own"):
+        measure_familiarity(net, [image])

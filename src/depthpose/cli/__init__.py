@@ -54,6 +54,7 @@ COMMANDS = {
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "depth calibrate": ("depth:calibrate", "choose when an image is refused as unlike the known"),
     "pose train": (
         "pose_training:train",
         "your CAD file, or a config, to a network that poses it",

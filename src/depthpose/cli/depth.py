@@ -27,6 +27,7 @@ def predict(
     max_memory: str | None = None,
     batch: int = 1,
     cloud: bool = False,
+    with_unlike: bool = False,
     view: str | None = None,
     engine: Engine = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
@@ -57,6 +58,8 @@ def predict(
         batch: images of one size that go through the networks together: for a GPU; a processor is
             busy with one.
         cloud: write a coloured point cloud, NAME.cloud.ply.
+        with_unlike: answer images that are unlike what the weights know too, with a warning
+            (NAME.warning.txt), in place of refusing them.
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
         engine: where the work is done.
     """
@@ -80,11 +83,18 @@ def predict(
             config=config,
             with_right=False,
             with_sgbm=matcher == "sgbm",
+            with_unlike=with_unlike,
         )
         return engine_depth.predict(images, (camera, focal_px), recipe, look, out, engine)
     sources = predicting.find_sources(images, Path(out))
     lens = predicting.read_lens(camera, focal_px, sources[0])
-    method = methods.weights_method(weights, config, with_right=False, with_sgbm=matcher == "sgbm")
+    method = methods.weights_method(
+        weights,
+        config,
+        with_right=False,
+        with_sgbm=matcher == "sgbm",
+        with_unlike=with_unlike,
+    )
     return predicting.predict_all(sources, lens, method, Path(out), look, view)
 
 
@@ -278,3 +288,47 @@ def evaluate(
         raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
     return evaluating.measure(dataset, folders, protocol, cap, out)
+
+
+def calibrate(
+    weights: tyro.conf.Positional[str],
+    data: list[Path],
+    out: Path,
+    alarm_share: float = 0.01,
+    split: str | None = None,
+    device: str = "cpu",
+) -> int:
+    """Choose when one image is refused as unlike what weights know.
+
+    Their mean confidence is measured on images that they shall know; what lies below that of all
+    but a share of these is refused by 'depth predict'. Tensors stay as they are.
+
+        depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
+
+    Args:
+        weights: weights with a generator that selects, by name or file.
+        data: folders of such images: KITTI raw, object, 2012/2015, or plain folders of pairs.
+        out: the file of the calibrated weights.
+        alarm_share: share of these images that may be refused.
+        split: name or file of a split, for the first folder.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.run import refuse_to_replace
+    from depthpose.depth import unlike
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.kitti import join_datasets, open_dataset
+
+    refuse_to_replace(out)
+    path = find_weights(weights)
+    parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
+    dataset = join_datasets(parts)
+    net = FakestereoNet.load(path, config=MatcherConfig(device=device), with_unlike=True)
+    shown = tqdm(range(len(dataset)), unit=" images", disable=None)
+    known = unlike.measure_familiarity(net, map(dataset.read_input, shown))
+    least = unlike.calibrate(path, known, alarm_share, out)
+    print(f"{len(known)} images: mean confidence {min(known):.3f} to {max(known):.3f}")
+    print(f"refused below {least:.3f}; calibrated weights: {out}")
+    return 0

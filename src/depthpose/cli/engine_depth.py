@@ -32,6 +32,7 @@ class NetRecipe:
     config: MatcherConfig
     with_right: bool
     with_sgbm: bool
+    with_unlike: bool = True
 
     def build(self) -> Method:
         """Build the networks on the device of the config."""
@@ -39,7 +40,11 @@ class NetRecipe:
             return sgbm_method(with_filled_holes=False)
         with self.weights.unpacked() as path:
             return weights_method(
-                path, self.config, with_right=self.with_right, with_sgbm=self.with_sgbm
+                path,
+                self.config,
+                with_right=self.with_right,
+                with_sgbm=self.with_sgbm,
+                with_unlike=self.with_unlike,
             )
 
     def settings(self) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def weights_method(
     *,
     with_right: bool | None = None,
     with_sgbm: bool = False,
+    with_unlike: bool = True,
 ) -> Method:
     """Build the network of a weights file, given by its path or by name.
 
@@ -48,6 +49,7 @@ def weights_method(
         config: how the matcher runs.
         with_right: show it the real right view; by default only to a matcher, which needs it.
         with_sgbm: let OpenCV match the drawn view in place of the weights' own matcher.
+        with_unlike: answer images unlike what the weights know too, as a measurement must.
 
     Raises:
         InputError: a matcher alone is asked to do without the right view, or weights without a
@@ -68,9 +70,12 @@ def weights_method(
     if with_sgbm:
         facts["matcher"] += " with sgbm"
         sgbm = SGBMConfig(with_filled_holes=True)
-        net = FakestereoNet.load(path, matcher="sgbm", config=sgbm, answer="matched")
+        net = FakestereoNet.load(
+            path, matcher="sgbm", config=sgbm, answer="matched", with_unlike=with_unlike
+        )
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
-    net = FakestereoNet.load(path, config=replace(config, device=own_device(config.device)))
+    run = replace(config, device=own_device(config.device))
+    net = FakestereoNet.load(path, config=run, with_unlike=with_unlike)
     if is_shown and net.matcher is None:
         raise InputError(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "

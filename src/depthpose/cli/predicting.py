@@ -218,6 +218,8 @@ class Predictor:
                 if self.look.with_cloud:
                     write_estimate_cloud(self.out, given, estimate)
                 write_estimate(self.out, given, estimate, self.look.range_m)
+                if estimate.warning:
+                    tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
                 if self.viewer is not None:
                     self.viewer.show_depth(given, estimate)
         except InputError as error:

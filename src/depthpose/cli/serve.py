@@ -41,7 +41,9 @@ def serve(
     taken = open_socket(host, port)
     address = taken_address(taken)
     limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=known_names(host, address))
-    app = make_app(FakestereoNet.load(weights), GeoPoseNet.load(pose_weights), limits)
+    app = make_app(
+        FakestereoNet.load(weights, with_unlike=True), GeoPoseNet.load(pose_weights), limits
+    )
     shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:

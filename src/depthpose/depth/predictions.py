@@ -20,6 +20,8 @@ from depthpose.core.files import (
     write_image,
     write_map,
 )
+from depthpose.core.files.disk import write_bytes
+from depthpose.core.files.text import read_text
 from depthpose.core.run import claim_folder
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
@@ -40,7 +42,7 @@ _READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
 CLOUD = "cloud.ply"
 ENDINGS = (
     "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
-    "disparity_px.npy", CLOUD,
+    "disparity_px.npy", "warning.txt", CLOUD,
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
@@ -57,11 +59,13 @@ def write_estimate(
     """Write the files of one estimate; the disparity comes last and marks the frame as finished.
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
-    ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky)
-    and ``NAME.disparity_px.npy``, each where the estimate has it. The disparity is that of the
-    frame's own rig.
+    ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
+    ``NAME.warning.txt`` and ``NAME.disparity_px.npy``, each where the estimate has it. The
+    disparity is that of the frame's own rig.
     """
     base = folder / pair.name
+    if estimate.warning:
+        write_bytes(_file(base, "warning.txt"), f"{estimate.warning}\n".encode())
     if estimate.depth_m is not None:
         write_map(_file(base, "depth_m.npy"), estimate.depth_m)
         write_depth_png(_file(base, "depth.png"), estimate.depth_m)
@@ -171,6 +175,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     disparity_px = read_disparity(folder, name, camera)
     base = folder / name
     depth_m, right = _file(base, "depth_m.npy"), _file(base, "right.png")
+    warning = _file(base, "warning.txt")
     metres = read_map(depth_m) if depth_m.is_file() else None
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
@@ -180,6 +185,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         confidence=read_confidence(folder, name),
         right=read_image(right) if right.is_file() else None,
         is_sky=read_sky(folder, name),
+        warning=read_text(warning).strip() if warning.is_file() else "",
     )
 
 

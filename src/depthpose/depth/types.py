@@ -79,6 +79,10 @@ class DepthEstimate:
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
         is_sky: where the image shows the sky, or None where the weights do not know it.
+        familiarity: mean confidence of the generator over the image, 0..1: how well its weights
+            know such images. None for pairs, and where the generator has no confidence.
+        warning: what speaks against the whole of it, such as an image unlike those that the
+            weights know; else empty.
     """
 
     depth_m: Float[Tensor, "h w"] | None
@@ -86,3 +90,5 @@ class DepthEstimate:
     confidence: Float[Tensor, "h w"] | None = None
     right: Float[Tensor, "3 h w"] | None = None
     is_sky: Bool[Tensor, "h w"] | None = None
+    familiarity: float | None = None
+    warning: str = ""

@@ -104,6 +104,8 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
         if len(known_m):
             low, middle, high = (float(f(known_m)) for f in (torch.min, torch.median, torch.max))
             facts.append(("nearest, middle, farthest", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
+    if found.warning:
+        facts.insert(0, ("warning", found.warning))
     if found.confidence is not None:
         facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
     return facts

@@ -165,8 +165,9 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
             else (f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else ".")
         )
         return f"No pixel got a depth from {sees}{why}"
+    warning = f"Careful: {found.warning}. " if found.warning else ""
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
     return (
-        f"Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
+        f"{warning}Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
         f"{middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
     )

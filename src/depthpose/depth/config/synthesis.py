@@ -87,6 +87,10 @@ class SelectionConfig:
     """Where depth comes from: the distribution of the left view; the matcher on left and drawn
     right view; or both, weighed by their confidence."""
 
+    least_confidence: float = 0.0
+    """Mean confidence below which an image is unlike what the weights know; 0: not looked at.
+    'depthpose depth calibrate' finds it."""
+
     virtual_focal_px: float = 372.0
     """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""
 
@@ -108,6 +112,10 @@ class SelectionConfig:
             )
         if self.answer not in ("own", "matched", "joined"):
             raise InputError(f"answer must be own, matched or joined, got {self.answer!r}")
+        if not 0 <= self.least_confidence < 1:
+            raise InputError(
+                f"least_confidence must be from 0 to below 1, got {self.least_confidence}"
+            )
         _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
 
     @property

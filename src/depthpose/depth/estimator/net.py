@@ -1,6 +1,7 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
+from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
 from depthpose.depth.estimator.matchers import choose_matcher, set_answer, work_focal_px
@@ -44,10 +45,17 @@ class FakestereoNet:
             ``answer`` is own), for one image alone.
         synthesiser: left view to right view; None matches real pairs only.
         terms: of the weights, where they bind whoever uses them.
+        with_unlike: answer images that are unlike what the weights know too, with a
+            ``warning`` in the estimate, in place of refusing them.
     """
 
     def __init__(
-        self, matcher: Matcher | None, synthesiser: Synthesiser | None = None, *, terms: str = ""
+        self,
+        matcher: Matcher | None,
+        synthesiser: Synthesiser | None = None,
+        *,
+        terms: str = "",
+        with_unlike: bool = False,
     ) -> None:
         if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
             raise InputError(
@@ -57,6 +65,7 @@ class FakestereoNet:
         self.matcher = matcher
         self.synthesiser = synthesiser
         self.terms = terms
+        self.with_unlike = with_unlike
 
     @classmethod
     def load(
@@ -66,6 +75,7 @@ class FakestereoNet:
         matcher: str | Path | Matcher | None = None,
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
+        with_unlike: bool = False,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
@@ -81,6 +91,8 @@ class FakestereoNet:
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
+            with_unlike: answer images that are unlike what the weights know too, with a
+                ``warning`` in the estimate, in place of refusing them.
 
         Raises:
             InputError: no such weights, no matcher in what was given, or an ``answer`` that these
@@ -99,7 +111,8 @@ class FakestereoNet:
         chosen = choose_matcher(weights, found, matcher, own, config)
         if found is None or found.generator is None:
             return cls(chosen, terms=terms)
-        return cls(chosen, make_synthesiser(found.generator, run.device), terms=terms)
+        synthesiser = make_synthesiser(found.generator, run.device)
+        return cls(chosen, synthesiser, terms=terms, with_unlike=with_unlike)
 
     def estimate(
         self,
@@ -124,7 +137,8 @@ class FakestereoNet:
 
         Raises:
             InputError: a file that cannot be read, sizes that disagree, a camera without what is
-                needed, a pair that is swapped or not rectified.
+                needed, a pair that is swapped or not rectified, an image unlike what the weights
+                know.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
         left = as_tensor(image)
@@ -199,7 +213,33 @@ class FakestereoNet:
         matches = self._disparities(left, drawn, square_camera(size, rig.virtual_focal_px))
         skies = [None] * len(images) if drawn.is_sky is None else drawn.is_sky
         parts = zip(images, matches, drawn.right, skies, strict=True)
-        return [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
+        found = [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
+        if drawn.confidence is None:
+            return found
+        known = [float(confidence.mean()) for confidence in drawn.confidence]
+        return [
+            self._told_apart(image.name, replace(one, familiarity=familiarity))
+            for image, one, familiarity in zip(images, found, known, strict=True)
+        ]
+
+    def _told_apart(self, name: str, found: DepthEstimate) -> DepthEstimate:
+        """Refuse an image that is unlike what the weights know, or warn of it."""
+        assert self.synthesiser is not None, "checked before"
+        assert found.familiarity is not None
+        rig = self.synthesiser.config
+        least = rig.least_confidence if isinstance(rig, SelectionConfig) else 0.0
+        if found.familiarity >= least:
+            return found
+        said = (
+            f"unlike the images that these weights know (mean confidence {found.familiarity:.2f}, "
+            f"below {least:.2f}), so its depth is a guess"
+        )
+        if not self.with_unlike:
+            raise InputError(
+                f"{name}: {said}. Check that it is upright and that the focal length is its own; "
+                "--with-unlike (in Python, with_unlike=True) answers it all the same."
+            )
+        return replace(found, warning=said)
 
     def _disparities(
         self, left: Float[Tensor, "b 3 h w"], drawn: Drawn, camera: Camera

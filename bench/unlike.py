@@ -1,0 +1,136 @@
+"""Which images weights refuse as unlike what they know: real streets, and what is no street.
+
+    python bench/unlike.py --samples $DEPTHPOSE_DATA [--weights default kitti-nc]
+
+Streets: KITTI's, KITTI-360's and those of six cameras of another car (DGP), with their own focal
+lengths. Unlike: scikit-image's pictures, indoor pictures, noise, one colour; streets turned,
+cut to what is above the horizon, or enlarged four times, all with the focal length that is told.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import skimage.data
+import torch
+from torch import Tensor
+
+from depthpose.core.camera import Camera
+from depthpose.core.files import read_image
+from depthpose.core.report import markdown_table, write_table
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.kitti import open_dataset
+from depthpose.depth.types import StereoInput
+from depthpose.depth.unlike import measure_familiarity
+
+PAIRS = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
+         "street_pairs/kitti_single", "street_pairs/kitti2015_eval_drives", "more/kitti_road",
+         "more/kitti_object_csc420", "more/kitti_road_unknown_drive")  # fmt: skip
+PICTURES = ("astronaut", "brick", "camera", "cat", "cell", "checkerboard", "clock", "coffee",
+            "coins", "grass", "gravel", "horse", "hubble_deep_field", "immunohistochemistry",
+            "logo", "moon", "page", "retina", "rocket", "text")  # fmt: skip
+PHONE = 0.8
+"""Focal length of what has none, in widths."""
+KITTI360_PX = 552.55
+
+
+def given(name: str, image: Tensor, focal_px: float | None = None) -> StereoInput:
+    """Make an input whose optical axis goes through its centre."""
+    height, width = image.shape[1:]
+    f = PHONE * max(height, width) if focal_px is None else focal_px
+    K = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]).double()
+    return StereoInput(name=name, left=image, right=None, camera=Camera(width, height, K))
+
+
+def dgp(folder: Path) -> Iterator[StereoInput]:
+    """Read the pictures of scenes in DGP's layout, with their intrinsics."""
+    for scene in sorted(folder.glob("scene_*")):
+        (calibration,) = scene.glob("calibration/*.json")
+        told = json.loads(calibration.read_text())
+        focal_px = {n: k["fx"] for n, k in zip(told["names"], told["intrinsics"], strict=True)}
+        for path in sorted(scene.glob("rgb/*/*.jpg")):
+            yield given(path.stem, read_image(path), focal_px[path.parent.name])
+
+
+def streets(samples: Path) -> Iterator[tuple[str, StereoInput]]:
+    """Give real streets, by where they are from."""
+    for folder in PAIRS:
+        dataset = open_dataset(samples / "depth" / folder)
+        for index in range(len(dataset)):
+            yield f"KITTI, {Path(folder).name}", dataset.read_input(index)
+    for path in sorted((samples / "depth/more/kitti360/left").glob("*")):
+        yield "KITTI-360", given(path.stem, read_image(path), KITTI360_PX)
+    for image in dgp(samples / "depth/more/tri_dgp"):
+        yield "DGP, six cameras", image
+
+
+def picture(name: str) -> Tensor:
+    """Give a picture of scikit-image in RGB."""
+    found = np.asarray(getattr(skimage.data, name)())
+    found = found.astype(np.uint8) * (255 if found.dtype == bool else 1)
+    rgb = np.repeat(found[..., None], 3, 2) if found.ndim == 2 else found[..., :3]
+    return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255
+
+
+def unlike(samples: Path) -> Iterator[tuple[str, StereoInput]]:
+    """Give what is no street, or a street that is told wrongly."""
+    generator = torch.Generator().manual_seed(0)
+    for name in PICTURES:
+        yield "scikit-image's pictures", given(name, picture(name))
+    for path in sorted((samples / "depth/middlebury").glob("*/*/im0.png")):
+        yield "indoors", given(path.parent.name, read_image(path))
+    for path in sorted((samples / "pose").glob("*/test/**/rgb/*")):
+        yield "indoors", given(path.stem, read_image(path), 570.0)
+    for number in range(6):
+        yield "noise", given("noise", torch.rand(3, 375, 1242, generator=generator), 721.5)
+        yield "one colour", given("flat", torch.full((3, 375, 1242), number / 5), 721.5)
+    dataset = open_dataset(samples / "depth" / PAIRS[0])
+    for index in range(0, len(dataset), 3):
+        street = dataset.read_input(index)
+        assert street.camera is not None
+        image, focal_px = street.left, float(street.camera.K[0, 0])
+        turned = image.rot90(1, (1, 2)).contiguous()
+        yield "streets turned by 90 degrees", given("r", turned, focal_px)
+        yield "streets upside down", given("u", image.rot90(2, (1, 2)).contiguous(), focal_px)
+        yield "streets above the horizon", given("s", image[:, :130], focal_px)
+        yield "streets enlarged four times", given("z", image[:, 140:240, 450:800], focal_px)
+        yield "streets of twice the focal length", given("f", image, 2 * focal_px)
+
+
+def measure(weights: str, samples: Path) -> list[dict[str, Any]]:
+    """Give, for each kind of image, how many are refused."""
+    net = FakestereoNet.load(weights, with_unlike=True)
+    assert net.synthesiser is not None
+    least = getattr(net.synthesiser.config, "least_confidence", 0.0)
+    found: dict[tuple[str, bool], list[float]] = defaultdict(list)
+    for is_known, images in ((True, streets(samples)), (False, unlike(samples))):
+        for kind, image in images:
+            found[kind, is_known] += measure_familiarity(net, [image])
+    return [
+        {
+            "weights": weights, "images": kind, "known": is_known, "number": len(values),
+            "refused": sum(value < least for value in values), "least": min(values),
+            "median": float(np.median(values)), "most": max(values), "threshold": least,
+        }
+        for (kind, is_known), values in found.items()
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Measure each set of weights; write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--samples", type=Path, required=True)
+    parser.add_argument("--weights", nargs="+", default=["default", "kitti-nc"])
+    parser.add_argument("--out", type=Path, default=Path("out/bench/unlike"))
+    options = parser.parse_args()
+    rows = [row for weights in options.weights for row in measure(weights, options.samples)]
+    write_table(options.out, rows, name="unlike")
+    print(markdown_table(rows))
+
+
+if __name__ == "__main__":
+    main()

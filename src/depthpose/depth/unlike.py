@@ -1,0 +1,71 @@
+"""When an image is unlike what the weights know: the generator's own confidence says so."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from depthpose.core.checkpoint import read_checkpoint, save_checkpoint
+from depthpose.core.errors import InputError
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.types import StereoInput
+from depthpose.depth.weights import BOTH
+
+_KIND = "selection"
+
+
+def measure_familiarity(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
+    """Give the mean confidence of each image that the generator is shown, 0..1.
+
+    Args:
+        net: with a generator that selects, and ``with_unlike``.
+        images: right views are not looked at.
+
+    Raises:
+        InputError: the generator has no confidence, or an image cannot be used.
+    """
+    found: list[float] = []
+    for image in images:
+        familiarity = net.estimate_pair(replace(image, right=None)).familiarity
+        if familiarity is None:
+            raise InputError(
+                "these weights have no generator with a confidence of its own; take those of "
+                "'depthpose depth train select'"
+            )
+        found.append(familiarity)
+    return found
+
+
+def calibrate(weights: Path, familiarity: list[float], alarm_share: float, out: Path) -> float:
+    """Write weights that refuse all but ``1 - alarm_share`` of images like some that are known.
+
+    Args:
+        weights: with a generator that selects; its tensors stay as they are.
+        familiarity: of images that the weights shall know (:func:`measure_familiarity`).
+        alarm_share: share of these that may be refused, 0..1.
+        out: the file of the weights.
+
+    Returns:
+        The ``least_confidence`` that they bear.
+
+    Raises:
+        InputError: too few images for that share, or weights of another kind.
+    """
+    if not 0 < alarm_share < 1 or len(familiarity) * alarm_share < 1:
+        raise InputError(
+            f"{len(familiarity)} images cannot tell what refuses a share of {alarm_share:g} of "
+            f"them; give {1 / max(alarm_share, 1e-6):.0f} images or more, or a larger share"
+        )
+    least = min(round(float(np.quantile(familiarity, alarm_share)), 4), 0.9999)
+    found = read_checkpoint(weights)
+    config = dict(found.config)
+    own = config.get(_KIND) if found.kind == BOTH else config if found.kind == _KIND else None
+    if not isinstance(own, dict):
+        raise InputError(
+            f"{weights}: holds no generator that selects; take weights of 'train select'"
+        )
+    changed = {**own, "least_confidence": least}
+    config = {**config, _KIND: changed} if found.kind == BOTH else changed
+    save_checkpoint(out, replace(found, config=config))
+    return least
