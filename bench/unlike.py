@@ -43,7 +43,9 @@ def given(name: str, image: Tensor, focal_px: float | None = None) -> StereoInpu
     height, width = image.shape[1:]
     f = PHONE * max(height, width) if focal_px is None else focal_px
     K = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]).double()
-    return StereoInput(name=name, left=image, right=None, camera=Camera(width, height, K))
+    return StereoInput(
+        name=name, left=image, right=None, camera=Camera(width=width, height=height, K=K)
+    )
 
 
 def dgp(folder: Path) -> Iterator[StereoInput]:

@@ -349,6 +349,16 @@ loop: {steps: 4, batch_size: 2, device: cpu}
 """
 
 
+SELECT = """
+generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],
+  virtual_focal_px: 130.0}
+with_fixed_start: false
+encoder_rate: 1.0
+pairs: {truth: disparity, augment: {crop_px: [32, 64]}}
+loop: {steps: 4, batch_size: 2, device: cpu}
+"""
+
+
 def test_training_by_config_and_words(
     pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -370,12 +380,33 @@ def test_training_by_config_and_words(
 
 
 @pytest.mark.slow
-def test_kills_at_any_moment_change_no_weight_of_a_stage(pairs: Path, tmp_path: Path) -> None:
+def test_two_processes_select_as_one_that_accumulates(pairs: Path, tmp_path: Path) -> None:
+    """Weights agree to float32 rounding; batch norm statistics are each process's own."""
+    found: list[dict[str, torch.Tensor]] = []
+    for processes, accumulate in ((1, 2), (2, 1)):
+        config, out = tmp_path / f"{processes}.yaml", tmp_path / f"run-{processes}"
+        config.write_text(SELECT.replace("steps: 4", f"steps: 4, accumulate: {accumulate}"))
+        launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+        words = [sys.executable, *(launch if processes == 2 else []), "-m", "depthpose", "depth"]
+        words += ["train", "select", "--config", str(config), "--data", str(pairs)]
+        done = subprocess.run([*words, "--out", str(out)], capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr.decode()[-3000:]
+        found.append(torch.load(out / "state.pt", weights_only=True)["modules"]["generator"])
+    for name, tensor in found[0].items():
+        if "running" not in name and "num_batches" not in name:
+            torch.testing.assert_close(tensor, found[1][name], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stage", "config"), [("view", VIEW), ("select", SELECT)])
+def test_kills_at_any_moment_change_no_weight_of_a_stage(
+    pairs: Path, tmp_path: Path, stage: str, config: str
+) -> None:
     """Before the first step too, while samples are read, and while weights are written."""
-    text = VIEW.replace("steps: 4", "steps: 200, save_every_steps: 7, validate_every_steps: 50")
-    (tmp_path / "view.yaml").write_text(text)
-    words = [sys.executable, "-m", "depthpose", "depth", "train", "view", "--resume"]
-    words += ["--config", str(tmp_path / "view.yaml"), "--data", str(pairs)]
+    text = config.replace("steps: 4", "steps: 200, save_every_steps: 7, validate_every_steps: 50")
+    (tmp_path / "stage.yaml").write_text(text)
+    words = [sys.executable, "-m", "depthpose", "depth", "train", stage, "--resume"]
+    words += ["--config", str(tmp_path / "stage.yaml"), "--data", str(pairs)]
     words += ["--held-out", str(pairs), "--out"]
     subprocess.run([*words, str(tmp_path / "whole")], check=True, capture_output=True)
     moments, killed = random.Random(1), tmp_path / "killed"

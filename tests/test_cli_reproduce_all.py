@@ -86,7 +86,9 @@ def test_kitti_to_tables_of_chapter_2(
         "[6/7] training by depth/finetune.yaml",
         "[7/7] table 2.3",
     ]
-    assert methods(home / "table-2.1") == ["fakestereo"] * 2, "caps of 80 and 50 m"
+    assert methods(home / "table-2.1") == ["fakestereo"] * 4, "caps of 80 and 50 m, ours beside"
+    named = [row.get("weights") for row in rows_of(home / "table-2.1")]
+    assert named.count("default") == 2, "the generator that selects stands beside the thesis's"
     assert methods(home / "table-2.2") == ["psmnet"] * 2
     weights = [row.get("weights") for row in rows_of(home / "table-2.3")]
     assert weights.count("apart") == weights.count("fakestereo") > 0

@@ -18,6 +18,7 @@ def reproduce(
     out: Path,
     weights: tuple[str, ...] = (),
     matcher: Literal["sgbm"] | None = None,
+    beside: tuple[str, ...] = ("default",),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
     protocol: str = "eigen-raw",
@@ -43,6 +44,8 @@ def reproduce(
         out: folder for all that is written.
         weights: weights files; 2.2 takes a stereo matcher's too.
         matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
+        beside: tables 2.1 and 2.3: weights of another method, a row each beside the thesis's; by
+            default those that ship, whose generator selects. '--beside' without a name: none.
         train: training folders: adds the two floors (best depth of each row, nearest image).
         train_without: names of training frames to keep out.
         protocol: how prediction and truth are compared; eigen-raw is the thesis's.
@@ -66,6 +69,10 @@ def reproduce(
     memory = methods.parse_bytes(max_memory)
     config = MatcherConfig(device=device, precision=precision, max_memory_bytes=memory)
     chosen = reproducing.own_methods(published, weights, matcher, config)
+    names = {method.name for _, method in chosen}
+    if not published.with_right:
+        others = [methods.weights_method(name, config, with_right=False) for name in beside]
+        chosen += [("", other) for other in others if other.name not in names]
     if train:
         training = evaluating.open_training(train, train_without)
         floors = [methods.floor_method(name, training) for name in ("rows", "nearest")]
