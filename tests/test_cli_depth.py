@@ -152,6 +152,27 @@ def test_an_image_unlike_the_known_is_refused_unless_asked_for(
     assert "its depth is a guess" in (tmp_path / "b/report.html").read_text()
 
 
+def test_where_depth_comes_from_is_one_word(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = str(tmp_path / "w.safetensors")
+    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
+    write_depth_weights(Path(weights), generator=sure_of(1), matcher=matcher.eval(), facts={})
+    words = [str(home / "images/0.png"), "--camera", str(home / "cam.json"), "--weights", weights]
+    found = {}
+    for answer in ("own", "matched", "joined"):
+        out = tmp_path / answer
+        assert main(["depth", "predict", *words, "--answer", answer, "--out", str(out)]) == 0
+        found[answer] = read_map(out / "0.disparity_px.npy")
+        assert json.loads((out / "run.json").read_text())["settings"]["answer"] == answer
+    assert not torch.equal(found["own"], found["matched"])
+    assert not torch.equal(found["own"], found["joined"])
+    capsys.readouterr()
+    other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
+    assert main(["depth", "predict", *words, *other]) == 2
+    assert "sgbm matches; leave one away" in capsys.readouterr().err
+
+
 def test_a_threshold_is_chosen_on_a_folder(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

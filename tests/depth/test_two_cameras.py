@@ -13,9 +13,9 @@ from depthpose.depth.estimator import FakestereoNet, resize_image
 from depthpose.depth.streets import draw_scene, kitti_rig, make_scene
 from depthpose.depth.types import StereoInput
 
-SAME_FIELD, OTHER_FIELD = 0.05, 0.1
-"""Median relative difference that is allowed: the same field of view at another size; half as much
-again to either side, where the network sees more of the street."""
+ALLOWED = 0.05
+"""Median relative difference: at another size, and where the street is seen half as much again to
+either side."""
 
 
 def rig(focal_px: float, width: int, height: int) -> StereoRig:
@@ -44,7 +44,8 @@ def test_one_scene_has_the_same_metres_through_every_camera() -> None:
     seen = depth_m(net, rig(360.0, 620, 188))
     larger = depth_m(net, rig(540.0, 930, 282))
     wider = depth_m(net, rig(360.0, 930, 188))
-    for other, allowed in ((larger, SAME_FIELD), (wider[:, 155:775], OTHER_FIELD)):
+    for other in (larger, wider[:, 155:775]):
         same_size = resize_image(other[None].expand(3, -1, -1) / 1000, 188, 620)[0] * 1000
         relative = (same_size - seen).abs() / seen
-        assert float(relative.median()) < allowed
+        assert float(relative.isfinite().float().mean()) > 0.7, "the rest is sky in one of the two"
+        assert float(relative.nanmedian()) < ALLOWED

@@ -7,7 +7,7 @@ import tyro
 
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
-from depthpose.depth.config import FloorName, MatcherConfig
+from depthpose.depth.config import Answer, FloorName, MatcherConfig
 
 MatcherName = Literal["psmnet", "sgbm"]
 Precision = Literal["fp32", "bf16"]
@@ -21,6 +21,7 @@ def predict(
     focal_px: float | None = None,
     weights: str = "default",
     matcher: Literal["psmnet", "sgbm"] = "psmnet",
+    answer: Answer | None = None,
     color_range: tuple[float, float] = (3.0, 80.0),
     device: str = "cpu",
     precision: Precision = "fp32",
@@ -51,9 +52,11 @@ def predict(
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
         weights: weights with a generator, by name or file ('depthpose weights list').
         matcher: psmnet (that of the weights), or sgbm, OpenCV's.
+        answer: own: the generator's own disparity; matched: the matcher on left and drawn right
+            view; joined: both. Left out: what the weights say; sgbm matches.
         color_range: metres of the brightest and the darkest colour, the same for all pictures.
         device: cpu, cuda, cuda:1, ...
-        precision: fp32, or bf16: faster, at some hundredths of a pixel.
+        precision: of the matcher, fp32, or bf16: faster, at some hundredths of a pixel.
         max_memory: bound on the memory of the matcher, such as 1GB; exact.
         batch: images of one size that go through the networks together: for a GPU; a processor is
             busy with one.
@@ -72,6 +75,8 @@ def predict(
         raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
     if batch < 1:
         raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
+    if matcher == "sgbm" and answer is not None:
+        raise InputError(f"--answer {answer} and --matcher sgbm: sgbm matches; leave one away.")
     if matcher == "sgbm" and config != MatcherConfig():
         raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
     look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
@@ -84,6 +89,7 @@ def predict(
             with_right=False,
             with_sgbm=matcher == "sgbm",
             with_unlike=with_unlike,
+            answer=answer,
         )
         return engine_depth.predict(images, (camera, focal_px), recipe, look, out, engine)
     sources = predicting.find_sources(images, Path(out))
@@ -94,6 +100,7 @@ def predict(
         with_right=False,
         with_sgbm=matcher == "sgbm",
         with_unlike=with_unlike,
+        answer=answer,
     )
     return predicting.predict_all(sources, lens, method, Path(out), look, view)
 
@@ -234,7 +241,9 @@ def evaluate(
         data: KITTI raw, object, 2012/2015, Middlebury, or a plain folder of pairs.
         out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
         weights: files or names. Weights with a generator see the left view alone; 'both:NAME' shows
-            their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one.
+            their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one, and
+            'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the
+            generator, from the matcher on the drawn view, or from both.
         matcher: sgbm measures OpenCV's StereoSGBM.
         predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
             that 'depth predict|match --engine ray' left, path or URL.

@@ -15,7 +15,7 @@ from depthpose.core.engine import Files, Function, Job, Sample
 from depthpose.core.errors import InputError
 from depthpose.core.files import VIDEO_SUFFIXES, image_size, read_image
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.config import Answer, MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import ENDINGS
 from depthpose.depth.types import StereoInput
@@ -33,6 +33,7 @@ class NetRecipe:
     with_right: bool
     with_sgbm: bool
     with_unlike: bool = True
+    answer: Answer | None = None
 
     def build(self) -> Method:
         """Build the networks on the device of the config."""
@@ -45,6 +46,7 @@ class NetRecipe:
                 with_right=self.with_right,
                 with_sgbm=self.with_sgbm,
                 with_unlike=self.with_unlike,
+                answer=self.answer,
             )
 
     def settings(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast, get_args
 
 from tqdm import tqdm
 
@@ -12,7 +12,7 @@ from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import own_device
-from depthpose.depth.config import FloorName, MatcherConfig, SGBMConfig
+from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.floors import NearestImageFloor, RowDepthFloor
 from depthpose.depth.kitti import Dataset
@@ -41,6 +41,7 @@ def weights_method(
     with_right: bool | None = None,
     with_sgbm: bool = False,
     with_unlike: bool = True,
+    answer: Answer | None = None,
 ) -> Method:
     """Build the network of a weights file, given by its path or by name.
 
@@ -50,6 +51,7 @@ def weights_method(
         with_right: show it the real right view; by default only to a matcher, which needs it.
         with_sgbm: let OpenCV match the drawn view in place of the weights' own matcher.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
+        answer: where depth of one image comes from, in place of what the weights say.
 
     Raises:
         InputError: a matcher alone is asked to do without the right view, or weights without a
@@ -75,19 +77,27 @@ def weights_method(
         )
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
     run = replace(config, device=own_device(config.device))
-    net = FakestereoNet.load(path, config=run, with_unlike=with_unlike)
+    net = FakestereoNet.load(path, config=run, answer=answer, with_unlike=with_unlike)
     if is_shown and net.matcher is None:
         raise InputError(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
             "weights with one, or sgbm."
         )
     name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
+    if answer is not None:
+        facts["answer"] = answer
+        name += f"-{answer}"
     return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:
-    """Build the method of a word: ``NAME``, ``both:NAME`` or ``sgbm:NAME`` (a file or a name)."""
+    """Build the method of a word: weights by file or name, perhaps with ``both:`` and the like.
+
+    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from.
+    """
     how, _, name = word.rpartition(":")
+    if how in get_args(Answer):
+        return weights_method(name, config, with_right=False, answer=cast("Answer", how))
     if how == "both":
         return weights_method(name, config, with_right=True)
     if how == "sgbm":
