@@ -41,7 +41,7 @@ def test_weights_without_a_matcher_are_tried_on_one_image(
     plane: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     net = FakestereoNet(None, make_synthesiser(sure_of(plane)))
-    monkeypatch.setattr(FakestereoNet, "load", lambda _: net)
+    monkeypatch.setattr(FakestereoNet, "load", lambda _, **__: net)
     assert main(["doctor"]) == code
     said = capsys.readouterr()
     if plane:
