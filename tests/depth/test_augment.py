@@ -19,8 +19,10 @@ from depthpose.depth.augment import (
     jitter_colors,
     pad_pair,
     scale_pair,
+    set_apart,
+    shift_rows,
 )
-from depthpose.depth.config import AugmentConfig
+from depthpose.depth.config import AugmentConfig, DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left, warp_right_to_left
 
 
@@ -122,6 +124,9 @@ CHANGES: dict[str, Callable[[TrainingPair, torch.Generator], TrainingPair]] = {
     "cropped": lambda pair, drawn: crop_pair(pair, (60, 150), drawn),
     "flipped twice": lambda pair, _: flip_and_swap(flip_and_swap(pair)),
     "recoloured": lambda pair, drawn: jitter_colors(pair, 0.3, drawn),
+    "set apart": lambda pair, drawn: set_apart(
+        pair, AugmentConfig(erased_share=1.0, misaligned_px=1.0), drawn
+    ),
     "padded": lambda pair, _: pad_pair(pair, (90, 300)),
     "all, crop too wide": lambda pair, drawn: augment(
         pair, AugmentConfig(crop_px=(60, 300), scale=(0.8, 1.3), flip_share=0.0), drawn
@@ -234,8 +239,37 @@ def test_flips_come_at_their_share() -> None:
         ({"scale": (2.0, 1.0)}, "scale must be a range"),
         ({"jitter": 1.0}, "jitter must be in"),
         ({"flip_share": 1.5}, "flip_share must be in"),
+        ({"erased_share": -0.1}, "erased_share must be in"),
+        ({"misaligned_px": 10.0}, "misaligned_px must be in"),
     ],
 )
 def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         AugmentConfig(**changes)  # pyright: ignore[reportArgumentType]
+
+
+def test_rows_of_one_view_are_off_in_proportion() -> None:
+    image = torch.arange(20.0)[None, :, None].expand(3, 20, 9).contiguous()
+    torch.testing.assert_close(shift_rows(image, 2.0, 2.0)[:, :-2], image[:, 2:], rtol=0, atol=1e-4)
+    turned = shift_rows(image, -1.0, 1.0)[0, 10] - 10
+    torch.testing.assert_close(turned, torch.linspace(-1, 1, 9), rtol=0, atol=1e-4)
+
+
+def test_a_patch_of_the_right_view_is_erased() -> None:
+    pair = street_pair()
+    found = set_apart(pair, AugmentConfig(erased_share=1.0), generator(0))
+    assert torch.equal(found.left, pair.left)
+    changed = (found.right != pair.right).any(0)
+    height, width = changed.shape
+    sides = (int(changed.any(1).sum()) / height, int(changed.any(0).sum()) / width)
+    assert all(1 / 6 - 0.02 < side < 1 / 3 + 0.02 for side in sides), sides
+    assert found.right[:, changed].unique(dim=1).shape[1] == 1
+
+
+def test_views_are_degraded_each_on_its_own() -> None:
+    pair = street_pair()._replace(right=street_pair().left)
+    config = AugmentConfig(apart=DegradeConfig(colour=0.3, hue_share=0.0))
+    found = set_apart(pair, config, generator(3))
+    assert not torch.allclose(found.left, found.right, atol=0.02)
+    assert torch.equal(found.left_px.nan_to_num(-1.0), pair.left_px.nan_to_num(-1.0))
+    assert set_apart(pair, AugmentConfig(), generator(3)) == pair

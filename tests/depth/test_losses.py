@@ -54,6 +54,12 @@ def test_smooth_l1_by_hand() -> None:
     assert float(disparity_loss(found, truth, 96)) == pytest.approx((0.125 + 2.5) / 2)
 
 
+def test_the_sky_may_be_learnt_as_no_disparity() -> None:
+    found, truth = torch.full((1, 1, 2), 3.0), torch.tensor([[[3.0, 0.0]]])
+    assert float(disparity_loss(found, truth, 96)) == 0
+    assert float(disparity_loss(found, truth, 96, with_sky=True)) == pytest.approx(2.5 / 2)
+
+
 def test_the_heads_weigh_a_half_seven_tenths_and_one() -> None:
     truth = torch.full((1, 1, 1), 5.0)
     heads = [truth + 1.5, truth + 2.5, truth + 3.5]

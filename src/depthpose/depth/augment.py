@@ -10,6 +10,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig
+from depthpose.depth.degrade import degrade
 
 _LUMA = (0.299, 0.587, 0.114)
 _UNKNOWN = torch.tensor(torch.nan)
@@ -49,7 +50,8 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
     cropped = crop_pair(scaled, _common_size(scaled, config.crop_px), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
         cropped = flip_and_swap(cropped)
-    return pad_pair(jitter_colors(cropped, config.jitter, generator), config.crop_px)
+    coloured = jitter_colors(cropped, config.jitter, generator)
+    return pad_pair(set_apart(coloured, config, generator), config.crop_px)
 
 
 def flip_and_swap(pair: TrainingPair) -> TrainingPair:
@@ -144,6 +146,50 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
     mean = (left.mean() + right.mean()) / 2  # one anchor, or the views would drift apart
     views = [_saturate((view - mean) * contrast + mean, saturation) for view in (left, right)]
     return pair._replace(left=views[0].clamp(0, 1), right=views[1].clamp(0, 1))
+
+
+def set_apart(
+    pair: TrainingPair, config: AugmentConfig, generator: torch.Generator
+) -> TrainingPair:
+    """Change each view on its own, as two real cameras differ; disparity stays what it is."""
+    if config.apart is not None:
+        left, right = (degrade(view, config.apart, generator) for view in (pair.left, pair.right))
+        pair = pair._replace(left=left, right=right)
+    if config.misaligned_px:
+        ends = config.misaligned_px * (2 * torch.rand(2, generator=generator) - 1)
+        pair = pair._replace(right=shift_rows(pair.right, *ends.tolist()))
+    if float(torch.rand((), generator=generator)) < config.erased_share:
+        pair = pair._replace(right=erase_patch(pair.right, generator))
+    return pair
+
+
+def shift_rows(
+    image: Float[Tensor, "3 h w"], left_px: float, right_px: float
+) -> Float[Tensor, "3 h w"]:
+    """Look each pixel up so many rows further down, in proportion between the two borders.
+
+    Columns stay, and so does disparity.
+    """
+    height, width = image.shape[1:]
+    rows = torch.arange(height)[:, None] + torch.linspace(left_px, right_px, width)
+    columns = torch.arange(width).expand(height, width)
+    places = [(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1]
+    grid = torch.stack(places, -1).to(image.dtype)
+    return F.grid_sample(image[None], grid[None], padding_mode="border", align_corners=False)[0]
+
+
+def erase_patch(
+    image: Float[Tensor, "3 h w"], generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    """Give a patch of a sixth to a third of each side the mean colour of the image."""
+    sides = []
+    for side in image.shape[1:]:
+        size = int(side * (1 + float(torch.rand((), generator=generator))) / 6)
+        first = int(torch.randint(side - size + 1, (), generator=generator))
+        sides.append(slice(first, first + size))
+    erased = image.clone()
+    erased[:, sides[0], sides[1]] = image.mean((1, 2))[:, None, None]
+    return erased
 
 
 def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 h w"]:

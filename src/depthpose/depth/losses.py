@@ -42,16 +42,22 @@ def l1_loss(made: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]) -> F
     return (made - real).abs().mean()
 
 
-def valid_disparity(truth_px: Float[Tensor, "b h w"], max_px: int) -> Bool[Tensor, "b h w"]:
-    """Where the truth can be learnt: known, positive and inside the matcher's range."""
-    return (truth_px > 0) & (truth_px < max_px)
+def valid_disparity(
+    truth_px: Float[Tensor, "b h w"], max_px: int, *, with_sky: bool = False
+) -> Bool[Tensor, "b h w"]:
+    """Where the truth can be learnt: known, positive (0 is the sky) and in the matcher's range."""
+    return ((truth_px >= 0) if with_sky else (truth_px > 0)) & (truth_px < max_px)
 
 
 def disparity_loss(
-    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], max_px: int
+    found_px: Float[Tensor, "b h w"],
+    truth_px: Float[Tensor, "b h w"],
+    max_px: int,
+    *,
+    with_sky: bool = False,
 ) -> Float[Tensor, ""]:
     """Smooth L1 over the pixels with truth (eq. 2.6 of the thesis); 0 where there are none."""
-    is_valid = valid_disparity(truth_px, max_px)
+    is_valid = valid_disparity(truth_px, max_px, with_sky=with_sky)
     # NaN truth must not reach the subtraction: its gradient would be NaN even where masked.
     difference = torch.where(is_valid, found_px - truth_px.nan_to_num(0.0), 0.0)
     losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="sum")
@@ -59,10 +65,14 @@ def disparity_loss(
 
 
 def heads_loss(
-    heads_px: Sequence[Float[Tensor, "b h w"]], truth_px: Float[Tensor, "b h w"], max_px: int
+    heads_px: Sequence[Float[Tensor, "b h w"]],
+    truth_px: Float[Tensor, "b h w"],
+    max_px: int,
+    *,
+    with_sky: bool = False,
 ) -> Float[Tensor, ""]:
     """Sum the loss of PSMNet's three heads, the later the heavier."""
-    losses = [disparity_loss(head, truth_px, max_px) for head in heads_px]
+    losses = [disparity_loss(head, truth_px, max_px, with_sky=with_sky) for head in heads_px]
     return torch.stack([w * x for w, x in zip(HEAD_WEIGHTS, losses, strict=True)]).sum()
 
 

@@ -11,6 +11,52 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class DegradeConfig:
+    """Random changes of an input image alone: what carries synthetic images over to real ones."""
+
+    colour: float = 0.35
+    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+
+    hue_share: float = 0.1
+    """Share of images whose channels are exchanged."""
+
+    veil_share: float = 0.2
+    """Share of images under a veil of haze."""
+
+    glare_share: float = 0.2
+    """Share of images with a light in them."""
+
+    blur_share: float = 0.4
+    """Share of images that are blurred."""
+
+    blur_px: float = 1.2
+    """Largest standard deviation of the blur [px]."""
+
+    noise_share: float = 0.6
+    """Share of images with noise."""
+
+    noise: float = 0.04
+    """Largest standard deviation of the noise; white is 1."""
+
+    jpeg_share: float = 0.3
+    """Share of images that go through JPEG."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        for name in ("hue", "veil", "glare", "blur", "noise", "jpeg"):
+            share = getattr(self, f"{name}_share")
+            if not 0 <= share <= 1:
+                raise InputError(f"{name}_share must be from 0 to 1, got {share}")
+        if not 0 <= self.colour < 1:
+            raise InputError(f"colour must be in [0, 1), got {self.colour}")
+        if self.blur_px < 0.3 or self.noise < 0:
+            raise InputError(
+                f"blur_px must be 0.3 or more and noise 0 or more, got {self.blur_px} and "
+                f"{self.noise}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class AugmentConfig:
     """Random changes of a training pair (thesis, 2.4.2)."""
 
@@ -27,6 +73,16 @@ class AugmentConfig:
     flip_share: float = 0.5
     """Share of pairs that are mirrored and swapped."""
 
+    apart: DegradeConfig | None = None
+    """Changes of each view on its own, as two cameras differ; None: none."""
+
+    erased_share: float = 0.0
+    """Share of pairs with a patch of the right view in one colour: what only one camera sees."""
+
+    misaligned_px: float = 0.0
+    """Rows of the right view are off by up to this at either border, as after a worn calibration
+    [px]."""
+
     def __post_init__(self) -> None:
         """Refuse changes that would break a pair."""
         if min(self.crop_px) < 1:
@@ -37,6 +93,10 @@ class AugmentConfig:
             raise InputError(f"jitter must be in [0, 1), got {self.jitter}; the thesis takes 0.2")
         if not 0 <= self.flip_share <= 1:
             raise InputError(f"flip_share must be in [0, 1], got {self.flip_share}")
+        if not 0 <= self.erased_share <= 1:
+            raise InputError(f"erased_share must be in [0, 1], got {self.erased_share}")
+        if not 0 <= self.misaligned_px < 10:
+            raise InputError(f"misaligned_px must be in [0, 10), got {self.misaligned_px}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,49 +188,3 @@ class PairsConfig:
             raise InputError(f"limit must be 1 pair or more, got {self.limit}")
         if self.focal_px is not None and self.focal_px <= 0:
             raise InputError(f"focal_px must be positive, got {self.focal_px}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DegradeConfig:
-    """Random changes of an input image alone: what carries synthetic images over to real ones."""
-
-    colour: float = 0.35
-    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
-
-    hue_share: float = 0.1
-    """Share of images whose channels are exchanged."""
-
-    veil_share: float = 0.2
-    """Share of images under a veil of haze."""
-
-    glare_share: float = 0.2
-    """Share of images with a light in them."""
-
-    blur_share: float = 0.4
-    """Share of images that are blurred."""
-
-    blur_px: float = 1.2
-    """Largest standard deviation of the blur [px]."""
-
-    noise_share: float = 0.6
-    """Share of images with noise."""
-
-    noise: float = 0.04
-    """Largest standard deviation of the noise; white is 1."""
-
-    jpeg_share: float = 0.3
-    """Share of images that go through JPEG."""
-
-    def __post_init__(self) -> None:
-        """Refuse shares that are none."""
-        for name in ("hue", "veil", "glare", "blur", "noise", "jpeg"):
-            share = getattr(self, f"{name}_share")
-            if not 0 <= share <= 1:
-                raise InputError(f"{name}_share must be from 0 to 1, got {share}")
-        if not 0 <= self.colour < 1:
-            raise InputError(f"colour must be in [0, 1), got {self.colour}")
-        if self.blur_px < 0.3 or self.noise < 0:
-            raise InputError(
-                f"blur_px must be 0.3 or more and noise 0 or more, got {self.blur_px} and "
-                f"{self.noise}"
-            )

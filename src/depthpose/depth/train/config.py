@@ -141,6 +141,9 @@ class StereoTraining:
     start: str | None = None
     """Weights to begin with (PSMNet, or a whole set)."""
 
+    with_sky: bool = False
+    """Learn a disparity of 0 where the truth knows the sky, in place of leaving it out."""
+
     adam: AdamConfig = field(default_factory=lambda: AdamConfig(schedule="halving"))
     """The optimiser: 1e-4, halved every quarter of the training."""
 

@@ -32,7 +32,7 @@ class StereoTask:
         heads = self.matcher(normalise(batch.left), normalise(batch.right))
         reach = self.matcher.config.max_disparity_px
         heads = tuple(head.float() for head in heads)
-        loss = heads_loss(heads, batch.left_px, reach)
+        loss = heads_loss(heads, batch.left_px, reach, with_sky=self.config.with_sky)
         yield Turn("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
 
     def validate(self) -> Evidence:
