@@ -88,10 +88,10 @@ ARMS = (
     Arm(name="pixel loss", change={"disparity_loss": "pixel"}),
     Arm(name="no cross entropy", change={"plane_weight": 0.0}),
     Arm(name="no view loss", change={"view_weight": 0.0}),
-    Arm(name="no labels, view loss", unlabelled="unlabelled"),
-    Arm(name="no labels, no view loss", unlabelled="none"),
-    Arm(name="encoder's rate 0.05", change={"encoder_rate": 0.05}),
-    Arm(name="harsher degrade", change={"degrade": HARSH}),
+    Arm(name="pairs without truth teach by the view alone", unlabelled="unlabelled"),
+    Arm(name="pairs without truth left out", unlabelled="none"),
+    Arm(name="pairs without truth left out", unlabelled="none", seed=1),
+    Arm(name="streets alone", sees="streets", seed=1),
 )
 
 

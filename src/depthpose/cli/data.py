@@ -49,6 +49,42 @@ def check(
     return 0 if report.is_ok else 1
 
 
+def pack(
+    path: tyro.conf.Positional[Path],
+    out: Path,
+    split: str | None = None,
+    shard_mb: int = 256,
+) -> int:
+    """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
+
+    Whatever takes a data set takes OUT, or a URL to which it was copied (s3://, gs://): a training
+    reads it by index, and a shard of a store comes to this machine, into ~/.cache/depthpose or
+    $DEPTHPOSE_CACHE, when it is first read. Files are copied as they are. index.json is written
+    last; what was stopped before begins again.
+
+        depthpose data pack KITTI --split eigen-train-val --out shards
+
+    Args:
+        path: the data set's folder.
+        out: a new folder for shards, calibration and index.
+        split: pack these frames alone.
+        shard_mb: megabytes of a shard, from which on the next one begins.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.run import refuse_to_replace
+    from depthpose.depth.kitti import open_dataset, pack_frames
+
+    if shard_mb < 1:
+        raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
+    refuse_to_replace(out / "index.json")
+    dataset = open_dataset(path, split)
+    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
+        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
+    print(f"{len(dataset)} frames in {shards} shards: {out}")
+    return 0
+
+
 def duplicates(
     train: tyro.conf.Positional[Path],
     evaluation: tyro.conf.Positional[Path],

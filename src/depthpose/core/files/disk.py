@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from depthpose.core.errors import InputError
+from depthpose.core.files.shards import read_member, split_member
 
 AnyPath = str | os.PathLike[str]
 """A path as users give it."""
@@ -19,7 +20,7 @@ MAX_FILE_BYTES = 2**28
 
 
 def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole.
+    """Read a regular file whole, or one in a tar shard (:mod:`depthpose.core.files.shards`).
 
     Args:
         path: the file.
@@ -29,6 +30,9 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
         InputError: there is no such file, or it is a folder, a device, too large or unreadable.
     """
     try:
+        member = split_member(Path(path))
+        if member is not None:
+            return read_member(*member, most)
         status = Path(path).stat()
         _refuse_irregular(path, status, most)
         return Path(path).read_bytes()

@@ -18,6 +18,7 @@ from depthpose.depth.kitti.frames import known_truths as known_truths
 from depthpose.depth.kitti.frames import lidar_truth as lidar_truth
 from depthpose.depth.kitti.frames import read_disparity as read_disparity
 from depthpose.depth.kitti.lidar import project_lidar as project_lidar
+from depthpose.depth.kitti.packed import pack_frames as pack_frames
 from depthpose.depth.kitti.splits import Split as Split
 from depthpose.depth.kitti.splits import read_split as read_split
 from depthpose.depth.kitti.writer import RawFrame as RawFrame

@@ -20,6 +20,7 @@ from depthpose.depth.kitti.frames import (
     lidar_truth,
 )
 from depthpose.depth.kitti.layouts import find_frames
+from depthpose.depth.kitti.packed import local_folder
 from depthpose.depth.kitti.splits import Split, read_split
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
 
@@ -58,18 +59,19 @@ class Dataset:
         return frame_rig(self.frames[index])
 
 
-def open_dataset(folder: Path, split: str | Path | None = None) -> Dataset:
-    """Open a KITTI, Middlebury or plain folder; its layout is recognised.
+def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset:
+    """Open a KITTI, Middlebury or plain folder, or packed shards; the layout is recognised.
 
     Args:
-        folder: the dataset's root (KITTI's ``training`` folder will do too).
+        folder: the dataset's root (KITTI's ``training`` folder will do too); of packed shards
+            perhaps a URL such as ``s3://bucket/streets``.
         split: name or file of a split: only its frames, which must all be there.
 
     Raises:
         InputError: no such folder or layout, two images of one name, or frames of the split are
             missing.
     """
-    folder = Path(folder)
+    folder = local_folder(folder)
     layout, frames = find_frames(folder)
     for frame, after in pairwise(frames):
         if frame.name == after.name:

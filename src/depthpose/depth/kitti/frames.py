@@ -113,7 +113,7 @@ def _read_rig(frame: Frame, path: Path) -> StereoRig:
     width, height = image_size(frame.left)
     if frame.style == "camera":
         return read_rig(path, (width, height))
-    return read_plain_calibration(path, frame.left.stem, width, height)
+    return read_plain_calibration(path, frame.name, width, height)
 
 
 def kitti_calibration(frame: Frame) -> KittiCalibration:

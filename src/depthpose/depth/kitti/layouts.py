@@ -5,6 +5,7 @@ from pathlib import Path
 
 from depthpose.core.errors import InputError
 from depthpose.depth.kitti.frames import Frame
+from depthpose.depth.kitti.packed import packed_frames
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -29,7 +30,7 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
         "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
         "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json, "
-        f".yaml).{hint}"
+        f".yaml), shards of 'depthpose data pack' (index.json).{hint}"
     )
 
 
@@ -144,6 +145,7 @@ def _pairs(folder: Path) -> Iterable[Frame]:
 
 
 LAYOUTS: dict[str, Callable[[Path], Iterable[Frame]]] = {
+    "packed shards": packed_frames,
     "KITTI raw": _raw,
     "KITTI object or 2015": _object_or_2015,
     "KITTI 2012": _kitti_2012,

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -184,7 +183,7 @@ def _find_places(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> l
         exact: TruthKind | None = "disparity" if needs_truth else None
         found += _spread([_Place(made, index, exact) for index in range(len(made))], config.limit)
     for number, folder in enumerate(config.folders):
-        dataset = open_dataset(Path(folder), config.split if number == 0 else None)
+        dataset = open_dataset(folder, config.split if number == 0 else None)
         excluded -= {frame.name for frame in dataset.frames}
         usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
         found += _spread(usable, config.limit)
