@@ -114,6 +114,9 @@ def main(words: Sequence[str] | None = None) -> int:
         said = str(stop) or "interrupted"
         print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
         return 130
+    finally:
+        if "depthpose.core.hold" in sys.modules:
+            sys.modules["depthpose.core.hold"].release_folders()
 
 
 @contextmanager

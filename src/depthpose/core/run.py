@@ -16,6 +16,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_json
+from depthpose.core.hold import hold, write_once
 
 RECORD = "run.json"
 _SOURCES = "sources.json"
@@ -106,6 +107,9 @@ def claim_folder(
 ) -> None:
     """Make ``folder`` the home of a run with these settings, or continue such a run.
 
+    It is this process's until :func:`depthpose.core.hold.release_folders`, and that of all
+    processes of one launch.
+
     Args:
         folder: made where it is missing.
         settings: JSON values that decide the results; compared with those of an earlier run.
@@ -114,7 +118,8 @@ def claim_folder(
 
     Raises:
         InputError: the folder holds a run with other settings (the first difference is named), or
-            a file that is not the run's and would be written over.
+            a file that is not the run's and would be written over, or another command is writing
+            there.
     """
     record = folder / RECORD
     if not record.exists():
@@ -122,10 +127,10 @@ def claim_folder(
         # Looked at again: another process may have begun the same run.
         if there and not record.exists():
             raise _not_ours(folder / there[0])
-    if record.exists():
-        refuse_other_settings(folder, read_json(record), settings)
-        return
-    write_json(record, run_record(settings))
+    if not record.exists():
+        write_once(record, run_record(settings))
+    refuse_other_settings(folder, read_json(record), settings)
+    hold(record, is_shared=find_shard().world > 1)
 
 
 def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import torch
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
+from depthpose.core.hold import release_folders
 from depthpose.core.loop import (
     LoopConfig,
     Progress,
@@ -182,7 +183,11 @@ def _walk(
     names = ("generator", "matcher", "fakestereo")
     claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
-    seconds = train(task, pairs, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    try:
+        loop, told = config.loop, run.on_step
+        seconds = train(task, pairs, loop, run.folder, resume=run.resume, on_step=told)
+    finally:
+        release_folders()
     return facts, seconds
 
 

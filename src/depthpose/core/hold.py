@@ -1,0 +1,80 @@
+"""One command at a time writes into a folder."""
+
+import os
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_json
+from depthpose.core.files.disk import refused_write
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
+
+
+def write_once(record: Path, content: Mapping[str, Any]) -> None:
+    """Write the record of a run, unless another process has just done so."""
+    own = record.with_name(f".part-{os.getpid()}-{record.name}")
+    with refused_write(record):
+        record.parent.mkdir(parents=True, exist_ok=True)
+    write_json(own, content)
+    try:
+        with suppress(FileExistsError):
+            os.link(own, record)
+    except OSError:  # a file system without links
+        write_json(record, content)
+    finally:
+        own.unlink(missing_ok=True)
+
+
+_held: dict[Path, int] = {}
+"""Records of the folders that this process writes to, locked, and their descriptors."""
+
+
+def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> None:
+    """Keep other commands out of a folder until :func:`release_folders`, or the process ends.
+
+    A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
+    Where the file system or the machine has none, nothing is held.
+
+    Args:
+        record: a file in the folder that no command replaces.
+        is_shared: let other processes of the same launch in.
+        patience_s: how long another command may take to end.
+
+    Raises:
+        InputError: another command holds the folder, and goes on holding it.
+    """
+    if fcntl is None or record.resolve() in _held:
+        return
+    file = os.open(record, os.O_RDWR)
+    kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
+    last = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.lockf(file, kind | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() > last:
+                os.close(file)
+                raise InputError(
+                    f"{record.parent}: another command is writing there; wait until it has ended, "
+                    "or choose another folder"
+                ) from error
+            time.sleep(0.1)
+        except OSError:  # no locks on this file system
+            os.close(file)
+            return
+        else:
+            _held[record.resolve()] = file
+            return
+
+
+def release_folders() -> None:
+    """Let other commands into the folders that this process has claimed."""
+    while _held:
+        os.close(_held.popitem()[1])

@@ -1,0 +1,82 @@
+"""One command at a time in a folder: the other waits, and is refused in the end."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from depthpose.core.errors import InputError
+from depthpose.core.hold import hold, release_folders, write_once
+from depthpose.core.run import RECORD, claim_folder
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from depthpose.core.run import claim_folder
+claim_folder(Path(sys.argv[1]), {"a": 1})
+print("held", flush=True)
+time.sleep(float(sys.argv[2]))
+"""
+
+
+@contextmanager
+def holder(folder: Path, seconds: int, **environment: str) -> Iterator["subprocess.Popen[str]"]:
+    """Start a process that claims a folder, and wait until it has."""
+    words = [sys.executable, "-c", HOLDER, str(folder), str(seconds)]
+    own = {**os.environ, **environment}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=own) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+            release_folders()
+
+
+def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
+    refused = pytest.raises(InputError, match="another command is writing there")
+    with holder(tmp_path, 600), refused:
+        hold(tmp_path / RECORD, is_shared=False, patience_s=0.3)
+    claim_folder(tmp_path, {"a": 1})
+    release_folders()
+
+
+def test_a_second_command_waits_for_one_that_ends(tmp_path: Path) -> None:
+    with holder(tmp_path, 1) as process:
+        began = time.monotonic()
+        hold(tmp_path / RECORD, is_shared=False, patience_s=60.0)
+        assert process.wait() == 0
+        assert time.monotonic() - began < 60
+
+
+def test_processes_of_one_launch_share_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    with holder(tmp_path, 600, WORLD_SIZE="2", RANK="0"):
+        claim_folder(tmp_path, {"a": 1})
+        release_folders()
+        with pytest.raises(InputError, match="another command is writing there"):
+            hold(tmp_path / RECORD, is_shared=False, patience_s=0.2)
+
+
+def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    claim_folder(tmp_path, {"a": 1})
+    release_folders()
+    with holder(tmp_path, 0) as process:
+        assert process.wait() == 0
+
+
+def test_the_first_record_stays(tmp_path: Path) -> None:
+    write_once(tmp_path / "run.json", {"settings": {"a": 1}})
+    write_once(tmp_path / "run.json", {"settings": {"a": 2}})
+    assert '"a": 1' in (tmp_path / "run.json").read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
