@@ -1,6 +1,7 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -9,12 +10,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import check_image
-from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
+from depthpose.core.camera import (
+    AnyCamera,
+    Camera,
+    StereoRig,
+    check_image_matches_camera,
+    choose_lens,
+)
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
+from depthpose.depth.estimator.inputs import (
+    Picture,
+    as_input,
+    as_inputs,
+    as_tensor,
+    refuse_unrectified,
+    usable_right,
+)
 from depthpose.depth.estimator.matchers import choose_matcher, set_answer, work_focal_px
 from depthpose.depth.estimator.virtual import (
     focal_size,
@@ -104,8 +118,9 @@ class FakestereoNet:
     def estimate(
         self,
         image: Picture,
-        camera: Camera | str | Path | None,
+        camera: AnyCamera | None = None,
         *,
+        focal_px: float | None = None,
         right: Picture | None = None,
         name: str | None = None,
         with_check: bool = True,
@@ -113,11 +128,14 @@ class FakestereoNet:
         """Estimate depth of ``image``, alone or as the left one of a rectified pair.
 
         Args:
-            image: the image, the left one of a pair: a file, a tensor of RGB in [0, 1], or an
-                array of 8-bit RGB (of OpenCV's BGR, ``image[..., ::-1]``).
-            camera: camera or rig, or its file of any format that is read. One image needs its
-                focal length, for the image is brought to the rig that the generator imitates; a
-                baseline is not looked at. A pair without camera gives disparity only.
+            image: the image, the left one of a pair: a file, a picture of Pillow's, an array or a
+                tensor, RGB, RGBA or grey, 8-bit numbers or floats in [0, 1] (of OpenCV's BGR,
+                ``image[..., ::-1]``).
+            camera: camera or rig, its file of any format that is read, a dict of what such a file
+                holds, or the 3x3 matrix K. One image needs its focal length, for the image is
+                brought to the rig that the generator imitates; a baseline is not looked at. A pair
+                without camera gives disparity only.
+            focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
             name: what to call the input in errors; the file's name by default.
             with_check: look whether the pair is rectified and in the right order first.
@@ -127,20 +145,9 @@ class FakestereoNet:
                 needed, a pair that is swapped or not rectified.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
-        left = as_tensor(image)
-        if isinstance(camera, str | Path):
-            camera = read_camera(Path(camera), (left.shape[2], left.shape[1]))
-        if camera is not None and not isinstance(camera, Camera):
-            raise InputError(
-                f"camera is a {type(camera).__name__}; give a Camera(width=, height=, K=), or a "
-                "StereoRig for metres from a pair, or its file"
-            )
-        pair = StereoInput(
-            name=chosen,
-            left=left,
-            right=None if right is None else as_tensor(right),
-            camera=camera,
-        )
+        pair = as_input(image, chosen, choose_lens(camera, focal_px))
+        if right is not None:
+            pair = replace(pair, right=as_tensor(right, "the right image"))
         return self.estimate_pair(pair, with_check=with_check)
 
     @torch.inference_mode()
@@ -166,16 +173,28 @@ class FakestereoNet:
         )
 
     @torch.inference_mode()
-    def estimate_many(self, images: Sequence[StereoInput]) -> list[DepthEstimate]:
+    def estimate_many(
+        self,
+        images: Sequence[StereoInput] | Sequence[Picture] | Picture,
+        camera: AnyCamera | None = None,
+        *,
+        focal_px: float | None = None,
+    ) -> list[DepthEstimate]:
         """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
 
         An input with a right view is matched with it, as :meth:`estimate_pair` does.
+
+        Args:
+            images: inputs; or pictures, or a batch of them as one array or tensor.
+            camera: of the pictures, as for :meth:`estimate`; inputs have their own.
+            focal_px: the same as its focal length alone [px].
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
         found: list[DepthEstimate] = []
-        for size, group in groupby(images, self._size_alone):
+        inputs = as_inputs(images, choose_lens(camera, focal_px))
+        for size, group in groupby(inputs, self._size_alone):
             alike = list(group)
             is_alone = size is not None
             found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
