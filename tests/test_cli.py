@@ -84,7 +84,11 @@ def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[st
          "none.pth: there is no such checkpoint file"),
         (["data", "check", "nowhere"], "nowhere"),
         (["depth", "evaluate", "--data", ".", "--out", "o"], "measure --weights FILE"),
-        (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o"], "match with --weights"),
+        (
+            ["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm",
+             "--weights", "w"],
+            "--weights w and --matcher sgbm: one of the two matches the pair",
+        ),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
          "l: no .png"),
         (["export", "depth", "--weights", "parts", "--out", "d.onnx"],

@@ -133,6 +133,35 @@ def test_weights_that_answer_themselves_need_no_matcher(
     assert "holds no matcher, which a pair needs" in capsys.readouterr().err
 
 
+def test_a_pair_is_matched_by_the_default_weights_where_none_are_named(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, image = tmp_path / "rig.json", str(home / "images/0.png")
+    rig.write_text(json.dumps({**CAMERA, "baseline_m": 0.5}))
+    pair = ["depth", "match", image, image, "--camera", str(rig), "--no-check", "--out"]
+    for name, words in (("none", []), ("named", ["--matcher", "default"])):
+        assert main([*pair, str(tmp_path / name), *words]) == 0
+        settings = json.loads((tmp_path / name / "run.json").read_text())["settings"]
+        assert settings["weights"] == "default"
+    assert main([*pair, str(tmp_path / "x"), "--matcher", "sgmb"]) == 2
+    assert "'sgmb': neither a file nor the name of weights" in capsys.readouterr().err
+
+
+def test_another_matcher_looks_at_the_drawn_view(home: Path, tmp_path: Path) -> None:
+    """Weights are named by --matcher here as in a training."""
+    words = (str(home / "images/0.png"), "--camera", str(home / "cam.json"))
+    for matcher in ("default", str(home / "w.safetensors"), "psmnet"):
+        out = tmp_path / Path(matcher).stem
+        assert predict(home, out, *words, "--matcher", matcher) == 0
+    said = json.loads((tmp_path / "default/run.json").read_text())["settings"]
+    assert said["matcher"] == "fakestereo with default"
+    own, other, same = (
+        read_map(tmp_path / f"{n}/0.depth_m.npy") for n in ("psmnet", "default", "w")
+    )
+    assert torch.equal(own, same)
+    assert not torch.equal(own, other)
+
+
 def test_processes_share_a_folder_of_images(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,9 +38,8 @@ class NetRecipe:
         if self.weights is None:
             return sgbm_method(with_filled_holes=False)
         with self.weights.unpacked() as path:
-            return weights_method(
-                path, self.config, with_right=self.with_right, with_sgbm=self.with_sgbm
-            )
+            matcher = "sgbm" if self.with_sgbm else "psmnet"
+            return weights_method(path, self.config, with_right=self.with_right, matcher=matcher)
 
     def settings(self) -> dict[str, Any]:
         """Say what decides the results; this machine need not have the workers' device."""

@@ -51,7 +51,8 @@ def train(
         held_out: folders of pairs that validation looks at, and none of which is learnt from; of
             each 20, evenly taken, where the config says no other number.
         generator: finetune: weights of the generator to begin with.
-        matcher: finetune: weights of the matcher, which is not changed.
+        matcher: finetune: what matches the drawn view: weights with a matcher, by name or file,
+            which are not changed.
         start: view, select, stereo: weights to begin with.
         encoder: select: weights of the encoder to begin with, of 'depthpose weights import
             efficientnet-lite0'.

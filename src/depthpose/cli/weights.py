@@ -127,7 +127,7 @@ def pack_weights(
         out: the .safetensors file to write.
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
-        matcher: take the matcher from these weights.
+        matcher: what matches the two views: weights with a matcher, by name or file.
         terms: said whenever the weights are loaded; for licences that bind the user. Those of the
             weights that are packed stay beside them.
         half: store 16-bit floats: half the size.

@@ -43,6 +43,9 @@ from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
 
+DEFAULT = "default"
+"""Name of the weights that are taken where none are named."""
+
 
 class FakestereoNet:
     """Metric depth from one image, by a synthesised right view, or from a rectified pair.
@@ -58,10 +61,16 @@ class FakestereoNet:
             ``answer`` is own), for one image alone.
         synthesiser: left view to right view; None matches real pairs only.
         terms: of the weights, where they bind whoever uses them.
+        weights: what they are called.
     """
 
     def __init__(
-        self, matcher: Matcher | None, synthesiser: Synthesiser | None = None, *, terms: str = ""
+        self,
+        matcher: Matcher | None,
+        synthesiser: Synthesiser | None = None,
+        *,
+        terms: str = "",
+        weights: str = "",
     ) -> None:
         if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
             raise InputError(
@@ -71,6 +80,15 @@ class FakestereoNet:
         self.matcher = matcher
         self.synthesiser = synthesiser
         self.terms = terms
+        self.weights = weights
+
+    def __repr__(self) -> str:
+        """Say it in one line: what draws and what matches, weights, device."""
+        parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
+        said = [" + ".join(type(part).__name__ for part in parts)]
+        said += [f"weights {self.weights!r}"] if self.weights else []
+        devices = {str(part.device) for part in parts if hasattr(part, "device")}
+        return f"FakestereoNet({', '.join(said + sorted(devices))})"
 
     @classmethod
     def load(
@@ -88,7 +106,7 @@ class FakestereoNet:
         Args:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
-                ``matcher`` alone.
+                ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
                 What names weights: :func:`depthpose.core.checkpoint.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
@@ -100,6 +118,8 @@ class FakestereoNet:
             InputError: no such weights, no matcher in what was given, or an ``answer`` that these
                 weights cannot give.
         """
+        if weights is None and (matcher is None or matcher == "psmnet"):
+            weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
         if answer is not None:
             set_answer(found, answer)
@@ -111,9 +131,14 @@ class FakestereoNet:
         say_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = choose_matcher(weights, found, matcher, own, config)
+        said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
         if found is None or found.generator is None:
-            return cls(chosen, terms=terms)
-        return cls(chosen, make_synthesiser(found.generator, run.device), terms=terms)
+            return cls(chosen, terms=terms, weights=said)
+        synthesiser = make_synthesiser(found.generator, run.device)
+        return cls(chosen, synthesiser, terms=terms, weights=said)
+
+    from_pretrained = load
+    """The same as :meth:`load`."""
 
     def estimate(
         self,

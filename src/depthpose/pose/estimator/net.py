@@ -49,6 +49,7 @@ class GeoPoseNet:
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
         self.config = EstimateConfig() if config is None else config
         self.weights = weights
+        self.name = ""
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights regress a depth image and cast no votes; load them as "
@@ -59,7 +60,9 @@ class GeoPoseNet:
         self._surfaces: dict[int, Surface] = {}
 
     @classmethod
-    def load(cls, weights: str | Path, config: EstimateConfig | None = None) -> "GeoPoseNet":
+    def load(
+        cls, weights: str | Path = "parts", config: EstimateConfig | None = None
+    ) -> "GeoPoseNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
         Weights whose terms bind the user say so (:class:`LicenceNotice`).
@@ -69,7 +72,18 @@ class GeoPoseNet:
         """
         found = read_pose_weights(find_weights(weights))
         say_terms(found.facts)
-        return cls(found, config)
+        net = cls(found, config)
+        net.name = str(weights)
+        return net
+
+    from_pretrained = load
+    """The same as :meth:`load`."""
+
+    def __repr__(self) -> str:
+        """Say it in one line: the network, its objects, weights, device."""
+        said = f"{type(self._network).__name__} of {', '.join(self.objects)}"
+        named = f", weights {self.name!r}" if self.name else ""
+        return f"GeoPoseNet({said}{named}, {self.config.device})"
 
     @property
     def terms(self) -> str:
