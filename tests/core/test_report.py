@@ -16,6 +16,7 @@ from depthpose.core.report import (
     Section,
     csv_table,
     markdown_table,
+    plain_table,
     write_markdown,
     write_page,
     write_table,
@@ -103,3 +104,14 @@ def test_the_words_and_tables_of_a_page_are_markdown_too(tmp_path: Path) -> None
     text = (tmp_path / "r.md").read_text()
     assert text.startswith("# Title\n\n## One\n\nWords.\n\n| name | x |")
     assert text.endswith("## Two\n\ntorch 2 · date today\n")
+
+
+def test_a_table_for_the_terminal_has_the_columns_that_are_asked_for() -> None:
+    rows = [
+        {"method": "ours", "d1": 0.5, "much": 1, "none": None},
+        {"method": "theirs", "d1": 0.25, "much": 2, "none": None},
+    ]
+    assert plain_table(rows, ["method", "d1", "none", "elsewhere"]) == (
+        "method  d1\nours    0.5000\ntheirs  0.2500\n"
+    )
+    assert plain_table(rows).startswith("method  d1      much\n")

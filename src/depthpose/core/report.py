@@ -106,6 +106,24 @@ def markdown_table(rows: Sequence[Row]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
+def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
+    """Format rows for a terminal, in columns of their own width; columns without a value go.
+
+    Args:
+        rows: to be shown.
+        names: of the columns, where not all are wanted; one that no row has is left out.
+    """
+    wanted = [
+        n for n in names or column_names(rows) if any(row.get(n) not in (None, "") for row in rows)
+    ]
+    cells = [wanted, *([show_value(row.get(name)) for name in wanted] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "".join(
+        "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
+        for line in cells
+    )
+
+
 def csv_table(rows: Sequence[Row]) -> str:
     """Format rows as CSV with a header, every digit kept."""
     text = io.StringIO()
