@@ -17,6 +17,7 @@ from tests.made_street import make_street
 from tests.pages.read_page import read_page
 
 from depthpose.cli import main
+from depthpose.cli.training import Lines
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
@@ -28,7 +29,7 @@ from depthpose.core.files import (
     write_image,
     write_video,
 )
-from depthpose.core.loop import read_metrics
+from depthpose.core.loop import Progress, read_metrics
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet, SGBMMatcher
 from depthpose.depth.synthesis import UNetGenerator
@@ -353,6 +354,8 @@ def test_training_by_config_and_words(
     said = capsys.readouterr().out
     assert "generator.safetensors" in said
     assert "- **Time**: 2 steps in " in said
+    assert said.startswith("step 1 of 2"), "there is no terminal"
+    assert "\nstep 2 of 2, discriminator/loss " in said
     assert "held_out/l1" in read_metrics(tmp_path / "run")[-1]
     assert list((tmp_path / "run" / "pictures").glob("*.png"))
     assert (tmp_path / "run" / "generator.safetensors").is_file()
@@ -361,6 +364,43 @@ def test_training_by_config_and_words(
     assert main([*words, "--steps", "2", "--resume"]) == 0
     assert main([*words, "--steps", "3", "--resume"]) == 2
     assert "loop.steps = 2, but now it is 3" in capsys.readouterr().err
+
+
+def test_without_a_terminal_a_line_is_printed_each_minute(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    seconds = iter(range(0, 4000, 10))
+    lines = Lines(clock=lambda: float(next(seconds)))
+    for step in range(1, 101):
+        numbers = {"net/loss": 1 / step} if step % 50 == 0 else {}
+        lines.show(Progress(step=step, steps=100, numbers=numbers))
+    said = capsys.readouterr().out.splitlines()
+    assert said[:2] == ["step 1 of 100", "step 7 of 100, 16 min left"]
+    assert said[-2:] == [
+        "step 97 of 100, 0 min left, net/loss 0.02",
+        "step 100 of 100, net/loss 0.01",
+    ]
+    assert len(said) == 18
+
+
+def test_a_stopped_training_is_finished_by_a_word(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "view.yaml").write_text(VIEW.replace("steps: 4", "steps: 4, save_every_steps: 1"))
+    words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
+    words += ["--data", str(pairs), "--out", str(tmp_path / "run")]
+    assert main([*words, "--finish"]) == 2
+    assert "holds no state of a training" in capsys.readouterr().err
+
+    def stop(self: Lines, progress: Progress) -> None:
+        if progress.step == 1:
+            raise KeyboardInterrupt
+
+    with patch.object(Lines, "show", stop):
+        assert main(words) == 130
+    assert main([*words, "--finish"]) == 0
+    assert "- **Time**: " in capsys.readouterr().out
+    assert (tmp_path / "run" / "generator.safetensors").is_file()
 
 
 @pytest.mark.slow

@@ -39,6 +39,9 @@ def test_a_cad_file_becomes_weights_with_a_card(
     said = capsys.readouterr().out
     assert f"trained weights: {out / 'pose.safetensors'}" in said
     assert "| 0 | " in said
+    assert "trained; now the refusal is calibrated" in said
+    card = (out / "pose.md").read_text()
+    assert f"--cad {part} --unit mm --config config.yaml --out my_part`" in card
     (model,) = read_pose_weights(out / "pose.safetensors").models
     assert model.name == "bracket"
     assert model.diameter_m == pytest.approx(0.160, abs=0.001)
