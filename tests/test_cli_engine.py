@@ -270,4 +270,4 @@ def test_without_ray_the_extra_is_named(
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     monkeypatch.setitem(__import__("sys").modules, "ray.data", None)
     assert predict(home, tmp_path, str(home / "left"), *RAY) == 2
-    assert "pip install 'depthpose[ray]'" in capsys.readouterr().err
+    assert "pip install -e '.[ray]'" in capsys.readouterr().err

@@ -181,7 +181,7 @@ def test_registration_wants_a_data_set_and_open3d(
     monkeypatch.setitem(sys.modules, "open3d", None)
     words = ["--bop", str(made.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
     assert main(["pose", "evaluate", *words]) == 2
-    assert "pip install 'depthpose[open3d]'" in capsys.readouterr().err
+    assert "pip install -e '.[open3d]'" in capsys.readouterr().err
     assert main(["pose", "predict", *words]) == 2
     assert "open3d: it looks for the models of a data set" in capsys.readouterr().err
 

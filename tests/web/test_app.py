@@ -387,7 +387,7 @@ def test_an_unknown_cad_file_is_refused_where_open3d_is_missing(
     assert status == 400
     assert "wide.obj: the weights know" in text
     assert "depthpose pose train --cad" in text
-    assert "pip install 'depthpose[open3d]'" in text
+    assert "pip install -e '.[open3d]'" in text
 
 
 @pytest.mark.skipif(find_spec("open3d") is None, reason="Open3D is not installed")

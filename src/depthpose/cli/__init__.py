@@ -8,16 +8,18 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from importlib import import_module
-from inspect import cleandoc
+from inspect import cleandoc, signature
 
 from depthpose import __version__
+from depthpose.cli.early import refuse_missing
 from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
 
 COMMANDS = {
     "demo": (
         "demo:demo",
-        "run everything on a made street and open the books: out/demo/report.html",
+        "pose made parts, match a real pair, guess a street: out/demo/report.html",
     ),
     "doctor": (
         "doctor:doctor",
@@ -148,9 +150,15 @@ def _run(name: str, rest: list[str]) -> int:
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
+
+    @wraps(command)
+    def checked(*words: object, **options: object) -> int:
+        refuse_missing(signature(command).bind(*words, **options).arguments)
+        return command(*words, **options)
+
     try:
         return tyro.cli(
-            command,
+            checked,
             prog=f"depthpose {name}",
             description=text,
             args=rest,
