@@ -284,10 +284,10 @@ def test_two_processes_share_the_work(
     ("words", "said"),
     [
         ([], "0 of --cloud, --depth and --bop are given; give one"),
-        (["--cloud", "a.ply", "--bop", "b"], "2 of --cloud, --depth and --bop are given"),
-        (["--cloud", "a.ply"], "the weights know bracket, bottle; say which by --object"),
-        (["--cloud", "a.ply", "--object", "bracke"], "did you mean 'bracket'?"),
-        (["--depth", "d.png", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
+        (["--cloud", ".", "--bop", "."], "2 of --cloud, --depth and --bop are given"),
+        (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
+        (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
+        (["--depth", ".", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz file there"),
     ],
 )

@@ -105,11 +105,11 @@ def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--cad", "part.stl"], "--cad without --unit: no file says its unit; give --unit mm"),
+        (["--cad", "."], "--cad without --unit: no file says its unit; give --unit mm"),
         ([], "there is no object to learn; name its CAD file (--cad FILE --unit mm)"),
-        (["--data", "lm"], "--data lm: the config learns from no data set"),
+        (["--data", "."], "--data .: the config learns from no data set"),
         (
-            ["--what", "segmentation", "--cad", "part.stl", "--unit", "mm"],
+            ["--what", "segmentation", "--cad", ".", "--unit", "mm"],
             "--cad has no meaning for 'segmentation', which learns from pictures",
         ),
         (["--cad", "nowhere.stl", "--unit", "mm"], "nowhere.stl"),
@@ -156,10 +156,10 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     monkeypatch.setitem(STAGES, "pose", (PoseTraining, stand_in))
     (tmp_path / "c.yaml").write_text("{}")
     words = ["pose", "train", "--cad", str(part), "--unit", "mm", "--out", str(tmp_path / "run")]
-    more = [[], ["--start", "nothing"], ["--start", "a.safetensors"]]
+    more = [[], ["--start", "nothing"], ["--start", "default"]]
     for extra in [*more, ["--config", str(tmp_path / "c.yaml")]]:
         assert main([*words, *extra]) == 0
-    assert started == ["parts", None, "a.safetensors", None]
+    assert started == ["parts", None, "default", None]
     own = read_config(
         Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml", PoseTraining
     )

@@ -8,13 +8,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.hub import is_on_hub
 from depthpose.core.shipped import find_weights
 
-_PATHS = frozenset({
+PATHS = frozenset({
     *("images", "left", "right", "camera", "cloud", "depth", "mask", "bop", "data", "held_out"),
     *("train", "evaluation", "path", "config", "cad", "csv", "predictions", "targets", "file"),
     *("models", "kitti", "linemod", "configs"),
 })  # fmt: skip
 """Arguments of commands that name files or folders that are read."""
-_WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})
+WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})
 """Arguments that name weights, by name or file."""
 _WORDS = ("psmnet", "sgbm", "nothing", "open3d")
 """What they may say in place of weights."""
@@ -32,9 +32,9 @@ def refuse_missing(given: Mapping[str, object]) -> None:
     """
     for name, value in given.items():
         for one in value if isinstance(value, list | tuple) else [value]:
-            if name in _PATHS and isinstance(one, str | Path):
+            if name in PATHS and isinstance(one, str | Path):
                 _refuse_path(str(one))
-            elif name in _WEIGHTS and isinstance(one, str):
+            elif name in WEIGHTS and isinstance(one, str):
                 _refuse_weights(one)
 
 

@@ -34,10 +34,13 @@ def train(
     finish: bool = False,
     view: str | None = None,
 ) -> int:
-    """Train a generator (view, select), the matcher (stereo), or the first through the second.
+    """Train a generator, the matcher, or the first through the second, by stages.
 
-    'view' trains the thesis's generator, which paints the right view; 'select' one that looks it
-    up in the left image and answers depth itself; 'finetune' either through the frozen matcher.
+        view      the thesis's generator, which paints the right view; needs pairs
+        select    a generator that looks the right view up in the left image, and answers depth
+                  itself; needs pairs with truth
+        stereo    the matcher; needs pairs with truth
+        finetune  either generator through the frozen matcher; needs weights of both
 
     A config holds every knob; the words below change what they name. The run folder keeps config,
     metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
@@ -47,7 +50,7 @@ def train(
         depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
 
     Args:
-        stage: what is trained.
+        stage: what is trained: view, select, stereo or finetune.
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
         data: folders of pairs; they replace the config's.
