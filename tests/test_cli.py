@@ -145,7 +145,11 @@ def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("depthpose 0.")
+    said = capsys.readouterr().out
+    assert said.startswith("depthpose 0.")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu alone"
+    assert f"(torch {torch.__version__}, Python 3." in said
+    assert said.endswith(f"{device})\n")
 
 
 def test_matching_writes_every_file(pair_folder: Path, tmp_path: Path) -> None:

@@ -4,11 +4,13 @@ Only this room prints. A command's function is imported when it is named and imp
 when it runs, so that every ``--help`` answers at once.
 """
 
+import platform
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.metadata import version
 from inspect import cleandoc, signature
 
 from depthpose import __version__
@@ -97,8 +99,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if words is None else words)
     if given in (["--version"], ["-V"]):
-        print(f"depthpose {__version__}")
-        return 0
+        return _say_version()
     name, rest = _split_command(given)
     if name is None:
         return _explain(given)
@@ -112,6 +113,15 @@ def main(words: Sequence[str] | None = None) -> int:
         said = str(stop) or "interrupted"
         print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
         return 130
+
+
+def _say_version() -> int:
+    """Say what a report of a problem begins with."""
+    from depthpose.cli.doctor import device_names
+
+    versions = f"torch {version('torch')}, Python {platform.python_version()}"
+    print(f"depthpose {__version__} ({versions}, {device_names()})")
+    return 0
 
 
 @contextmanager

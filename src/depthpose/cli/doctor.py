@@ -48,7 +48,7 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 
-    for name, value in {**environment(), "device": _devices(), "weights in": SHIPPED}.items():
+    for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
     print(*_extras(), *_weights(), sep="\n")
     tries = {"depth room": _try_depth, "pose room": _try_pose}
@@ -56,7 +56,8 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
     return 0 if all(works) else 1
 
 
-def _devices() -> str:
+def device_names() -> str:
+    """Name what computes: the GPUs, or the processor alone."""
     import torch
 
     found = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
