@@ -237,7 +237,13 @@ def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
     one = {"image": "left.png", "camera": "camera.json"}
     found = ask(client, "depth", samples, one).json()
     assert found["said"].endswith(" m. 0% are sky.")
-    assert "grey: sky or no answer" in found["pictures"][0]["caption"]
+    picture, depth = found["pictures"][:2]
+    assert picture["caption"] == "the picture"
+    assert picture["size"] == depth["size"]
+    assert "grey: sky or no answer" in depth["caption"]
+    assert depth["scale"]["title"] == "depth [m]"
+    assert [depth["scale"]["marks"][k] for k in (0, -1)] == [[0.0, "3"], [1.0, "80"]]
+    assert 'placeholder="0.54"' not in html, "the value that makes depths 1.4 % too large"
     status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
     assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
 

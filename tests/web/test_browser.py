@@ -113,14 +113,23 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     assert page.locator("#depth .terms").count() == 0, "the weights have none"
     assert 0.05 < drawn_share(page, "#depth") < 1
     pictures = page.locator("#depth .pictures img")
-    assert pictures.count() == 3
-    for k in range(3):
+    assert pictures.count() == 4, "the picture itself stands beside its depth"
+    for k in range(4):
+        shape = pictures.nth(k).evaluate("i => i.decode().then(() => [i.width / i.height, "
+                                         "i.naturalWidth / i.naturalHeight])")  # fmt: skip
+        assert shape[0] == pytest.approx(shape[1], rel=0.02)
+        assert pictures.nth(k).get_attribute("height"), "nothing moves when it comes"
         assert pictures.nth(k).evaluate("image => image.decode().then(() => image.naturalWidth)")
     depth_m = np.load(io.BytesIO(take(page, "#depth", "left.depth_m.npy")))
     # The number under the pointer is the one in the file.
-    box = pictures.first.bounding_box()
+    bar = page.locator("#depth .pictures .scale").first
+    assert bar.locator(".of").text_content() == "depth [m]"
+    assert bar.locator(".marks span").first.text_content() == "3"
+    assert "gradient" in bar.locator(".bar").evaluate("bar => getComputedStyle(bar).background")
+    depth = pictures.nth(1)
+    box = depth.bounding_box()
     assert box is not None
-    pictures.first.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
+    depth.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
     page.locator("#depth .read", has_text="At (").wait_for()
     said = page.locator("#depth .read").first.text_content() or ""
     found = re.search(r"At \((\d+), (\d+)\): ([\d.]+) m", said)

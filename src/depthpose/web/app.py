@@ -5,12 +5,14 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import anyio
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -24,7 +26,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.scene import page_file
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.web.answer import Answer
+from depthpose.web.answer import Answer, Shown
 from depthpose.web.depth import answer_depth
 from depthpose.web.form import Form, without_paths
 from depthpose.web.guard import (
@@ -49,7 +51,12 @@ _SAFE = {
 }
 _RESULTS = 3
 """Answers whose files are kept in memory for downloads."""
-_TYPES = {".png": "image/png", ".json": "application/json", ".zip": "application/zip"}
+_TYPES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".json": "application/json",
+    ".zip": "application/zip",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,11 +163,18 @@ class Pages:
             "terms": answer.terms,
             "facts": list(answer.facts),
             "tables": dict(answer.tables),
-            "pictures": [vars(picture) for picture in answer.pictures],
+            "pictures": [_picture(picture, answer.files) for picture in answer.pictures],
             "scene": answer.scene.encoded(),
             "files": sizes,
             "folder": f"results/{key}/",
         }
+
+
+def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
+    """Give what the page needs of a picture: its size too, so that nothing moves when it comes."""
+    with Image.open(BytesIO(files[shown.file])) as image:  # a file of our own
+        width, height = image.size
+    return {**vars(shown), "scale": shown.scale and vars(shown.scale), "size": [width, height]}
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:

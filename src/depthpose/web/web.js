@@ -107,9 +107,11 @@ function table(rows) {
 
 // A picture; where there are numbers behind it, the one under the pointer is read out.
 function shown(picture, folder) {
-  const image = made("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption });
+  const [width, height] = picture.size;
+  const image = made("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption, width, height });
   const read = made("span", { className: "read" });
-  const figure = made("figure", {}, image, made("figcaption", {}, picture.caption, read));
+  const bar = picture.scale ? [scaled(picture.scale)] : [];
+  const figure = made("figure", {}, image, ...bar, made("figcaption", {}, picture.caption, read));
   if (!picture.values) return figure;
   let map;
   image.addEventListener("pointerenter", async () => {
@@ -125,6 +127,19 @@ function shown(picture, folder) {
   });
   image.addEventListener("pointerleave", () => { read.textContent = ""; });
   return figure;
+}
+
+// The bar of a picture's colours, with its numbers.
+function scaled({ title, colors, marks }) {
+  const bar = made("div", { className: "bar" }), rgb = colors.map(c => `rgb(${c.map(v => Math.round(255 * v))})`);
+  bar.style.background = `linear-gradient(to right, ${rgb})`;
+  const numbers = marks.map(([place, textContent]) => {
+    const mark = made("span", { textContent });
+    mark.style.left = `${100 * place}%`;
+    return mark;
+  });
+  return made("div", { className: "scale" }, bar, made("div", { className: "marks" }, ...numbers),
+    made("div", { className: "of", textContent: title }));
 }
 
 // NPY, version 1, float32, row by row: what the server writes.
