@@ -5,6 +5,7 @@ import json
 import tempfile
 import threading
 import zipfile
+from base64 import b64decode
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -246,6 +247,18 @@ def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
     assert 'placeholder="0.54"' not in html, "the value that makes depths 1.4 % too large"
     status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
     assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
+
+
+def test_examples_are_what_the_forms_take(page: TestClient, tmp_path: Path) -> None:
+    for room, named in (("depth", "camera image right"), ("pose", "camera depth mask")):
+        found = page.get(f"/examples/{room}").json()
+        assert sorted(one["field"] for one in found["files"]) == named.split()
+        for one in found["files"]:
+            (tmp_path / one["name"]).write_bytes(b64decode(one["data"]))
+        files = {one["field"]: one["name"] for one in found["files"]}
+        answer = ask(page, room, tmp_path, files, **found["fields"]).json()
+        assert answer["ok"], answer["said"]
+    assert page.get("/examples/kitchen").status_code == 404
 
 
 def test_a_picture_of_the_sky_alone_is_said_to_be_one(

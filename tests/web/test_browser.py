@@ -107,7 +107,7 @@ def send(page: Page, room: str, files: dict[str, Path]) -> str:
 
 
 def test_depth_good(page: Page, address: str, samples: Path) -> None:
-    page.goto(address)
+    page.goto(f"{address}#depth")
     files = {"image": samples / "left.png", "camera": samples / "camera.json"}
     assert "half of these are nearer than" in send(page, "depth", files)
     assert page.locator("#depth .terms").count() == 0, "the weights have none"
@@ -131,7 +131,7 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     assert box is not None
     depth.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
     page.locator("#depth .read", has_text="At (").wait_for()
-    said = page.locator("#depth .read").first.text_content() or ""
+    said = page.locator("#depth .read").nth(1).text_content() or ""
     found = re.search(r"At \((\d+), (\d+)\): ([\d.]+) m", said)
     assert found is not None
     u, v, shown_m = int(found[1]), int(found[2]), float(found[3])
@@ -140,6 +140,16 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     page.locator("#depth canvas").press("ArrowLeft")
     page.wait_for_timeout(1000)
     assert picture_of(page, "#depth") != before, "the cloud turns"
+
+
+@pytest.mark.parametrize("room", ["pose", "depth"])
+def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, room: str) -> None:
+    page.goto(address if room == "pose" else f"{address}#depth")
+    assert page.locator(f"#{room}").is_visible(), "poses lead"
+    page.locator(f"#{room} .try").click()
+    page.locator(f"#{room} .answer .said").wait_for()
+    assert page.locator(f"#{room} .said.failed").count() == 0
+    assert page.locator(f"#{room} .drop.has").count() == 3
 
 
 def test_terms_of_the_weights_are_read_with_the_answer(
@@ -166,7 +176,7 @@ def test_terms_of_the_weights_are_read_with_the_answer(
 
 
 def test_depth_bad(page: Page, address: str, samples: Path) -> None:
-    page.goto(address)
+    page.goto(f"{address}#depth")
     said = send(page, "depth", {"image": samples / "words.txt"})
     assert "'words.txt' is not a picture; this field takes .png" in said
     page.reload()

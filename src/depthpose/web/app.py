@@ -4,7 +4,7 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,6 +28,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.web.answer import Answer, Shown
 from depthpose.web.depth import answer_depth
+from depthpose.web.examples import depth_example, pose_example
 from depthpose.web.form import Form, without_paths
 from depthpose.web.guard import (
     LOOPBACK,
@@ -83,6 +84,10 @@ class Pages:
             "depth": partial(answer_depth, net=depth),
             "pose": partial(answer_pose, net=pose),
         }
+        self._examples: dict[str, Callable[[], dict[str, Any]]] = {
+            "depth": cache(depth_example),
+            "pose": cache(partial(pose_example, pose)),
+        }
         self._one = anyio.CapacityLimiter(1)
         self._inside = 0
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
@@ -114,6 +119,16 @@ class Pages:
             raise HTTPException(404, f"there is no {name!r}; the page is at /")
         media_type, text = self._assets[name]
         return Response(text, media_type=media_type)
+
+    async def example(self, request: Request) -> Response:
+        """Give files and fields to fill a form with; they are made when first asked for."""
+        make = self._examples.get(request.path_params["room"])
+        if make is None:
+            raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+        try:
+            return JSONResponse(await anyio.to_thread.run_sync(make, limiter=self._one))
+        except InputError as error:
+            raise HTTPException(400, str(error)) from error
 
     async def estimate(self, request: Request) -> Response:
         """Take a form to an answer."""
@@ -197,6 +212,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
         routes=[
             Route("/", pages.home),
             Route("/assets/{name}", pages.asset),
+            Route("/examples/{room}", pages.example),
             Route("/estimate/{room}", pages.estimate, methods=["POST"]),
             Route("/results/{key}/{name}", pages.download),
         ],

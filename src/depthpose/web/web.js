@@ -52,6 +52,29 @@ function sized(bytes) {
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
 
+// An example fills the form and is sent: what a user would choose, chosen.
+for (const button of document.querySelectorAll(".try")) button.addEventListener("click", async () => {
+  const form = button.form;
+  button.disabled = true;
+  const response = await fetch(`examples/${form.dataset.room}`).catch(() => null);
+  const found = await response?.json().catch(() => null);
+  button.disabled = false;
+  if (!found?.files) {
+    const textContent = found?.error || "the server does not answer; is 'depthpose serve' still running?";
+    form.parentElement.querySelector(".answer").replaceChildren(made("p", { className: "said failed", role: "alert", textContent }));
+    return;
+  }
+  form.reset();
+  for (const input of form.querySelectorAll("input[type=file]")) {
+    const file = found.files.find(one => one.field === input.name), held = new DataTransfer();
+    if (file) held.items.add(new File([Uint8Array.from(atob(file.data), c => c.charCodeAt(0))], file.name));
+    input.files = held.files;
+    input.dispatchEvent(new Event("change"));
+  }
+  for (const [name, value] of Object.entries(found.fields)) form.elements[name].value = value;
+  form.requestSubmit(form.querySelector(".go"));
+});
+
 for (const form of document.forms) form.addEventListener("submit", async event => {
   event.preventDefault();
   const answer = form.parentElement.querySelector(".answer"), button = form.querySelector(".go");
