@@ -48,5 +48,5 @@ def test_an_unknown_name_is_refused() -> None:
 
 
 def test_the_public_names_are_listed() -> None:
-    assert {"FakestereoNet", "GeoPoseNet"} <= set(dir(depthpose))
+    assert {"FakestereoNet", "GeoPoseNet", "pipeline"} <= set(dir(depthpose))
     assert "torch" not in modules_after("import depthpose; dir(depthpose)")

@@ -9,13 +9,14 @@ from PIL import Image
 from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
 from torch import Tensor
 
+import depthpose
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import resize_image
+from depthpose.depth.estimator import DepthPipeline, resize_image
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
@@ -320,6 +321,26 @@ def test_a_batch_is_estimated_image_by_image(generator: UNetGenerator) -> None:
             torch.testing.assert_close(one.disparity_px, other.disparity_px, rtol=1e-4, atol=1e-4)
     (single,) = net.estimate_many(batch[0], focal_px=100.0)
     torch.testing.assert_close(single.disparity_px, alone[0].disparity_px, rtol=1e-4, atol=1e-4)
+
+
+def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) -> None:
+    """One picture gives a dict, a list a list; without a camera a phone's is taken, and said."""
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    pipe = DepthPipeline(net)
+    found = pipe(Image.fromarray(RGB), focal_px=100.0)
+    assert isinstance(found, dict)
+    expected = net.estimate(RGB, focal_px=100.0).depth_m
+    torch.testing.assert_close(found["predicted_depth"], expected)
+    assert (found["depth"].mode, found["depth"].size) == ("L", (60, 40))
+    assert found["depth"].getextrema() == (0, 255)
+    farthest = np.unravel_index(int(found["predicted_depth"].argmax()), (40, 60))
+    assert np.asarray(found["depth"])[farthest] == 255
+    with pytest.warns(Notice, match="a focal length of 45 px is taken, a phone's"):
+        (one,) = pipe([RGB])
+    torch.testing.assert_close(one["predicted_depth"], net.estimate(RGB, focal_px=45.0).depth_m)
+    with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
+        depthpose.pipeline("image-segmentation")
+    assert depthpose.pipeline("depth-estimation").net.weights == "default"
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:

@@ -12,6 +12,7 @@ from torch import Tensor
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
     AnyCamera,
+    AnyLens,
     Camera,
     StereoRig,
     check_image_matches_camera,
@@ -201,7 +202,7 @@ class FakestereoNet:
     def estimate_many(
         self,
         images: Sequence[StereoInput] | Sequence[Picture] | Picture,
-        camera: AnyCamera | None = None,
+        camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
     ) -> list[DepthEstimate]:
