@@ -336,7 +336,9 @@ def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) ->
     farthest = np.unravel_index(int(found["predicted_depth"].argmax()), (40, 60))
     assert np.asarray(found["depth"])[farthest] == 255
     with pytest.warns(Notice, match="a focal length of 45 px is taken, a phone's"):
-        (one,) = pipe([RGB])
+        several = pipe([RGB])
+    assert isinstance(several, list)
+    (one,) = several
     torch.testing.assert_close(one["predicted_depth"], net.estimate(RGB, focal_px=45.0).depth_m)
     with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
         depthpose.pipeline("image-segmentation")

@@ -88,7 +88,8 @@ class FakestereoNet:
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
         said = [" + ".join(type(part).__name__ for part in parts)]
         said += [f"weights {self.weights!r}"] if self.weights else []
-        devices = {str(part.device) for part in parts if hasattr(part, "device")}
+        known = (getattr(part, "device", None) for part in parts)
+        devices = {str(device) for device in known if device is not None}
         return f"FakestereoNet({', '.join(said + sorted(devices))})"
 
     @classmethod
