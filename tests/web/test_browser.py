@@ -150,6 +150,10 @@ def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, roo
     page.locator(f"#{room} .answer .said").wait_for()
     assert page.locator(f"#{room} .said.failed").count() == 0
     assert page.locator(f"#{room} .drop.has").count() == 3
+    page.set_viewport_size({"width": 400, "height": 900})
+    page.wait_for_timeout(500)
+    width = page.evaluate("document.documentElement.scrollWidth")
+    assert width <= 400, "a phone need not scroll sideways"
 
 
 def test_terms_of_the_weights_are_read_with_the_answer(
