@@ -17,9 +17,13 @@ setup: $(READY)
 # torch first and exactly, so that nothing else chooses a build of several gigabytes.
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install -q -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	@echo "1 of 2: torch into .venv. On Linux this is a GPU build of several GB; for the CPU build,"
+	@echo "   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make ..."
+	$(BIN)/python -m pip install -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
+	@echo "2 of 2: depthpose and what its tests need"
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
 	touch $@
+	@echo "ready: 'source .venv/bin/activate' puts depthpose on your path"
 
 demo: $(READY)
 	$(BIN)/depthpose demo --out $(OUT)/demo

@@ -2,7 +2,7 @@
 
     python bench/pose_peers.py $DEPTHPOSE_DATA/pose --seeds 5 [--weights W.safetensors ...]
 
-``pip install 'depthpose[open3d]'`` first. Ours runs on the objects that the weights know. Seconds
+``pip install -e '.[open3d]'`` first. Ours runs on the objects that the weights know. Seconds
 are of the wall, one thread each (``OMP_NUM_THREADS=1``); a model's preparation is not among them.
 Success is ADD (ADD-S where the table says so) below 10 % of the diameter; what is answered beyond
 is wrong, what is not answered refused.

@@ -9,6 +9,7 @@ import torch
 from tests.made_street import make_street
 
 from depthpose.cli import COMMANDS, main
+from depthpose.cli.early import refuse_missing
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
 from depthpose.depth.types import StereoInput
 
@@ -70,6 +71,29 @@ def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[st
     assert "130  interrupted" in text
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_in_words(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """No type and no default that is nothing: ``{None}|PATH``, ``(default: )``."""
+    assert main([*name.split(), "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for code in ("{None", "None}", "|STR", "INT INT", "(default: )", "(default: None)"):
+        assert code not in text, code
+
+
+def test_help_lists_the_stages_and_sets_the_thesis_apart(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["depth", "train", "--help"]) == 0
+    text = capsys.readouterr().out
+    for stage in ("view", "select", "stereo", "finetune"):
+        assert f"\n    {stage} " in text, stage
+    assert main(["--help"]) == 0
+    first, _, of_thesis = capsys.readouterr().out.partition("tables and figures of the thesis:")
+    assert "reproduce" not in first
+    assert "figure 3-5" in of_thesis
+    assert first.index("pose train") < first.index("depth match") < first.index("depth predict")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -77,16 +101,20 @@ def test_help_names_every_command_and_exit_code(capsys: pytest.CaptureFixture[st
         (["depth", "mach"], "no command 'mach'; did you mean 'match'"),
         (["weights", "show", "nope"], "neither a file nor the name of weights"),
         (["weights", "import", "psmnet", "none.tar", "--out", "w.safetensors",
-          "--align-corners", "true"], "none.tar: there is no such checkpoint file"),
-        (["weights", "import", "psmnet", "none.tar", "--out", "w.safetensors"],
+          "--align-corners", "true"], "none.tar: there is no such file or folder"),
+        (["weights", "import", "psmnet", ".", "--out", "w.safetensors"],
          "needs --align-corners"),
         (["weights", "import", "fcgf", "none.pth", "--out", "w.safetensors"],
-         "none.pth: there is no such checkpoint file"),
+         "none.pth: there is no such file or folder"),
         (["data", "check", "nowhere"], "nowhere"),
         (["depth", "evaluate", "--data", ".", "--out", "o"], "measure --weights FILE"),
-        (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o"], "match with --weights"),
+        (
+            ["depth", "match", ".", ".", "--camera", ".", "--out", "o", "--matcher", "sgbm",
+             "--weights", "default"],
+            "--weights default and --matcher sgbm: one of the two matches the pair",
+        ),
         (["depth", "match", "l", "r", "--camera", "c.json", "--out", "o", "--matcher", "sgbm"],
-         "l: no .png"),
+         "l: there is no such file or folder"),
         (["export", "depth", "--weights", "parts", "--out", "d.onnx"],
          "kind 'geoposenet'; depth takes"),
         (["export", "pose", "--weights", "default", "--out", "p.onnx"],
@@ -117,7 +145,11 @@ def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("depthpose 0.")
+    said = capsys.readouterr().out
+    assert said.startswith("depthpose 0.")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu alone"
+    assert f"(torch {torch.__version__}, Python 3." in said
+    assert said.endswith(f"{device})\n")
 
 
 def test_matching_writes_every_file(pair_folder: Path, tmp_path: Path) -> None:
@@ -240,3 +272,34 @@ def test_a_size_that_is_none_is_refused(
     more = (f"--max-memory={size}", "--weights", str(tmp_path / "w.safetensors"))
     assert match(pair_folder, tmp_path / "o", *more) == 2
     assert "not a size" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["depth", "predict", "lfet.png", "--focal-px", "9"], "did you mean 'left.png'?"),
+        (["depth", "match", "left.png", "right.png", "--camera", "c.json"], "right.png: there is"),
+        (["depth", "train", "view", "--data", "left.png", "streets"], "streets: there is no such"),
+        (["depth", "evaluate", "--data", ".", "--weights", "both:nope"], "weights 'nope': neither"),
+        (["pose", "train", "--cad", "part.stl", "--unit", "mm"], "part.stl: there is no such"),
+        (["pose", "predict", "--cloud", "a.ply"], "a.ply: there is no such file"),
+        (["pose", "predict", "--cloud", ".", "--weights", "prats"], "did you mean 'parts'?"),
+    ],
+)
+def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
+    words: list[str], said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "left.png").touch()
+    code = (
+        "import sys; from depthpose.cli import main; code = main(sys.argv[1:]); "
+        "assert not {'torch', 'numpy', 'PIL'} & set(sys.modules); sys.exit(code)"
+    )
+    command = [sys.executable, "-c", code, *words, "--out", "out"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+
+
+def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
+    refuse_missing({"images": ["left/*.png", "s3://bucket/left"], "weights": ["hf://me/mine"]})
+    refuse_missing({"weights": ("sgbm:default", "open3d"), "start": "nothing", "bop": None})

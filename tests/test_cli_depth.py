@@ -18,6 +18,7 @@ from tests.made_street import make_street
 from tests.pages.read_page import read_page
 
 from depthpose.cli import main
+from depthpose.cli.training import Lines
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
@@ -29,7 +30,7 @@ from depthpose.core.files import (
     write_image,
     write_video,
 )
-from depthpose.core.loop import read_metrics
+from depthpose.core.loop import Progress, read_metrics
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet, SGBMMatcher
 from depthpose.depth.synthesis import UNetGenerator
@@ -170,7 +171,7 @@ def test_where_depth_comes_from_is_one_word(
     capsys.readouterr()
     other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
     assert main(["depth", "predict", *words, *other]) == 2
-    assert "sgbm matches; leave one away" in capsys.readouterr().err
+    assert "another matcher matches the drawn view; leave one away" in capsys.readouterr().err
 
 
 def test_a_threshold_is_chosen_on_a_folder(
@@ -187,6 +188,35 @@ def test_a_threshold_is_chosen_on_a_folder(
     assert main(["depth", "calibrate", *words, "--alarm-share", "0.5"]) == 0
     assert "3 images: mean confidence 1.000 to 1.000" in capsys.readouterr().out
     assert read_checkpoint(out).config["least_confidence"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_pair_is_matched_by_the_default_weights_where_none_are_named(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, image = tmp_path / "rig.json", str(home / "images/0.png")
+    rig.write_text(json.dumps({**CAMERA, "baseline_m": 0.5}))
+    pair = ["depth", "match", image, image, "--camera", str(rig), "--no-check", "--out"]
+    for name, words in (("none", []), ("named", ["--matcher", "default"])):
+        assert main([*pair, str(tmp_path / name), *words]) == 0
+        settings = json.loads((tmp_path / name / "run.json").read_text())["settings"]
+        assert settings["weights"] == "default"
+    assert main([*pair, str(tmp_path / "x"), "--matcher", "sgmb"]) == 2
+    assert "'sgmb': neither a file nor the name of weights" in capsys.readouterr().err
+
+
+def test_another_matcher_looks_at_the_drawn_view(home: Path, tmp_path: Path) -> None:
+    """Weights are named by --matcher here as in a training."""
+    words = (str(home / "images/0.png"), "--camera", str(home / "cam.json"))
+    for matcher in ("default", str(home / "w.safetensors"), "psmnet"):
+        out = tmp_path / Path(matcher).stem
+        assert predict(home, out, *words, "--matcher", matcher) == 0
+    said = json.loads((tmp_path / "default/run.json").read_text())["settings"]
+    assert said["matcher"] == "fakestereo with default"
+    own, other, same = (
+        read_map(tmp_path / f"{n}/0.depth_m.npy") for n in ("psmnet", "default", "w")
+    )
+    assert torch.equal(own, same)
+    assert not torch.equal(own, other)
 
 
 def test_processes_share_a_folder_of_images(
@@ -390,6 +420,8 @@ def test_training_by_config_and_words(
     said = capsys.readouterr().out
     assert "generator.safetensors" in said
     assert "- **Time**: 2 steps in " in said
+    assert said.startswith("step 1 of 2"), "there is no terminal"
+    assert "\nstep 2 of 2, discriminator/loss " in said
     assert "held_out/l1" in read_metrics(tmp_path / "run")[-1]
     assert list((tmp_path / "run" / "pictures").glob("*.png"))
     assert (tmp_path / "run" / "generator.safetensors").is_file()
@@ -398,6 +430,43 @@ def test_training_by_config_and_words(
     assert main([*words, "--steps", "2", "--resume"]) == 0
     assert main([*words, "--steps", "3", "--resume"]) == 2
     assert "loop.steps = 2, but now it is 3" in capsys.readouterr().err
+
+
+def test_without_a_terminal_a_line_is_printed_each_minute(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    seconds = iter(range(0, 4000, 10))
+    lines = Lines(clock=lambda: float(next(seconds)))
+    for step in range(1, 101):
+        numbers = {"net/loss": 1 / step} if step % 50 == 0 else {}
+        lines.show(Progress(step=step, steps=100, numbers=numbers))
+    said = capsys.readouterr().out.splitlines()
+    assert said[:2] == ["step 1 of 100", "step 7 of 100, 16 min left"]
+    assert said[-2:] == [
+        "step 97 of 100, 0 min left, net/loss 0.02",
+        "step 100 of 100, net/loss 0.01",
+    ]
+    assert len(said) == 18
+
+
+def test_a_stopped_training_is_finished_by_a_word(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "view.yaml").write_text(VIEW.replace("steps: 4", "steps: 4, save_every_steps: 1"))
+    words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
+    words += ["--data", str(pairs), "--out", str(tmp_path / "run")]
+    assert main([*words, "--finish"]) == 2
+    assert "holds no state of a training" in capsys.readouterr().err
+
+    def stop(self: Lines, progress: Progress) -> None:
+        if progress.step == 1:
+            raise KeyboardInterrupt
+
+    with patch.object(Lines, "show", stop):
+        assert main(words) == 130
+    assert main([*words, "--finish"]) == 0
+    assert "- **Time**: " in capsys.readouterr().out
+    assert (tmp_path / "run" / "generator.safetensors").is_file()
 
 
 @pytest.mark.slow
@@ -479,5 +548,5 @@ def test_words_of_another_stage_are_refused(
     pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["depth", "train", "stereo", "--data", str(pairs), "--out", str(tmp_path / "run")]
-    assert main([*words, "--generator", "g.safetensors"]) == 2
+    assert main([*words, "--generator", "default"]) == 2
     assert "--generator has no meaning for 'stereo'" in capsys.readouterr().err

@@ -255,7 +255,8 @@ def test_options_that_mean_nothing_are_refused(
 def test_what_no_engine_takes_is_refused(
     home: Path, tmp_path: Path, double: InProcessEngine, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert predict(home, tmp_path, "drive.mp4", *RAY) == 2
+    (tmp_path / "drive.mp4").touch()
+    assert predict(home, tmp_path, str(tmp_path / "drive.mp4"), *RAY) == 2
     assert "takes no videos" in capsys.readouterr().err
     assert match(home, tmp_path, str(home / "left")) == 2
     assert "there is no right image beside it" in capsys.readouterr().err
@@ -270,4 +271,4 @@ def test_without_ray_the_extra_is_named(
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     monkeypatch.setitem(__import__("sys").modules, "ray.data", None)
     assert predict(home, tmp_path, str(home / "left"), *RAY) == 2
-    assert "pip install 'depthpose[ray]'" in capsys.readouterr().err
+    assert "pip install -e '.[ray]'" in capsys.readouterr().err

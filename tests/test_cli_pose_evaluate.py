@@ -59,7 +59,12 @@ def test_a_csv_is_measured(
         statuses = [row["status"] for row in csv.DictReader(lines)]
     assert statuses == ["missing", "ok"] * 2
     assert "Success by masks" in (out / "report.html").read_text()
-    assert "4 instances, layout BOP; objects: bracket, bottle" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "4 instances, layout BOP; objects: bracket, bottle" in said
+    heads = next(line for line in said.splitlines() if line.startswith("method")).split()
+    assert heads[:5] == ["method", "object", "instances", "success", "wrong"]
+    assert len(heads) <= 11
+    assert len(mean) > 20, "the files hold every column"
 
 
 def test_the_page_shows_best_median_and_worst_beside_the_truth(
@@ -176,7 +181,7 @@ def test_registration_wants_a_data_set_and_open3d(
     monkeypatch.setitem(sys.modules, "open3d", None)
     words = ["--bop", str(made.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
     assert main(["pose", "evaluate", *words]) == 2
-    assert "pip install 'depthpose[open3d]'" in capsys.readouterr().err
+    assert "pip install -e '.[open3d]'" in capsys.readouterr().err
     assert main(["pose", "predict", *words]) == 2
     assert "open3d: it looks for the models of a data set" in capsys.readouterr().err
 

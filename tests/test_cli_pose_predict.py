@@ -1,12 +1,15 @@
 """``pose predict`` from the words to the files, with an oracle in place of the network."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tests.pages.read_page import read_page
 from tests.pose.made_frames import make_dataset
 from tests.pose.made_object import (
@@ -70,9 +73,17 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     words = ["--cloud", str(tmp_path / "part.ply"), "--unit", "mm", "--object", "bracket"]
     out = tmp_path / "out"
     assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
-    assert "1 inputs: 1 ok" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "1 inputs: 1 ok" in said
     found = read_predictions(out)[0].estimate
     assert found.camera_from_model is not None
+    heads, answer = (re.split(r"  +", line) for line in said.splitlines()[1:3])
+    assert heads[:5] == ["input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw"]
+    assert answer[:3] == ["part", "bracket", "ok"]
+    np.testing.assert_allclose(np.array(answer[3].split(", "), float),
+                               found.camera_from_model.t_m, atol=1e-4)  # fmt: skip
+    turn = Rotation.from_quat(np.array(answer[4].split(", "), float)).as_matrix()
+    np.testing.assert_allclose(turn, found.camera_from_model.R, atol=1e-3)
     assert float(add_m(found.camera_from_model, TRUTH, bracket().vertices_m)) < 0.001
     row = poses_of(out)["part"]
     assert {"network", "voting", "icp"} <= row["seconds"].keys()
@@ -273,10 +284,10 @@ def test_two_processes_share_the_work(
     ("words", "said"),
     [
         ([], "0 of --cloud, --depth and --bop are given; give one"),
-        (["--cloud", "a.ply", "--bop", "b"], "2 of --cloud, --depth and --bop are given"),
-        (["--cloud", "a.ply"], "the weights know bracket, bottle; say which by --object"),
-        (["--cloud", "a.ply", "--object", "bracke"], "did you mean 'bracket'?"),
-        (["--depth", "d.png", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
+        (["--cloud", ".", "--bop", "."], "2 of --cloud, --depth and --bop are given"),
+        (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
+        (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
+        (["--depth", ".", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz file there"),
     ],
 )

@@ -39,6 +39,9 @@ def test_a_cad_file_becomes_weights_with_a_card(
     said = capsys.readouterr().out
     assert f"trained weights: {out / 'pose.safetensors'}" in said
     assert "| 0 | " in said
+    assert "trained; now the refusal is calibrated" in said
+    card = (out / "pose.md").read_text()
+    assert f"--cad {part} --unit mm --config config.yaml --out my_part`" in card
     (model,) = read_pose_weights(out / "pose.safetensors").models
     assert model.name == "bracket"
     assert model.diameter_m == pytest.approx(0.160, abs=0.001)
@@ -102,11 +105,11 @@ def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--cad", "part.stl"], "--cad without --unit: no file says its unit; give --unit mm"),
+        (["--cad", "."], "--cad without --unit: no file says its unit; give --unit mm"),
         ([], "there is no object to learn; name its CAD file (--cad FILE --unit mm)"),
-        (["--data", "lm"], "--data lm: the config learns from no data set"),
+        (["--data", "."], "--data .: the config learns from no data set"),
         (
-            ["--what", "segmentation", "--cad", "part.stl", "--unit", "mm"],
+            ["--what", "segmentation", "--cad", ".", "--unit", "mm"],
             "--cad has no meaning for 'segmentation', which learns from pictures",
         ),
         (["--cad", "nowhere.stl", "--unit", "mm"], "nowhere.stl"),
@@ -153,10 +156,10 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     monkeypatch.setitem(STAGES, "pose", (PoseTraining, stand_in))
     (tmp_path / "c.yaml").write_text("{}")
     words = ["pose", "train", "--cad", str(part), "--unit", "mm", "--out", str(tmp_path / "run")]
-    more = [[], ["--start", "nothing"], ["--start", "a.safetensors"]]
+    more = [[], ["--start", "nothing"], ["--start", "default"]]
     for extra in [*more, ["--config", str(tmp_path / "c.yaml")]]:
         assert main([*words, *extra]) == 0
-    assert started == ["parts", None, "a.safetensors", None]
+    assert started == ["parts", None, "default", None]
     own = read_config(
         Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml", PoseTraining
     )

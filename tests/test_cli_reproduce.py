@@ -172,7 +172,10 @@ def test_a_rerun_measures_the_same_files_and_refuses_other_settings(
     [
         (["2.1", "--matcher", "sgbm"], "table 2.1 is of one image; table 2.2 takes it"),
         (["2.2"], "nothing to measure; give --weights FILE or --matcher sgbm"),
-        (["2.3", "--weights", "w"], "but 1 weights were given; give one for each, in this order"),
+        (
+            ["2.3", "--weights", "default"],
+            "but 1 weights were given; give one for each, in this order",
+        ),
         (["2.1", "--weights", "nope"], "neither a file nor the name of weights"),
         (["2.2", "--matcher", "sgbm", "--protocol", "kitti-2015"], "the tables hold depth"),
     ],
@@ -212,7 +215,16 @@ def test_figures_are_drawn_and_explained(
 def test_an_unknown_frame_has_no_figure(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["figure", "2-5", "--kitti", str(street), "--weights", "w", "--out", str(tmp_path)]
+    words = [
+        "figure",
+        "2-5",
+        "--kitti",
+        str(street),
+        "--weights",
+        "default",
+        "--out",
+        str(tmp_path),
+    ]
     assert main([*words, "--frames", "e"]) == 2
     assert "no frame 'e'; Known: 'a', 'b', 'c', 'd'" in capsys.readouterr().err
 

@@ -118,6 +118,6 @@ def test_without_the_extra_it_says_which(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "starlette", None)
     assert main(["serve"]) == 2
-    assert "needs starlette, which is not installed: pip install 'depthpose[serve]'" in (
+    assert "needs starlette, which is not installed: pip install -e '.[serve]'" in (
         capsys.readouterr().err
     )

@@ -45,3 +45,8 @@ def test_an_estimator_is_imported_when_asked_for() -> None:
 def test_an_unknown_name_is_refused() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Fakestereo'"):
         getattr(depthpose, "Fakestereo")  # noqa: B009
+
+
+def test_the_public_names_are_listed() -> None:
+    assert {"FakestereoNet", "GeoPoseNet", "pipeline"} <= set(dir(depthpose))
+    assert "torch" not in modules_after("import depthpose; dir(depthpose)")

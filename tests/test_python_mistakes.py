@@ -37,13 +37,33 @@ MISTAKES = {
         "Camera(width=64, height=48, K=torch.tensor(K))",
         "K is of torch.float32, not torch.float64; pass K.double()",
     ),
-    "K as a camera": (
-        "depth.estimate(torch.rand(3, 48, 64), np.array(K))",
-        "camera is a ndarray; give a Camera(width=, height=, K=)",
+    "a word as a camera": (
+        "depth.estimate(torch.rand(3, 48, 64), object())",
+        "camera is a object; give a Camera(width=, height=, K=)",
     ),
-    "a mapping as a camera": (
-        "pose.estimate(depth=depth_m, mask=mask, camera={'K': K}, object='flange')",
+    "letters as a camera": (
+        "depth.estimate(torch.rand(3, 48, 64), [['a', 'b', 'c']] * 3)",
+        "camera is a list; give a Camera(width=, height=, K=)",
+    ),
+    "a key of a camera": (
+        "pose.estimate(depth=depth_m, mask=mask, camera={'focal': 50}, object='flange')",
+        "unknown key 'focal'; ",
+    ),
+    "camera and focal length": (
+        "depth.estimate(torch.rand(3, 48, 64), camera, focal_px=50)",
+        "camera and focal_px are both given; leave one of the two away",
+    ),
+    "a mapping as a cloud": (
+        "pose.estimate(cloud={'points': points}, object='flange')",
         "a dict where numbers belong; give a tensor or array of numbers, or a file's path",
+    ),
+    "a float image of 0 to 255": (
+        "depth.estimate(np.full((48, 64, 3), 127.0), camera)",
+        "must lie in [0, 1], got 127 .. 127; divide 8-bit values by 255",
+    ),
+    "a batch": (
+        "depth.estimate(torch.rand(2, 3, 48, 64), camera)",
+        "(2, 3, 48, 64), a batch; give one image, or the batch to estimate_many(batch, camera)",
     ),
     "voting": ("VotingConfig(method='ransack')", "method is 'ransack'; did you mean 'ransac'?"),
     "inliers": ("VotingConfig(inlier_test='x')", "inlier_test is 'x'; Known: 'angle', 'distance'"),
@@ -58,6 +78,7 @@ PROGRAM = """
 import json, sys
 import numpy as np
 import torch
+from PIL import Image
 from depthpose import FakestereoNet, GeoPoseNet
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
@@ -81,6 +102,24 @@ for name, code in json.loads(sys.argv[1]).items():
         said[name] = repr(error)
 print(json.dumps(said))
 """
+
+
+TAKEN = {
+    "a dict": "pose.estimate(depth=depth_m, mask=mask, camera={'K': K}, object='flange')",
+    "a list": "pose.estimate(depth=depth_m, mask=mask, camera=K, object='flange')",
+    "K of float32": "depth.estimate(np.zeros((48, 64), np.uint8), torch.tensor(K))",
+    "a focal length": "pose.estimate(depth=depth_m, mask=mask, focal_px=50, object='flange')",
+    "one of Pillow's": "depth.estimate(Image.new('RGBA', (64, 48)), K)",
+    "Pillow's mask": "pose.estimate(depth=depth_m, mask=Image.new('L', (64, 48), 255), "
+    "camera=K, object='flange')",
+}
+"""What gave an AttributeError, or an error about types, and is plain to read."""
+
+
+def test_what_people_have_in_hand_is_taken() -> None:
+    command = [sys.executable, "-c", PROGRAM, json.dumps(TAKEN)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert json.loads(done.stdout) == dict.fromkeys(TAKEN, "nothing"), done.stderr
 
 
 def test_every_mistake_is_named_with_its_remedy() -> None:

@@ -18,7 +18,7 @@ from tests.test_cli_engine import files_of, make_home, predict, unpacked
 from tests.written import ROOT
 
 pytestmark = pytest.mark.slow
-pytest.importorskip("ray", reason="Ray is not installed: pip install 'depthpose[ray]'")
+pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
 
 # Ray's workers are polite (nice 15): on a machine that others keep busy they would get no core.
 os.environ.setdefault("RAY_worker_niceness", "0")

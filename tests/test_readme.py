@@ -83,3 +83,27 @@ def test_the_make_targets_exist(target: str) -> None:
 def test_the_links_lead_somewhere() -> None:
     for link in re.findall(r"\]\(([^)#]+)\)", README):
         assert link.startswith("http") or (ROOT / link).exists(), link
+
+
+def test_the_first_lines_to_type_are_there() -> None:
+    """Tests, the command on the path, the size of torch and the smaller build."""
+    install = README.partition("## Install")[2].partition("\n## ")[0]
+    for words in ("make demo\n", "make test\n", "source .venv/bin/activate", "6.3 GB",
+                  "PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu"):  # fmt: skip
+        assert words in install, words
+
+
+def test_poses_lead_and_one_image_comes_last() -> None:
+    assert README.index("GeoPoseNet.load(") < README.index("FakestereoNet.load(")
+    words = ("pose predict", "depth match", "depth predict")
+    assert [w for line in commands() for w in words if f" {w} " in line and "demo" in line][:4] == [
+        "pose predict", "pose predict", "depth match", "depth predict",
+    ]  # fmt: skip
+    assert "streets seen by a forward camera" in README.partition("## Install")[0]
+
+
+def test_nothing_names_a_release_that_there_is_not() -> None:
+    """No index has a package of this name yet: an extra is installed from the clone."""
+    for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.py")]:
+        if path.name != "fresh.md":  # what was typed there installed a wheel
+            assert not re.search(r"pip install [^\n`]*depthpose\[", path.read_text()), path

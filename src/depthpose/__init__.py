@@ -5,14 +5,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from depthpose.depth.estimator import FakestereoNet as FakestereoNet
+    from depthpose.depth.estimator import pipeline as pipeline
     from depthpose.pose.estimator import GeoPoseNet as GeoPoseNet
 
 __version__ = "0.1.0"
-__all__ = ["FakestereoNet", "GeoPoseNet", "__version__"]
+__all__ = ["FakestereoNet", "GeoPoseNet", "__version__", "pipeline"]
 
 _HOMES = {
     "FakestereoNet": "depthpose.depth.estimator",
     "GeoPoseNet": "depthpose.pose.estimator",
+    "pipeline": "depthpose.depth.estimator",
 }
 
 
@@ -21,3 +23,8 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'depthpose' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names, which are imported when they are asked for."""
+    return sorted(__all__)

@@ -14,4 +14,7 @@ def test_far_names_are_only_listed() -> None:
 
 def test_a_missing_extra_says_what_to_install() -> None:
     error = MissingExtraError("cv2", "opencv", "SGBM")
-    assert str(error) == ("SGBM needs cv2, which is not installed: pip install 'depthpose[opencv]'")
+    assert str(error) == (
+        "SGBM needs cv2, which is not installed: pip install -e '.[opencv]' in the clone of "
+        "depthpose"
+    )

@@ -94,6 +94,45 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     assert one == other
 
 
+def test_what_was_stopped_is_finished_with_the_steps_so_far(tmp_path: Path) -> None:
+    """Its weights are those of a training of so many steps, but for the schedule of the rate."""
+    with pytest.raises(InputError, match="holds no state of a training"):
+        trained(tmp_path / "none", loop(), finish=True)
+    interrupted(tmp_path, loop(ema_decay=0.9), after=5)
+    saved = torch.load(tmp_path / "state.pt", weights_only=True)
+    finished = trained(tmp_path, loop(ema_decay=0.9), finish=True)
+    for name, module in finished.modules.items():
+        assert_equal(module.state_dict(), saved["average"][name])
+    whole = trained(tmp_path, loop(ema_decay=0.9), resume=True)
+    assert_equal(weights(whole), weights(trained(tmp_path / "whole", loop(ema_decay=0.9))))
+
+
+def test_ctrl_c_twice_finishes_with_the_step_at_hand(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def press_twice(progress: Progress) -> None:
+        for _ in range(2 if progress.step == 5 else 0):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    trained(tmp_path, loop(log_every_steps=100), on_step=press_twice)
+    assert torch.load(tmp_path / "state.pt", weights_only=True)["step"] == 6
+    last = read_metrics(tmp_path)[-1]
+    assert last["step"] == 6
+    assert "held_out/one" in last, "the last step is validated as any last one is"
+    assert "Press Ctrl-C again" in capfd.readouterr().err
+
+
+def test_ctrl_c_once_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("depthpose.core.loop.host.PATIENCE_S", 0.1)
+
+    def press(progress: Progress) -> None:
+        if progress.step == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted, match=r"stopped after step 6 of 12.*--finish makes weights"):
+        trained(tmp_path, loop(), on_step=press)
+
+
 def test_a_training_without_bf16_is_one_in_fp32_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from depthpose.core.report import (
     Section,
     csv_table,
     markdown_table,
+    plain_table,
     write_markdown,
     write_page,
     write_table,
@@ -50,6 +51,7 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     write_page(tmp_path / "page.html", "Title", sections, {"torch": "2"})
     html = (tmp_path / "page.html").read_text()
     assert "data:image/png;base64," in html
+    assert 'width="2" height="2"' in html, "nothing moves when the picture comes"
     assert "&lt;script&gt;x" in html
     assert "a &lt;picture&gt;" in html
     assert "http" not in html
@@ -103,3 +105,23 @@ def test_the_words_and_tables_of_a_page_are_markdown_too(tmp_path: Path) -> None
     text = (tmp_path / "r.md").read_text()
     assert text.startswith("# Title\n\n## One\n\nWords.\n\n| name | x |")
     assert text.endswith("## Two\n\ntorch 2 · date today\n")
+
+
+def test_a_table_for_the_terminal_has_the_columns_that_are_asked_for() -> None:
+    rows = [
+        {"method": "ours", "d1": 0.5, "much": 1, "none": None},
+        {"method": "theirs", "d1": 0.25, "much": 2, "none": None},
+    ]
+    assert plain_table(rows, ["method", "d1", "none", "elsewhere"]) == (
+        "method  d1\nours    0.5000\ntheirs  0.2500\n"
+    )
+    assert plain_table(rows).startswith("method  d1      much\n")
+
+
+def test_a_large_picture_is_made_small_enough_for_a_page(tmp_path: Path) -> None:
+    noise = torch.rand(3, 800, 1000, generator=torch.Generator().manual_seed(0))
+    write_image(tmp_path / "p.png", noise)
+    picture = Picture(path=tmp_path / "p.png", caption="noise")
+    assert picture.size == (1000, 800)
+    assert picture.data_uri.startswith("data:image/jpeg;base64,")
+    assert len(picture.data_uri) < (tmp_path / "p.png").stat().st_size / 2

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -82,3 +83,23 @@ def test_the_axis_turns_to_a_direction_the_shortest_way(direction: tuple[float, 
     angle = torch.acos((towards / towards.norm())[2])
     # The shortest: it turns by no more than the angle between the two.
     assert torch.allclose((R.trace() - 1) / 2, angle.cos(), atol=1e-9)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_a_transform_is_a_4x4_matrix_to_torch_and_numpy(batch: Batch) -> None:
+    pose = random_rigid(batch)
+    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
+    ones = torch.cat([points, torch.ones(*batch, 5, 1, dtype=torch.float64)], -1)
+    moved = ones @ Rigid(pose.R, pose.t_m).matrix().mT
+    torch.testing.assert_close(moved[..., :3], pose.apply(points))
+    as_array = np.asarray(Rigid(pose.R.float(), pose.t_m.float()))
+    assert (as_array.shape, as_array.dtype) == ((*batch, 4, 4), np.float64)
+    np.testing.assert_allclose(as_array, pose.matrix().numpy(), atol=1e-6)
+    assert np.asarray(pose, dtype=np.float32).dtype == np.float32
+
+
+def test_a_transform_is_one_readable_line() -> None:
+    pose = Rigid(torch.eye(3), torch.tensor([0.1, -0.25, 1.0]))
+    rows = "[1.0000, 0.0000, 0.0000], [0.0000, 1.0000, 0.0000], [0.0000, 0.0000, 1.0000]"
+    assert repr(pose) == f"Rigid(R=[{rows}], t_m=[0.1000, -0.2500, 1.0000])"
+    assert repr(random_rigid((2, 3))) == "Rigid(a batch of (2, 3))"

@@ -10,7 +10,7 @@ from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.depth.stereo import CallableMatcher
-from depthpose.depth.types import StereoSample
+from depthpose.depth.types import DepthEstimate, StereoSample
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +89,6 @@ def test_a_swapped_pair_is_recognised(street: StereoSample) -> None:
 @pytest.mark.parametrize(
     ("weights", "matcher", "message"),
     [
-        (None, None, "there is no matcher in that"),
-        (None, "psmnet", "there is no matcher in that"),
         ("w.safetensors", "sgbm", "neither a file nor the name of weights"),
         (None, "sgmb", "'sgmb': neither a file nor the name"),
     ],
@@ -100,6 +98,33 @@ def test_a_matcher_and_its_weights_belong_together(
 ) -> None:
     with pytest.raises(InputError, match=message):
         FakestereoNet.load(weights, matcher=matcher)
+
+
+def test_without_a_name_the_default_is_loaded() -> None:
+    """Its files say the same as those that are named; from_pretrained is what others call it."""
+    said = "FakestereoNet(SelectionSynthesiser + PSMNetMatcher, weights 'default', cpu)"
+    for net in (
+        FakestereoNet.load(),
+        FakestereoNet.load(matcher="psmnet"),
+        FakestereoNet.from_pretrained("default"),
+    ):
+        assert repr(net) == said
+    assert repr(FakestereoNet.load(matcher="sgbm")) == "FakestereoNet(SGBMMatcher)"
+
+
+def test_an_estimate_is_one_readable_line() -> None:
+    depth_m = torch.full((20, 30), 4.0)
+    depth_m[:10], depth_m[0] = 12, torch.nan
+    px, sky = torch.full((20, 30), 8.0), torch.arange(20)[:, None].expand(20, 30) < 1
+    whole = DepthEstimate(depth_m=depth_m, disparity_px=px, confidence=px / 16, is_sky=sky)
+    assert repr(whole) == (
+        "DepthEstimate(30x20, depth 4.0 .. 12.0 m (median 4.0, known of 95%), "
+        "mean confidence 0.50, sky 5%)"
+    )
+    alone = DepthEstimate(depth_m=None, disparity_px=px)
+    assert repr(alone) == "DepthEstimate(30x20, disparity 8.0 .. 8.0 px (median 8.0))"
+    empty = DepthEstimate(depth_m=depth_m * torch.nan, disparity_px=px)
+    assert repr(empty) == "DepthEstimate(30x20, depth nowhere known)"
 
 
 def test_the_rig_decides_the_metres() -> None:

@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
 from torch import Tensor, nn
 
+import depthpose
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig, SGBMConfig
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import resize_image
+from depthpose.depth.estimator import DepthPipeline, resize_image
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet
@@ -255,18 +257,95 @@ def test_values_that_are_no_picture_are_refused(
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (np.zeros((40, 60, 4), np.uint8), r"array of shape \(40, 60, 4\); give 8-bit RGB"),
-        (np.zeros((40, 60), np.uint8), r"array of shape \(40, 60\); give 8-bit RGB"),
-        (np.zeros((40, 60, 3), np.float32), "array of float32; give 8-bit RGB"),
-        (torch.zeros(4, 40, 60), r"must have shape \(3, H, W\), got \(4, 40, 60\)"),
-        (torch.zeros(3, 40, 60, dtype=torch.uint8), "must be float in"),
+        (np.zeros((40, 60, 2), np.uint8), r"array of shape \(40, 60, 2\); give \(H, W, 3\)"),
+        (np.zeros((5, 40, 60, 3), np.uint8), r"a batch; .* to estimate_many\(batch, camera\)"),
+        (torch.zeros(5, 3, 40, 60), r"tensor of shape \(5, 3, 40, 60\), a batch"),
+        (np.zeros((40, 60, 3), np.uint16), r"array of uint16; .*divide .* \(65535"),
+        (torch.zeros(3, 40, 60, dtype=torch.int32), "tensor of torch.int32; give 8-bit numbers"),
+        (np.full((40, 60, 3), 127.0), "divide 8-bit values by 255"),
         (torch.full((3, 40, 60), 127.0), "divide 8-bit values by 255"),
+        (Image.new("F", (60, 40)), "the image: 32 bits a pixel"),
         (None, "must be a tensor, got NoneType"),
     ],
 )
 def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         as_tensor(given)
+
+
+GREY = np.arange(40 * 60).reshape(40, 60).astype(np.uint8)
+RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], -1)
+RGBA = np.concatenate([RGB, GREY[..., None]], -1)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        RGB,
+        RGBA,
+        RGB[None],
+        RGB / 255,
+        (RGB / 255).astype(np.float32),
+        RGB.transpose(2, 0, 1),
+        torch.from_numpy(RGB).permute(2, 0, 1),
+        torch.from_numpy(RGB).permute(2, 0, 1)[None] / 255,
+        torch.from_numpy(RGBA),
+        Image.fromarray(RGB),
+        Image.fromarray(RGBA),
+    ],
+    ids=[
+        *("bytes", "alpha", "batch of one", "float64", "float32", "channels first"),
+        *("byte tensor", "batch of a tensor", "tensor, channels last", "pillow", "pillow, alpha"),
+    ],
+)
+def test_any_form_of_a_picture_is_the_same_picture(given: object) -> None:
+    expected = torch.from_numpy(RGB).permute(2, 0, 1).float() / 255
+    torch.testing.assert_close(as_tensor(given), expected)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [GREY, GREY[..., None], GREY / 255, torch.from_numpy(GREY)[None], Image.fromarray(GREY)],
+    ids=["bytes", "a channel", "floats", "a tensor", "pillow"],
+)
+def test_grey_is_three_equal_channels(given: object) -> None:
+    expected = torch.from_numpy(GREY).expand(3, -1, -1).float() / 255
+    torch.testing.assert_close(as_tensor(given), expected)
+
+
+def test_a_batch_is_estimated_image_by_image(generator: UNetGenerator) -> None:
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    batch = torch.rand(3, 3, 40, 60)
+    alone = [net.estimate(image, focal_px=100.0) for image in batch]
+    pixels = [image.permute(1, 2, 0).numpy() for image in batch]
+    for together in (net.estimate_many(batch, focal_px=100.0),
+                     net.estimate_many(pixels, camera(60, 40, 100.0))):  # fmt: skip
+        for one, other in zip(alone, together, strict=True):
+            torch.testing.assert_close(one.disparity_px, other.disparity_px, rtol=1e-4, atol=1e-4)
+    (single,) = net.estimate_many(batch[0], focal_px=100.0)
+    torch.testing.assert_close(single.disparity_px, alone[0].disparity_px, rtol=1e-4, atol=1e-4)
+
+
+def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) -> None:
+    """One picture gives a dict, a list a list; without a camera a phone's is taken, and said."""
+    net = FakestereoNet(CallableMatcher(by_brightness), make_synthesiser(generator))
+    pipe = DepthPipeline(net)
+    found = pipe(Image.fromarray(RGB), focal_px=100.0)
+    assert isinstance(found, dict)
+    expected = net.estimate(RGB, focal_px=100.0).depth_m
+    torch.testing.assert_close(found["predicted_depth"], expected)
+    assert (found["depth"].mode, found["depth"].size) == ("L", (60, 40))
+    assert found["depth"].getextrema() == (0, 255)
+    farthest = np.unravel_index(int(found["predicted_depth"].argmax()), (40, 60))
+    assert np.asarray(found["depth"])[farthest] == 255
+    with pytest.warns(Notice, match="a focal length of 45 px is taken, a phone's"):
+        several = pipe([RGB])
+    assert isinstance(several, list)
+    (one,) = several
+    torch.testing.assert_close(one["predicted_depth"], net.estimate(RGB, focal_px=45.0).depth_m)
+    with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
+        depthpose.pipeline("image-segmentation")
+    assert depthpose.pipeline("depth-estimation").net.weights == "default"
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:

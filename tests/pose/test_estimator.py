@@ -455,3 +455,16 @@ def test_ten_million_points_are_thinned_first(part: ObjectModel) -> None:
     weights = tiny_weights(part, cloud=CloudConfig(max_points=None))
     net = Oracle(weights, [truth], config=config)
     assert_close(net.estimate(cloud=many), truth)
+
+
+def test_estimates_and_networks_are_one_readable_line() -> None:
+    net = GeoPoseNet.load()
+    assert repr(net) == (
+        "GeoPoseNet(ResUNet of bracket, flange, mug, connector, spool, weights 'parts', cpu)"
+    )
+    assert repr(GeoPoseNet.from_pretrained("parts")) == repr(net)
+    pose = Rigid(torch.eye(3), torch.tensor([0.1, -0.25, 1.0]))
+    found = PoseEstimate(name="a", object="mug", status="ok", camera_from_model=pose, risk=0.01)
+    assert repr(found) == "PoseEstimate(mug: ok, t_m=[0.1000, -0.2500, 1.0000], risk 0.010)"
+    none = PoseEstimate(name="a", object="mug", status="doubtful", reason="who knows")
+    assert repr(none) == "PoseEstimate(mug: doubtful, who knows)"

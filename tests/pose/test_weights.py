@@ -114,7 +114,11 @@ def test_the_command_line_knows_the_kind(
 ) -> None:
     write_pose_weights(tmp_path / "mine.safetensors", tiny_weights(bracket(), bottle()))
     assert main(["weights", "list", "--folder", str(tmp_path)]) == 0
-    assert "geoposenet" in capsys.readouterr().out
+    listed = capsys.readouterr().out.splitlines()
+    assert listed[0].split() == ["name", "kind", "MB", "licence", "trained", "on"]
+    assert listed[1].startswith("mine  geoposenet  ")
+    assert main(["weights", "list"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
     assert main(["weights", "show", str(tmp_path / "mine.safetensors")]) == 0
     said = capsys.readouterr().out
     assert "objects: bracket (7), bottle (0)" in said

@@ -5,6 +5,7 @@ import json
 import tempfile
 import threading
 import zipfile
+from base64 import b64decode
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -237,9 +238,27 @@ def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
     one = {"image": "left.png", "camera": "camera.json"}
     found = ask(client, "depth", samples, one).json()
     assert found["said"].endswith(" m. 0% are sky.")
-    assert "grey: sky or no answer" in found["pictures"][0]["caption"]
+    picture, depth = found["pictures"][:2]
+    assert picture["caption"] == "the picture"
+    assert picture["size"] == depth["size"]
+    assert "grey: sky or no answer" in depth["caption"]
+    assert depth["scale"]["title"] == "depth [m]"
+    assert [depth["scale"]["marks"][k] for k in (0, -1)] == [[0.0, "3"], [1.0, "80"]]
+    assert 'placeholder="0.54"' not in html, "the value that makes depths 1.4 % too large"
     status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
     assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
+
+
+def test_examples_are_what_the_forms_take(page: TestClient, tmp_path: Path) -> None:
+    for room, named in (("depth", "camera image right"), ("pose", "camera depth mask")):
+        found = page.get(f"/examples/{room}").json()
+        assert sorted(one["field"] for one in found["files"]) == named.split()
+        for one in found["files"]:
+            (tmp_path / one["name"]).write_bytes(b64decode(one["data"]))
+        files = {one["field"]: one["name"] for one in found["files"]}
+        answer = ask(page, room, tmp_path, files, **found["fields"]).json()
+        assert answer["ok"], answer["said"]
+    assert page.get("/examples/kitchen").status_code == 404
 
 
 def test_a_picture_of_the_sky_alone_is_said_to_be_one(
@@ -387,7 +406,7 @@ def test_an_unknown_cad_file_is_refused_where_open3d_is_missing(
     assert status == 400
     assert "wide.obj: the weights know" in text
     assert "depthpose pose train --cad" in text
-    assert "pip install 'depthpose[open3d]'" in text
+    assert "pip install -e '.[open3d]'" in text
 
 
 @pytest.mark.skipif(find_spec("open3d") is None, reason="Open3D is not installed")

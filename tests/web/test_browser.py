@@ -107,22 +107,31 @@ def send(page: Page, room: str, files: dict[str, Path]) -> str:
 
 
 def test_depth_good(page: Page, address: str, samples: Path) -> None:
-    page.goto(address)
+    page.goto(f"{address}#depth")
     files = {"image": samples / "left.png", "camera": samples / "camera.json"}
     assert "half of these are nearer than" in send(page, "depth", files)
     assert page.locator("#depth .terms").count() == 0, "the weights have none"
     assert 0.05 < drawn_share(page, "#depth") < 1
     pictures = page.locator("#depth .pictures img")
-    assert pictures.count() == 3
-    for k in range(3):
+    assert pictures.count() == 4, "the picture itself stands beside its depth"
+    for k in range(4):
+        shape = pictures.nth(k).evaluate("i => i.decode().then(() => [i.width / i.height, "
+                                         "i.naturalWidth / i.naturalHeight])")  # fmt: skip
+        assert shape[0] == pytest.approx(shape[1], rel=0.02)
+        assert pictures.nth(k).get_attribute("height"), "nothing moves when it comes"
         assert pictures.nth(k).evaluate("image => image.decode().then(() => image.naturalWidth)")
     depth_m = np.load(io.BytesIO(take(page, "#depth", "left.depth_m.npy")))
     # The number under the pointer is the one in the file.
-    box = pictures.first.bounding_box()
+    bar = page.locator("#depth .pictures .scale").first
+    assert bar.locator(".of").text_content() == "depth [m]"
+    assert bar.locator(".marks span").first.text_content() == "3"
+    assert "gradient" in bar.locator(".bar").evaluate("bar => getComputedStyle(bar).background")
+    depth = pictures.nth(1)
+    box = depth.bounding_box()
     assert box is not None
-    pictures.first.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
+    depth.hover(position={"x": box["width"] / 2, "y": box["height"] * 0.9})
     page.locator("#depth .read", has_text="At (").wait_for()
-    said = page.locator("#depth .read").first.text_content() or ""
+    said = page.locator("#depth .read").nth(1).text_content() or ""
     found = re.search(r"At \((\d+), (\d+)\): ([\d.]+) m", said)
     assert found is not None
     u, v, shown_m = int(found[1]), int(found[2]), float(found[3])
@@ -131,6 +140,20 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     page.locator("#depth canvas").press("ArrowLeft")
     page.wait_for_timeout(1000)
     assert picture_of(page, "#depth") != before, "the cloud turns"
+
+
+@pytest.mark.parametrize("room", ["pose", "depth"])
+def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, room: str) -> None:
+    page.goto(address if room == "pose" else f"{address}#depth")
+    assert page.locator(f"#{room}").is_visible(), "poses lead"
+    page.locator(f"#{room} .try").click()
+    page.locator(f"#{room} .answer .said").wait_for()
+    assert page.locator(f"#{room} .said.failed").count() == 0
+    assert page.locator(f"#{room} .drop.has").count() == 3
+    page.set_viewport_size({"width": 400, "height": 900})
+    page.wait_for_timeout(500)
+    width = page.evaluate("document.documentElement.scrollWidth")
+    assert width <= 400, "a phone need not scroll sideways"
 
 
 def test_terms_of_the_weights_are_read_with_the_answer(
@@ -157,7 +180,7 @@ def test_terms_of_the_weights_are_read_with_the_answer(
 
 
 def test_depth_bad(page: Page, address: str, samples: Path) -> None:
-    page.goto(address)
+    page.goto(f"{address}#depth")
     said = send(page, "depth", {"image": samples / "words.txt"})
     assert "'words.txt' is not a picture; this field takes .png" in said
     page.reload()

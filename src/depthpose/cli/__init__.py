@@ -4,26 +4,41 @@ Only this room prints. A command's function is imported when it is named and imp
 when it runs, so that every ``--help`` answers at once.
 """
 
+import platform
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from inspect import cleandoc
+from importlib.metadata import version
+from inspect import cleandoc, signature
 
 from depthpose import __version__
+from depthpose.cli.early import refuse_missing
 from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
 
 COMMANDS = {
     "demo": (
         "demo:demo",
-        "run everything on a made street and open the books: out/demo/report.html",
+        "pose made parts, match a real pair, guess a street: out/demo/report.html",
     ),
-    "doctor": (
-        "doctor:doctor",
-        "what is installed, and a try of each room; or what files are",
-    ),
+    "doctor": ("doctor:doctor", "what is installed, and a try of each room; or what files are"),
     "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
+    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose train": ("pose_training:train", "your CAD file, or a config, to a network that poses it"),
+    "pose calibrate": (
+        "pose_training:calibrate",
+        "choose anew when poses of trained weights are withheld",
+    ),
+    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
+    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
+    "depth train": (
+        "training:train",
+        "stages view, select, stereo, finetune: generator, matcher, one through the other",
+    ),
+    "depth calibrate": ("depth:calibrate", "choose when an image is refused as unlike the known"),
+    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
         "data:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
@@ -51,21 +66,8 @@ COMMANDS = {
         "upload weights and their card to the Hugging Face hub",
     ),
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
-    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
-    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
-    "depth train": ("training:train", "train the generator, the matcher, or one through the other"),
-    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
-    "depth calibrate": ("depth:calibrate", "choose when an image is refused as unlike the known"),
-    "pose train": (
-        "pose_training:train",
-        "your CAD file, or a config, to a network that poses it",
-    ),
-    "pose calibrate": (
-        "pose_training:calibrate",
-        "choose anew when poses of trained weights are withheld",
-    ),
-    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
+    "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
     "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),
     "reproduce all": (
         "reproduce_all:reproduce_all",
@@ -78,9 +80,9 @@ COMMANDS = {
     "figure 3-2": ("pose_figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
     "figure 3-4": ("pose_figures:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("pose_figures:figure_3_5", "boxes of true and estimated poses"),
-    "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
-    "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
 }
+_THESIS = ("reproduce", "figure")
+"""Groups of commands that make the tables and figures of the thesis again."""
 _EXIT_CODES = """exit codes:
   0    done
   1    done, but something in the input failed (it is named)
@@ -99,8 +101,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if words is None else words)
     if given in (["--version"], ["-V"]):
-        print(f"depthpose {__version__}")
-        return 0
+        return _say_version()
     name, rest = _split_command(given)
     if name is None:
         return _explain(given)
@@ -117,6 +118,15 @@ def main(words: Sequence[str] | None = None) -> int:
     finally:
         if "depthpose.core.hold" in sys.modules:
             sys.modules["depthpose.core.hold"].release_folders()
+
+
+def _say_version() -> int:
+    """Say what a report of a problem begins with."""
+    from depthpose.cli.doctor import device_names
+
+    versions = f"torch {version('torch')}, Python {platform.python_version()}"
+    print(f"depthpose {__version__} ({versions}, {device_names()})")
+    return 0
 
 
 @contextmanager
@@ -153,9 +163,17 @@ def _run(name: str, rest: list[str]) -> int:
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
+
+    from depthpose.cli.wording import in_words_of
+
+    @in_words_of(command)
+    def checked(*words: object, **options: object) -> int:
+        refuse_missing(signature(command).bind(*words, **options).arguments)
+        return command(*words, **options)
+
     try:
         return tyro.cli(
-            command,
+            checked,
             prog=f"depthpose {name}",
             description=text,
             args=rest,
@@ -188,7 +206,15 @@ def _explain(given: list[str]) -> int:
 
 def _overview(commands: dict[str, str], group: str) -> str:
     width = max(map(len, commands)) + 2
-    lines = [f"  {name:<{width}}{what}" for name, what in commands.items()]
+    of_thesis = {n: what for n, what in commands.items() if n.partition(" ")[0] in _THESIS}
+    parts = {
+        "commands": {n: what for n, what in commands.items() if n not in of_thesis},
+        "the tables and figures of the thesis": of_thesis,
+    }
+    lines: list[str] = []
+    for title, names in parts.items():
+        if names:
+            lines += [f"{title}:", *(f"  {n:<{width}}{what}" for n, what in names.items()), ""]
     usage = f"usage: depthpose {group or 'COMMAND'} ... [--help]"
-    what = "Metric depth from one camera, and the 6-DoF pose of a known object from a depth sensor."
-    return "\n".join([usage, "", what, "", "commands:", *lines, "", _EXIT_CODES])
+    what = "The 6-DoF pose of a known object from a depth sensor, and metric depth from images."
+    return "\n".join([usage, "", what, "", *lines, _EXIT_CODES])

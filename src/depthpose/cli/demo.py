@@ -2,27 +2,33 @@
 
 from pathlib import Path
 
+_OF_POSES = ("object", "status", "error_mm", "of_diameter", "rotation_deg", "translation_mm")
+_OF_DEPTHS = ("scene", "method", "sees", "abs_rel", "rmse", "d1", "epe_px")
+"""Columns that are printed; the page and the files hold all."""
+
 
 def demo(
     out: Path = Path("out/demo"), weights: str = "default", pose_weights: str = "parts"
 ) -> int:
-    """Estimate depth of a street and of a real pair, and poses of parts; write a page about it.
+    """Pose made parts, estimate depth of a real pair and of a street; write a page about it.
 
-    Needs no network and no data. The street's depth is known exactly: it is estimated from one
-    image and from both, beside OpenCV's StereoSGBM. The real pair comes with scikit-image (the
-    extra 'demo'); without it the page shows the street alone. Five made parts on a table are posed
-    from a depth image.
+    Needs no network and no data. Five made parts on a table are posed from a depth image. The real
+    pair comes with scikit-image (the extra 'demo'); without it the page shows the street alone,
+    whose depth is known exactly: it is estimated from both images and from one, beside OpenCV's
+    StereoSGBM.
 
     Args:
         out: folder for the pictures, the maps, the poses and report.html.
         weights: of the depth networks, by name or file ('depthpose weights list').
         pose_weights: of a pose network that knows made parts, by name or file.
     """
-    from depthpose.core.report import markdown_table
+    from functools import partial
+
+    from depthpose.core.report import plain_table
     from depthpose.demo import make_demo
 
-    result = make_demo(out, weights, pose_weights)
-    print(markdown_table(result.depths))
-    print(markdown_table(result.poses))
+    result = make_demo(out, weights, pose_weights, tell=partial(print, flush=True))
+    print(plain_table(result.poses, _OF_POSES))
+    print(plain_table(result.depths, _OF_DEPTHS))
     print(f"The page: {result.page}")
     return 0

@@ -9,7 +9,6 @@ from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, FloorName, MatcherConfig
 
-MatcherName = Literal["psmnet", "sgbm"]
 Precision = Literal["fp32", "bf16"]
 Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
@@ -20,7 +19,7 @@ def predict(
     camera: Path | None = None,
     focal_px: float | None = None,
     weights: str = "default",
-    matcher: Literal["psmnet", "sgbm"] = "psmnet",
+    matcher: str = "psmnet",
     answer: Answer | None = None,
     color_range: tuple[float, float] = (3.0, 80.0),
     device: str = "cpu",
@@ -51,9 +50,10 @@ def predict(
             BOP, ROS or OpenCV. A baseline in it is not looked at: one image has none.
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
         weights: weights with a generator, by name or file ('depthpose weights list').
-        matcher: psmnet (that of the weights), or sgbm, OpenCV's.
+        matcher: what matches the drawn view: psmnet (that of the weights), sgbm (OpenCV's), or
+            other weights with a matcher, by name or file.
         answer: own: the generator's own disparity; matched: the matcher on left and drawn right
-            view; joined: both. Left out: what the weights say; sgbm matches.
+            view; joined: both. Left out: what the weights say; another matcher matches.
         color_range: metres of the brightest and the darkest colour, the same for all pictures.
         device: cpu, cuda, cuda:1, ...
         precision: of the matcher, fp32, or bf16: faster, at some hundredths of a pixel.
@@ -75,14 +75,22 @@ def predict(
         raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
     if batch < 1:
         raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
-    if matcher == "sgbm" and answer is not None:
-        raise InputError(f"--answer {answer} and --matcher sgbm: sgbm matches; leave one away.")
+    if matcher != "psmnet" and answer is not None:
+        raise InputError(
+            f"--answer {answer} and --matcher {matcher}: another matcher matches the drawn view; "
+            "leave one away."
+        )
     if matcher == "sgbm" and config != MatcherConfig():
         raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
     look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
     if engine.is_ray:
         from depthpose.cli import engine_depth
 
+        if matcher not in ("psmnet", "sgbm"):
+            raise InputError(
+                f"--matcher {matcher}: --engine ray takes psmnet or sgbm; make one file of both by "
+                "'depthpose weights pack G --matcher S --out W'"
+            )
         recipe = engine_depth.NetRecipe(
             weights=engine_depth.Weights.read(weights),
             config=config,
@@ -98,7 +106,7 @@ def predict(
         weights,
         config,
         with_right=False,
-        with_sgbm=matcher == "sgbm",
+        matcher=matcher,
         with_unlike=with_unlike,
         answer=answer,
     )
@@ -112,7 +120,7 @@ def match(
     camera: Path,
     out: str,
     weights: str | None = None,
-    matcher: MatcherName | None = None,
+    matcher: str = "psmnet",
     device: str = "cpu",
     precision: Precision = "fp32",
     max_memory: str | None = None,
@@ -130,7 +138,8 @@ def match(
     what is finished; other settings need another --out. No file is written over that is not the
     run's own.
 
-        depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out out
+        depthpose depth match left.png right.png --camera cam.json --out out
+        depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out sgbm
 
     Args:
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
@@ -139,8 +148,9 @@ def match(
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
         out: folder for the results.
-        weights: PSMNet weights, a .safetensors file.
-        matcher: psmnet (the default with --weights) or sgbm, OpenCV's, which needs no weights.
+        weights: weights with a matcher, by name or file; 'default' unless sgbm matches.
+        matcher: what matches the two views: psmnet (that of the weights), sgbm (OpenCV's, which
+            needs none), or weights with a matcher, by name or file.
         device: cpu, cuda, cuda:1, ...
         precision: fp32, or bf16: faster, at some hundredths of a pixel.
         max_memory: bound on the memory of activations, such as 1GB or 800MB; exact.
@@ -154,8 +164,7 @@ def match(
     from depthpose.cli import matching, methods
     from depthpose.core.run import refuse_among_inputs
 
-    if (weights is None) == (matcher != "sgbm"):
-        raise InputError("match with --weights FILE (PSMNet), or with --matcher sgbm.")
+    weights = _weights_that_match(weights, matcher)
     config = MatcherConfig(
         device=device,
         precision=precision,
@@ -185,6 +194,18 @@ def match(
     return matching.match_all(pairs, method, Path(out), with_cloud=cloud)
 
 
+def _weights_that_match(weights: str | None, matcher: str) -> str | None:
+    """Name the weights whose matcher matches; None where sgbm does."""
+    if matcher == "psmnet":
+        return "default" if weights is None else weights
+    if weights is not None:
+        raise InputError(
+            f"--weights {weights} and --matcher {matcher}: one of the two matches the pair; leave "
+            "the other away"
+        )
+    return None if matcher == "sgbm" else matcher
+
+
 def _match_on_ray(
     left: str,
     right: str | None,
@@ -212,7 +233,7 @@ def evaluate(
     data: Path,
     out: Path,
     weights: tuple[str, ...] = (),
-    matcher: MatcherName | None = None,
+    matcher: Literal["sgbm"] | None = None,
     predictions: str | None = None,
     floor: tuple[FloorName, ...] = (),
     train: tuple[Path, ...] = (),
@@ -244,7 +265,7 @@ def evaluate(
             their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one, and
             'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the
             generator, from the matcher on the drawn view, or from both.
-        matcher: sgbm measures OpenCV's StereoSGBM.
+        matcher: sgbm measures OpenCV's StereoSGBM on both views, and no weights.
         predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
             that 'depth predict|match --engine ray' left, path or URL.
         floor: what every method must beat: rows (the best constant depth of each image row) or

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, install_words
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -48,7 +48,7 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 
-    for name, value in {**environment(), "device": _devices(), "weights in": SHIPPED}.items():
+    for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
     print(*_extras(), *_weights(), sep="\n")
     tries = {"depth room": _try_depth, "pose room": _try_pose}
@@ -56,7 +56,8 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
     return 0 if all(works) else 1
 
 
-def _devices() -> str:
+def device_names() -> str:
+    """Name what computes: the GPUs, or the processor alone."""
     import torch
 
     found = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -76,7 +77,7 @@ def _extras() -> Iterator[str]:
         if not _is_installed(package):
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        how = f"lacks {', '.join(packages)}: pip install 'depthpose[{extra}]'"
+        how = f"lacks {', '.join(packages)}: {install_words(extra)}"
         yield f"extra {extra}: {how if packages else 'installed'}"
 
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from depthpose.cli.wording import in_words
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
@@ -23,9 +24,9 @@ class EngineOptions:
     many results to a shard, OUT/shards/*.tar or *.parquet, listed in OUT/manifest.csv; inputs and
     OUT may be URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest
     (*.parquet, *.csv)."""
-    address: str | None = None
+    address: Annotated[str | None, in_words("HOST:PORT")] = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
-    workers: int | None = None
+    workers: Annotated[int | None, in_words("N")] = None
     """at most; by default as many as the cluster has room for."""
     worker_cpus: float = 1.0
     """cores that each worker asks for."""

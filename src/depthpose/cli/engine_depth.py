@@ -44,7 +44,7 @@ class NetRecipe:
                 path,
                 self.config,
                 with_right=self.with_right,
-                with_sgbm=self.with_sgbm,
+                matcher="sgbm" if self.with_sgbm else "psmnet",
                 with_unlike=self.with_unlike,
                 answer=self.answer,
             )

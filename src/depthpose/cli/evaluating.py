@@ -12,12 +12,16 @@ from tqdm import tqdm
 from depthpose.cli.depth_page import frame_sections
 from depthpose.cli.methods import Method
 from depthpose.core.errors import InputError
-from depthpose.core.report import Section, markdown_table, write_page, write_table
+from depthpose.core.report import Section, plain_table, write_page, write_table
 from depthpose.core.run import environment, find_shard, read_settings, wait_for
 from depthpose.depth.evaluate import PROTOCOLS, Evaluation, Protocol, evaluate, has_truth
 from depthpose.depth.kitti import Dataset, join_datasets, open_dataset
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import StereoInput
+
+_SHOWN = ("method", "cap_m", "frames", "coverage", "abs_rel", "sq_rel", "rmse", "rmse_log", "d1",
+          "epe_px", "d1_all", "ause")  # fmt: skip
+"""Columns that are printed; the files hold all."""
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
@@ -93,9 +97,9 @@ def measure(
         *detail_sections(measured),
     ]
     write_page(page, f"{protocol} on {dataset.name}", sections, environment())
-    print(markdown_table(measured.rows))
+    print(plain_table(measured.rows, _SHOWN))
     say_skipped(measured)
-    print(f"the page: {page}")
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
     return 0
 
 

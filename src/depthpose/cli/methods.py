@@ -39,7 +39,7 @@ def weights_method(
     config: MatcherConfig,
     *,
     with_right: bool | None = None,
-    with_sgbm: bool = False,
+    matcher: str = "psmnet",
     with_unlike: bool = True,
     answer: Answer | None = None,
 ) -> Method:
@@ -49,7 +49,8 @@ def weights_method(
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
         with_right: show it the real right view; by default only to a matcher, which needs it.
-        with_sgbm: let OpenCV match the drawn view in place of the weights' own matcher.
+        matcher: what matches the drawn view: psmnet (the weights' own), sgbm (OpenCV's), or that
+            of other weights, by name or file.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
@@ -69,15 +70,24 @@ def weights_method(
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
     if kind != "psmnet":
         facts["sees"] = "both views" if is_shown else "left view"
-    if with_sgbm:
+    if matcher == "sgbm":
         facts["matcher"] += " with sgbm"
         sgbm = SGBMConfig(with_filled_holes=True)
         net = FakestereoNet.load(
             path, matcher="sgbm", config=sgbm, answer="matched", with_unlike=with_unlike
         )
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
-    run = replace(config, device=own_device(config.device))
-    net = FakestereoNet.load(path, config=run, answer=answer, with_unlike=with_unlike)
+    config = replace(config, device=own_device(config.device))
+    if matcher != "psmnet":
+        other = find_weights(matcher)
+        facts["matcher"] += f" with {other.stem}"
+        facts["matcher_sha256"] = file_sha256(other)
+        net = FakestereoNet.load(
+            path, matcher=other, config=config, answer="matched", with_unlike=with_unlike
+        )
+        name = f"{path.stem}-{other.stem}"
+        return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+    net = FakestereoNet.load(path, config=config, answer=answer, with_unlike=with_unlike)
     if is_shown and net.matcher is None:
         raise InputError(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
@@ -101,7 +111,7 @@ def named_method(word: str, config: MatcherConfig) -> Method:
     if how == "both":
         return weights_method(name, config, with_right=True)
     if how == "sgbm":
-        return weights_method(name, config, with_right=False, with_sgbm=True)
+        return weights_method(name, config, with_right=False, matcher="sgbm")
     return weights_method(word, config)
 
 

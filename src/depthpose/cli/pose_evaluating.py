@@ -12,7 +12,7 @@ from depthpose.cli.pose_names import distinct_names
 from depthpose.cli.pose_page import instance_sections
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
-from depthpose.core.report import Section, markdown_table, write_page, write_table
+from depthpose.core.report import Section, plain_table, write_page, write_table
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.bop import BopDataset, Instance, open_bop, read_targets
 from depthpose.pose.config import EvaluationConfig
@@ -24,6 +24,9 @@ HOW = (
     "to 10 cm. ar, ar_vsd, ar_mssd, ar_mspd: BOP's average recalls. The row 'mean' counts each "
     "object the same, 'all' each instance, as BOP does."
 )
+_SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",
+          "rotation_deg_median", "translation_m_median")  # fmt: skip
+"""Columns that are printed; the files hold all."""
 
 
 def open_instances(
@@ -157,8 +160,8 @@ def measure(
     page = out / "report.html"
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
     write_page(page, title, sections, environment())
-    print(markdown_table(measured.rows))
-    print(f"the page: {page}")
+    print(plain_table(measured.rows, _SHOWN))
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
     return 0
 
 

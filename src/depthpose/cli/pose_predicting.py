@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,6 +24,8 @@ from depthpose.core.files import (
     write_cloud,
     write_image,
 )
+from depthpose.core.report import plain_table
+from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
     Shard,
     claim_folder,
@@ -55,6 +58,9 @@ from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
 PAGE = "report.html"
+_MOST_SHOWN = 20
+"""Of the answers, on the terminal; poses.json holds all."""
+_FRAME = "camera_from_model: x right, y down, z forward; risk: the chance that a pose is wrong"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,11 +228,30 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
             reasons[prediction.estimate.status] += 1
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
-    if len(predictions) == 1 and not failed and not predictions[0].estimate.is_ok:
-        print(f"refused: {predictions[0].estimate.reason}")
+    shown = [p.estimate for p in predictions if is_finished(p)]
+    if shown:
+        print(plain_table([_answer_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
+        print(_FRAME)
+    if len(shown) == 1 and not shown[0].is_ok:
+        print(f"refused: {shown[0].reason}")
     said = ", ".join(f"{count} {status}" for status, count in sorted(reasons.items()))
     print(f"{len(predictions)} inputs: {said or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
+
+
+def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
+    """Say what was found of one input: object, status, translation, quaternion, risk."""
+    row: dict[str, Any] = {
+        "input": estimate.name,
+        "object": estimate.object,
+        "status": estimate.status,
+    }
+    pose = estimate.camera_from_model
+    if pose is not None:
+        quaternion = Rotation.from_matrix(pose.R.double().numpy()).as_quat()
+        row |= {"x, y, z [m]": numbers_text(pose.t_m.tolist())}
+        row |= {"qx, qy, qz, qw": numbers_text(quaternion.tolist())}
+    return row | {"risk": None if estimate.risk is None else f"{estimate.risk:.3f}"}
 
 
 def write_files(

@@ -1,6 +1,7 @@
 """``depthpose pose train`` and ``pose calibrate``."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,6 +32,7 @@ def train(
     device: Literal["auto", "cpu"] | None = None,
     precision: Literal["fp32", "bf16", "fp16"] | None = None,
     resume: bool = False,
+    finish: bool = False,
     view: str | None = None,
 ) -> int:
     """Train a network on your CAD file, or by a config.
@@ -38,7 +40,8 @@ def train(
     Views of the object are made while it trains: no photograph is needed. At the end the refusal
     is calibrated and the whole is judged on views that it has not seen; OUT holds the weights with
     the model in them, their card, and all that led there. What stopped a training is made good by
-    --resume.
+    --resume; --finish, or Ctrl-C twice, makes do with the steps so far. Without a terminal a line
+    is printed each minute.
 
         depthpose pose train --cad part.stl --unit mm --out my_part
         depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
@@ -60,6 +63,8 @@ def train(
         device: auto takes what accelerate finds; cpu takes no GPU.
         precision: arithmetic of the forward pass.
         resume: go on from the state that OUT holds.
+        finish: calibrate and write weights of the state that OUT holds, without another step;
+            Ctrl-C twice does the same while it trains.
         view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
     """
     from depthpose.core.config import read_config
@@ -84,7 +89,8 @@ def train(
         chosen = _with_data(chosen, data)
     is_first = find_shard().rank == 0
     with progress_bar(view) as on_step:
-        run = Run(folder=out, resume=resume, on_step=on_step, tell=print if is_first else None)
+        tell = partial(print, flush=True) if is_first else None
+        run = Run(folder=out, resume=resume, finish=finish, on_step=on_step, tell=tell)
         path = run_stage(chosen, run)
     if is_first:
         say_trained(path)

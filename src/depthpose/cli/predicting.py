@@ -9,14 +9,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.depth_page import PAGE, write_depth_page
 from depthpose.cli.methods import Method
 from depthpose.cli.viewing import Viewer, open_viewer
-from depthpose.core.camera import Camera, StereoRig, read_camera
+from depthpose.core.camera import Camera, StereoRig, centred_camera, read_camera
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -54,10 +53,7 @@ class Lens:
         if self.camera is not None:
             return self.camera
         assert self.focal_px is not None
-        height, width = image.shape[1:]
-        f = self.focal_px
-        K = [[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]
-        return Camera(width=width, height=height, K=torch.tensor(K, dtype=torch.float64))
+        return centred_camera((image.shape[2], image.shape[1]), self.focal_px)
 
     def facts(self) -> dict[str, Any]:
         """Give what is known as JSON values: it decides the results."""

@@ -13,7 +13,7 @@ def list_weights(folder: Path | None = None) -> int:
         folder: look here instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-    from depthpose.core.report import markdown_table
+    from depthpose.core.report import plain_table
 
     home = folder or SHIPPED
     found = sorted(home.glob("*.safetensors"))
@@ -21,11 +21,23 @@ def list_weights(folder: Path | None = None) -> int:
         print(f"No weights in {home}. 'depthpose weights import' brings in a published checkpoint.")
         return 0
     rows = [
-        {"name": path.stem, "kind": (read := read_checkpoint(path)).kind, **read.facts}
+        {
+            "name": path.stem,
+            "kind": (read := read_checkpoint(path)).kind,
+            "MB": f"{path.stat().st_size / 1e6:.1f}",
+            "licence": _in_short(read.facts.get("licence", "")),
+            "trained on": _in_short(read.facts.get("trained_on", "")),
+        }
         for path in found
     ]
-    print(markdown_table(rows), end="")
+    print(plain_table(rows), end="")
+    print("'depthpose weights show NAME' says all of one: origin, terms, settings.")
     return 0
+
+
+def _in_short(text: str, most: int = 34) -> str:
+    """Cut a sentence at a word."""
+    return text if len(text) <= most else text[: most - 4].rpartition(" ")[0].rstrip(",;") + " ..."
 
 
 def show_weights(weights: tyro.conf.Positional[str]) -> int:
@@ -127,7 +139,7 @@ def pack_weights(
         out: the .safetensors file to write.
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
-        matcher: take the matcher from these weights.
+        matcher: what matches the two views: weights with a matcher, by name or file.
         terms: said whenever the weights are loaded; for licences that bind the user. Those of the
             weights that are packed stay beside them.
         half: store 16-bit floats: half the size.

@@ -15,17 +15,12 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.hub import WEIGHTS_FILE, fetch_weights, is_on_hub
+from depthpose.core.shipped import SHIPPED as SHIPPED
+from depthpose.core.shipped import find_weights as find_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
-
-SHIPPED = Path(__file__).parents[1] / "weights"
-"""Folder of the weights that come with the package."""
-
-_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
-"""Weights that stay out of the wheel."""
 
 
 class LicenceNotice(Notice):
@@ -185,38 +180,6 @@ def read_published(path: Path) -> Mapping[str, Any]:
         return _tensors(file)
 
 
-def find_weights(name: str | Path) -> Path:
-    """Find a weights file: by its path, its folder, its name in the package, or on the hub.
-
-    Args:
-        name: a file; weights that came with the package, by name; a folder with one file of
-            weights, or with ``model.safetensors``; or ``hf://OWNER/NAME`` (``core.hub``).
-
-    Raises:
-        InputError: none of these; the nearest name is said.
-    """
-    path = Path(name)
-    shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
-    if path.is_file():
-        return path
-    if str(name) in shipped:
-        return shipped[str(name)]
-    if path.is_dir():
-        return _only_weights(path)
-    if is_on_hub(name):
-        return fetch_weights(str(name))
-    if str(name) in _IN_REPOSITORY:
-        raise InputError(
-            f"weights {str(name)!r}: not in the wheel, for their terms or their size. Take "
-            f"src/depthpose/weights/{name}.safetensors from the repository and give its path."
-        )
-    raise InputError(
-        f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
-        f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones, "
-        "hf://OWNER/NAME those on the hub."
-    )
-
-
 def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
     """Warn of terms that bind whoever uses the weights, where their card has any."""
     if terms := facts.get("terms", ""):
@@ -253,18 +216,6 @@ def file_sha256(path: Path) -> str:
     """Fingerprint a file; it stands beside every number that the file made."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _only_weights(folder: Path) -> Path:
-    files = sorted(folder.glob("*.safetensors"))
-    named = [file for file in files if file.name == WEIGHTS_FILE] or files
-    if len(named) == 1:
-        return named[0]
-    which = ", ".join(file.name for file in files) or "none"
-    raise InputError(
-        f"{folder}: a folder of weights holds one .safetensors file, or one called {WEIGHTS_FILE}; "
-        f"here: {which}. Name the file."
-    )
 
 
 @contextmanager

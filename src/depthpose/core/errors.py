@@ -19,8 +19,13 @@ class MissingExtraError(ImportError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(
-            f"{purpose} needs {package}, which is not installed: pip install 'depthpose[{extra}]'"
+            f"{purpose} needs {package}, which is not installed: {install_words(extra)}"
         )
+
+
+def install_words(extra: str) -> str:
+    """Say how an extra is installed; the package index has no release yet."""
+    return f"pip install -e '.[{extra}]' in the clone of depthpose"
 
 
 class Notice(UserWarning):

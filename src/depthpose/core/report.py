@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
 from depthpose.core.draw import Scale, shrink_to_pixels
-from depthpose.core.files import atomic_write, encode_image, write_json
+from depthpose.core.files import atomic_write, encode_image, image_size, read_image, write_json
 from depthpose.core.scene import Scene, page_file
 
 Row = Mapping[str, Any]
@@ -21,6 +21,8 @@ Row = Mapping[str, Any]
 _MOST_PIXELS = 480_000
 """Of a drawing on a page of many: a frame of KITTI is whole."""
 _QUALITY = 85
+_MOST_BYTES = 250_000
+"""Of a picture file that goes onto a page as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +34,18 @@ class Picture:
     scale: Scale | None = None
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]: a page that knows them does not move when the picture comes."""
+        return image_size(self.path)
+
+    @property
     def data_uri(self) -> str:
-        """The file's bytes as a ``data:`` address, so that the page needs no other file."""
+        """The picture as a ``data:`` address, so that the page needs no other file.
+
+        A small file's own bytes; a large one is shrunk to what a page of many takes.
+        """
+        if self.path.stat().st_size > _MOST_BYTES:
+            return Drawing(image=read_image(self.path), caption=self.caption).data_uri
         kind = "jpeg" if self.path.suffix.lower() in (".jpg", ".jpeg") else "png"
         return f"data:image/{kind};base64," + base64.b64encode(self.path.read_bytes()).decode()
 
@@ -45,6 +57,11 @@ class Drawing:
     image: Float[Tensor, "3 h w"]
     caption: str
     scale: Scale | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.image.shape[2], self.image.shape[1]
 
     @property
     def data_uri(self) -> str:
@@ -104,6 +121,24 @@ def markdown_table(rows: Sequence[Row]) -> str:
     lines = [names, ["---"] * len(names)]
     lines += [[show_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
+    """Format rows for a terminal, in columns of their own width; columns without a value go.
+
+    Args:
+        rows: to be shown.
+        names: of the columns, where not all are wanted; one that no row has is left out.
+    """
+    wanted = [
+        n for n in names or column_names(rows) if any(row.get(n) not in (None, "") for row in rows)
+    ]
+    cells = [wanted, *([show_value(row.get(name)) for name in wanted] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "".join(
+        "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
+        for line in cells
+    )
 
 
 def csv_table(rows: Sequence[Row]) -> str:

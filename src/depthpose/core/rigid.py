@@ -1,9 +1,12 @@
 """Rigid transforms: apply, compose, invert, compare, fit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -33,6 +36,28 @@ class Rigid:
     def inverse(self) -> "Rigid":
         """Give ``source_from_target``."""
         return Rigid(self.R.mT, -(self.R.mT @ self.t_m[..., None]).squeeze(-1))
+
+    def matrix(self) -> Float64[Tensor, "*batch 4 4"]:
+        """Give ``[[R, t], [0, 1]]``, the translation in metres."""
+        top = torch.cat([self.R, self.t_m[..., None]], -1).double()
+        last = top.new_tensor([0, 0, 0, 1]).expand(*top.shape[:-2], 1, 4)
+        return torch.cat([top, last], -2)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:  # noqa: ANN401
+        """Give :meth:`matrix` to numpy, whose ``asarray`` and functions then take a transform."""
+        return np.array(self.matrix().detach().cpu().numpy(), dtype=dtype, copy=copy)
+
+    def __repr__(self) -> str:
+        """Say it in one line: of a batch its size alone."""
+        if self.t_m.ndim > 1:
+            return f"Rigid(a batch of {tuple(self.t_m.shape[:-1])})"
+        rows = ", ".join(f"[{numbers_text(row)}]" for row in self.R.tolist())
+        return f"Rigid(R=[{rows}], t_m=[{numbers_text(self.t_m.tolist())}])"
+
+
+def numbers_text(numbers: Sequence[float], digits: int = 4) -> str:
+    """Write numbers for people: ``0.1234, -1.0000``."""
+    return ", ".join(f"{number:.{digits}f}" for number in numbers)
 
 
 def fit_rigid(

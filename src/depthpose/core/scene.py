@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.files import Cloud
 
 MOST_POINTS = 60_000
-"""Of one cloud on a page: 1.2 MB of text."""
+"""Of one cloud on a page: 0.7 MB of text."""
 MOST_LINES = 20_000
 
 _GREY = 0.55
@@ -73,7 +73,7 @@ class Scene:
         return "; ".join(said)
 
     def encoded(self) -> dict[str, Any]:
-        """Give the JSON that ``viewer.js`` reads: base64 of float32 places and 8-bit colours."""
+        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours."""
         return {"caption": self.caption, "note": self.note,
                 "layers": [_encoded(layer) for layer in self.layers]}  # fmt: skip
 
@@ -129,8 +129,23 @@ def _encoded(layer: Layer) -> dict[str, Any]:
         "kind": kind,
         "shown": layer.is_shown,
         "count": len(places),
-        "places": _base64(places.detach().cpu().numpy().astype("<f4")),
+        **_encoded_places(places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)),
         "colors": _base64(bytes_of_color),
+    }
+
+
+def _encoded_places(places_m: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """Store places as steps of 1/65535 of their extent: half the size of float32.
+
+    A street of 80 m has steps of 1.2 mm, a table of 1.5 m of 0.02 mm.
+    """
+    low = places_m.min(0) if len(places_m) else np.zeros(3)
+    step = (places_m.max(0) - low) / 65535 if len(places_m) else np.zeros(3)
+    steps = np.round((places_m - low) / np.where(step > 0, step, 1))
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "places": _base64(steps.astype("<u2")),
     }
 
 

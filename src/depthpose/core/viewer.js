@@ -1,8 +1,8 @@
 // A 3D view of points and lines in plain WebGL: showScene(element, scene).
 //
-// A scene is {caption, note, layers: [{name, kind, shown, count, places, colors}]}: kind is "points"
-// or "lines", places are base64 of little-endian float32 (three a point, six a line), colors of
-// 8-bit RGB. The frame is a camera's: x right, y down, z forward, in metres. One WebGL context
+// A scene is {caption, note, layers: [{name, kind, shown, count, places, low, step, colors}]}: kind
+// is "points" or "lines", places are base64 of little-endian 16-bit steps from low (three a point,
+// six a line), colors of 8-bit RGB. The frame is a camera's: x right, y down, z forward, in metres. One WebGL context
 // draws all views of a page (browsers allow few), and each is copied to a canvas that prints. Shown
 // again, an element's former scene is let go.
 const showScene = (() => {
@@ -147,7 +147,8 @@ const showScene = (() => {
     element.classList.add("scene");
     if (!context()) return element.append(made("p", { className: "lacking", textContent: LACKING }));
     const layers = scene.layers.map(layer => ({ ...layer,
-      places: decoded(layer.places, Float32Array), colors: decoded(layer.colors, Uint8Array) }));
+      places: Float32Array.from(decoded(layer.places, Uint16Array), (n, i) => layer.low[i % 3] + n * layer.step[i % 3]),
+      colors: decoded(layer.colors, Uint8Array) }));
     const canvas = made("canvas", { tabIndex: 0, role: "img" }), flat = canvas.getContext("2d");
     canvas.ariaLabel = `3D view: ${scene.caption}. Arrow keys turn it, plus and minus zoom, 0 resets.`;
     const keys = made("div", { className: "keys" });

@@ -46,7 +46,7 @@ def show_depth(
     street = replace(street, input=replace(street.input, name="street"))
     network = FakestereoNet.load(weights)
     rows, sections = [], []
-    for sample, intro in ((street, _STREET_TEXT), (read_motorcycle(), _MOTORCYCLE_TEXT)):
+    for sample, intro in ((read_motorcycle(), _MOTORCYCLE_TEXT), (street, _STREET_TEXT)):
         if sample is None:
             continue
         more, shown = _try_all(out, sample, _nets(network, sample), intro)
@@ -64,7 +64,7 @@ def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
     filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
     pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
     is_street = sample.input.name == "street"
-    return {"Fakestereo-Net, compact": (_FROM_ONE, network), **pairs} if is_street else pairs
+    return {**pairs, "Fakestereo-Net, compact": (_FROM_ONE, network)} if is_street else pairs
 
 
 def _try_all(
@@ -120,7 +120,9 @@ _STREET_TEXT = (
     "A made street, drawn on the spot from a seed that no training has seen; its depth is known "
     "exactly. Distances from 3 m (bright) to 80 m (dark), grey where there is none: the sky. "
     "epe_px and d1_all measure disparity, the other columns depth, over all pixels nearer than "
-    "80 m, hidden ones too."
+    "80 m, hidden ones too. Depth from one image is a guess from what streets look like: good for "
+    "road, cars and house fronts at a usual camera's height, too near far away, and of nothing but "
+    "streets."
 )
 _MOTORCYCLE_TEXT = (
     "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "

@@ -92,3 +92,24 @@ class DepthEstimate:
     is_sky: Bool[Tensor, "h w"] | None = None
     familiarity: float | None = None
     warning: str = ""
+
+    def __repr__(self) -> str:
+        """Say it in one line: size, metres, certainty."""
+        height, width = self.disparity_px.shape
+        said = [f"{width}x{height}", f"disparity {_spread(self.disparity_px, 'px')}"]
+        if self.depth_m is not None:
+            said[1] = f"depth {_spread(self.depth_m, 'm')}"
+        if self.confidence is not None:
+            said.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
+        if self.is_sky is not None:
+            said.append(f"sky {float(self.is_sky.float().mean()):.0%}")
+        return f"DepthEstimate({', '.join(said)})"
+
+
+def _spread(values: Float[Tensor, "h w"], unit: str) -> str:
+    known = values[values.isfinite()]
+    if not len(known):
+        return "nowhere known"
+    low, high = (float(v) for v in known.aminmax())
+    share = "" if len(known) == values.numel() else f", known of {len(known) / values.numel():.0%}"
+    return f"{low:.1f} .. {high:.1f} {unit} (median {float(known.median()):.1f}{share})"

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, numbers_text
 
 Status = Literal[
     "ok",
@@ -266,3 +266,12 @@ class PoseEstimate:
     def is_ok(self) -> bool:
         """Whether there is a pose."""
         return self.status == "ok"
+
+    def __repr__(self) -> str:
+        """Say it in one line."""
+        said = f"{self.object}: {self.status}"
+        if self.camera_from_model is not None:
+            said += f", t_m=[{numbers_text(self.camera_from_model.t_m.tolist())}]"
+        if self.risk is not None:
+            said += f", risk {self.risk:.3f}"
+        return f"PoseEstimate({said}{f', {self.reason}' if self.reason else ''})"

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from depthpose.core.draw import Scale
 from depthpose.core.scene import Scene
 
 
@@ -16,12 +17,14 @@ class Shown:
         caption: says what it shows, with its scale.
         values: file with a number for each pixel, which the page reads out under the pointer.
         unit: of these numbers.
+        scale: what its colours mean.
     """
 
     file: str
     caption: str
     values: str | None = None
     unit: str = ""
+    scale: Scale | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,13 +4,15 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import anyio
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -24,8 +26,9 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.scene import page_file
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.web.answer import Answer
+from depthpose.web.answer import Answer, Shown
 from depthpose.web.depth import answer_depth
+from depthpose.web.examples import depth_example, pose_example
 from depthpose.web.form import Form, without_paths
 from depthpose.web.guard import (
     LOOPBACK,
@@ -49,7 +52,12 @@ _SAFE = {
 }
 _RESULTS = 3
 """Answers whose files are kept in memory for downloads."""
-_TYPES = {".png": "image/png", ".json": "application/json", ".zip": "application/zip"}
+_TYPES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".json": "application/json",
+    ".zip": "application/zip",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +83,10 @@ class Pages:
         self._rooms: dict[str, Callable[[Form], Answer]] = {
             "depth": partial(answer_depth, net=depth),
             "pose": partial(answer_pose, net=pose),
+        }
+        self._examples: dict[str, Callable[[], dict[str, Any]]] = {
+            "depth": cache(depth_example),
+            "pose": cache(partial(pose_example, pose)),
         }
         self._one = anyio.CapacityLimiter(1)
         self._inside = 0
@@ -107,6 +119,16 @@ class Pages:
             raise HTTPException(404, f"there is no {name!r}; the page is at /")
         media_type, text = self._assets[name]
         return Response(text, media_type=media_type)
+
+    async def example(self, request: Request) -> Response:
+        """Give files and fields to fill a form with; they are made when first asked for."""
+        make = self._examples.get(request.path_params["room"])
+        if make is None:
+            raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+        try:
+            return JSONResponse(await anyio.to_thread.run_sync(make, limiter=self._one))
+        except InputError as error:
+            raise HTTPException(400, str(error)) from error
 
     async def estimate(self, request: Request) -> Response:
         """Take a form to an answer."""
@@ -156,11 +178,18 @@ class Pages:
             "terms": answer.terms,
             "facts": list(answer.facts),
             "tables": dict(answer.tables),
-            "pictures": [vars(picture) for picture in answer.pictures],
+            "pictures": [_picture(picture, answer.files) for picture in answer.pictures],
             "scene": answer.scene.encoded(),
             "files": sizes,
             "folder": f"results/{key}/",
         }
+
+
+def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
+    """Give what the page needs of a picture: its size too, so that nothing moves when it comes."""
+    with Image.open(BytesIO(files[shown.file])) as image:  # a file of our own
+        width, height = image.size
+    return {**vars(shown), "scale": shown.scale and vars(shown.scale), "size": [width, height]}
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:
@@ -183,6 +212,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
         routes=[
             Route("/", pages.home),
             Route("/assets/{name}", pages.asset),
+            Route("/examples/{room}", pages.example),
             Route("/estimate/{room}", pages.estimate, methods=["POST"]),
             Route("/results/{key}/{name}", pages.download),
         ],

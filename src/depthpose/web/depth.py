@@ -3,7 +3,7 @@
 import math
 import time
 
-from depthpose.core.draw import draw_share
+from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
 from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
@@ -40,6 +40,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     folder = form.results()
     write_estimate(folder, pair, found, (near_m, far_m))
     write_estimate_cloud(folder, pair, found, far_m)
+    write_image(folder / f"{pair.name}.input.jpg", pair.left)
     focal = " (guessed, 0.75 widths: metres are as wrong as it is)" if is_guess else ""
     pictures = _pictures(pair, found, (near_m, far_m))
     if found.confidence is not None:
@@ -64,7 +65,8 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
     if has_right and baseline_m is None and "camera" not in form.files:
         raise InputError(
             "baseline: a pair becomes metres by the distance of its two cameras; fill in the "
-            "baseline in metres (0.54 for KITTI), or choose a camera file that has it"
+            "baseline in metres (of KITTI's 2011_09_26: 0.5327), or choose a camera file that has "
+            "it"
         )
     is_guess = focal_px is None and "camera" not in form.files
     camera = form.camera(_keys(form, width, height), (width, height))
@@ -132,12 +134,14 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
     name = pair.name
     colors = f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {said_grey(found)}"
     pictures = [
+        Shown(file=f"{name}.input.jpg", caption="the picture"),
         Shown(
             file=f"{name}.color.png",
             caption=f"depth: {colors.format(*range_m)}",
             values=f"{name}.depth_m.npy",
             unit="m",
-        )
+            scale=depth_scale(*range_m),
+        ),
     ]
     if found.right is not None:
         pictures.append(Shown(file=f"{name}.right.png", caption="right view, as drawn"))
@@ -147,6 +151,7 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
                 file=f"{name}.confidence.png",
                 caption="confidence: bright is sure, dark a guess",
                 values=f"{name}.confidence.npy",
+                scale=rising_scale("confidence", 1.0),
             )
         )
     return pictures

@@ -69,7 +69,7 @@ class Form:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise InputError(f"{field} is {text!r}; write a number such as 0.54")
+            raise InputError(f"{field} is {text!r}; write a number such as 0.5")
         return value
 
     def camera(self, keys: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, install_words
 from depthpose.core.files import read_map, write_cloud, write_image
 from depthpose.core.scene import Scene
 from depthpose.pages.pose import pose_facts, pose_scene, pose_sentence, pose_tables
@@ -111,7 +111,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
             f"{form.file('cad').name}: the weights know {', '.join(net.objects)}, and this is none "
             "of them (is its unit right?). A network learns a part from its CAD file alone: "
             "depthpose pose train --cad FILE --unit mm --out my_part. Without training, "
-            "pip install 'depthpose[open3d]' poses any CAD file, less surely"
+            f"{install_words('open3d')} poses any CAD file, less surely"
         )
     how = "Open3D's FPFH features, RANSAC and ICP: untrained, and it refuses nearly nothing"
     return _Target(model=model, how=how, registration=FpfhRegistration(model))

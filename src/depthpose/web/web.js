@@ -52,6 +52,29 @@ function sized(bytes) {
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
 
+// An example fills the form and is sent: what a user would choose, chosen.
+for (const button of document.querySelectorAll(".try")) button.addEventListener("click", async () => {
+  const form = button.form;
+  button.disabled = true;
+  const response = await fetch(`examples/${form.dataset.room}`).catch(() => null);
+  const found = await response?.json().catch(() => null);
+  button.disabled = false;
+  if (!found?.files) {
+    const textContent = found?.error || "the server does not answer; is 'depthpose serve' still running?";
+    form.parentElement.querySelector(".answer").replaceChildren(made("p", { className: "said failed", role: "alert", textContent }));
+    return;
+  }
+  form.reset();
+  for (const input of form.querySelectorAll("input[type=file]")) {
+    const file = found.files.find(one => one.field === input.name), held = new DataTransfer();
+    if (file) held.items.add(new File([Uint8Array.from(atob(file.data), c => c.charCodeAt(0))], file.name));
+    input.files = held.files;
+    input.dispatchEvent(new Event("change"));
+  }
+  for (const [name, value] of Object.entries(found.fields)) form.elements[name].value = value;
+  form.requestSubmit(form.querySelector(".go"));
+});
+
 for (const form of document.forms) form.addEventListener("submit", async event => {
   event.preventDefault();
   const answer = form.parentElement.querySelector(".answer"), button = form.querySelector(".go");
@@ -107,9 +130,11 @@ function table(rows) {
 
 // A picture; where there are numbers behind it, the one under the pointer is read out.
 function shown(picture, folder) {
-  const image = made("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption });
+  const [width, height] = picture.size;
+  const image = made("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption, width, height });
   const read = made("span", { className: "read" });
-  const figure = made("figure", {}, image, made("figcaption", {}, picture.caption, read));
+  const bar = picture.scale ? [scaled(picture.scale)] : [];
+  const figure = made("figure", {}, image, ...bar, made("figcaption", {}, picture.caption, read));
   if (!picture.values) return figure;
   let map;
   image.addEventListener("pointerenter", async () => {
@@ -125,6 +150,19 @@ function shown(picture, folder) {
   });
   image.addEventListener("pointerleave", () => { read.textContent = ""; });
   return figure;
+}
+
+// The bar of a picture's colours, with its numbers.
+function scaled({ title, colors, marks }) {
+  const bar = made("div", { className: "bar" }), rgb = colors.map(c => `rgb(${c.map(v => Math.round(255 * v))})`);
+  bar.style.background = `linear-gradient(to right, ${rgb})`;
+  const numbers = marks.map(([place, textContent]) => {
+    const mark = made("span", { textContent });
+    mark.style.left = `${100 * place}%`;
+    return mark;
+  });
+  return made("div", { className: "scale" }, bar, made("div", { className: "marks" }, ...numbers),
+    made("div", { className: "of", textContent: title }));
 }
 
 // NPY, version 1, float32, row by row: what the server writes.

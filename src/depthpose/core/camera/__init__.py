@@ -12,6 +12,11 @@ from depthpose.core.camera.epipolar import fundamental_matrix as fundamental_mat
 from depthpose.core.camera.facts import refuse_other_resolution as refuse_other_resolution
 from depthpose.core.camera.facts import refuse_outside as refuse_outside
 from depthpose.core.camera.facts import suspicious_centre as suspicious_centre
+from depthpose.core.camera.given import AnyCamera as AnyCamera
+from depthpose.core.camera.given import AnyLens as AnyLens
+from depthpose.core.camera.given import camera_of as camera_of
+from depthpose.core.camera.given import centred_camera as centred_camera
+from depthpose.core.camera.given import choose_lens as choose_lens
 from depthpose.core.camera.model import Camera as Camera
 from depthpose.core.camera.model import StereoRig as StereoRig
 from depthpose.core.camera.pinhole import back_project as back_project

@@ -52,7 +52,7 @@ def read_rig(path: AnyPath, size: Size | None = None) -> StereoRig:
         return camera
     raise InputError(
         f"{path}: no 'baseline_m', without which disparity cannot become metres; add the distance "
-        'between the two cameras in metres, such as "baseline_m": 0.54 (of ROS or OpenCV, name '
+        'between the two cameras in metres, such as "baseline_m": 0.12 (of ROS or OpenCV, name '
         "the folder that holds both files of the pair)"
     )
 

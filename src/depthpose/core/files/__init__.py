@@ -15,10 +15,12 @@ from depthpose.core.files.depth_png import write_disparity_png as write_disparit
 from depthpose.core.files.disk import AnyPath as AnyPath
 from depthpose.core.files.disk import atomic_write as atomic_write
 from depthpose.core.files.disk import read_bytes as read_bytes
+from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
 from depthpose.core.files.images import encode_image as encode_image
 from depthpose.core.files.images import image_size as image_size
 from depthpose.core.files.images import list_images as list_images
+from depthpose.core.files.images import picture_tensor as picture_tensor
 from depthpose.core.files.images import read_image as read_image
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.maps import read_map as read_map

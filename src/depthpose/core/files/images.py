@@ -52,8 +52,17 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
         InputError: the file is missing, damaged, too large or not a picture.
     """
     with opened_image(path) as image:
-        turn = _UPRIGHT.get(_orientation(image))
-        pixels = _rgb_or_grey(path, image if turn is None else image.transpose(turn))
+        return picture_tensor(image, path)
+
+
+def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    """Bring a picture of Pillow's to RGB in [0, 1], as :func:`read_image` does a file.
+
+    Raises:
+        InputError: it has 32 bits a pixel; Pillow's own errors where its file is damaged.
+    """
+    turn = _UPRIGHT.get(_orientation(image))
+    pixels = _rgb_or_grey(name, image if turn is None else image.transpose(turn))
     if pixels.ndim == 2:
         scale = 65535 if pixels.dtype.itemsize == 2 else 255
         grey = torch.from_numpy(pixels.astype(np.float32)).div_(scale)

@@ -2,7 +2,8 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from types import FrameType
@@ -64,20 +65,49 @@ def leave_signals_to_the_loop(_: int) -> None:
     os.setsid()
 
 
+class Wish:
+    """What whoever runs a training asked it to do, by signals."""
+
+    def __init__(self) -> None:
+        self._asked: list[tuple[int, float]] = []
+
+    def remember(self, number: int, _: FrameType | None) -> None:
+        """Take a signal; the first Ctrl-C is told what a second one does."""
+        if not self._asked and number == signal.SIGINT:
+            os.write(2, _SECOND.encode())  # print may be at work itself
+        self._asked.append((number, time.monotonic()))
+
+    def to_stop(self) -> bool:
+        """Whether to stop after the step, with the state saved."""
+        return bool(self._asked)
+
+    def to_finish(self) -> bool:
+        """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
+        presses = [at for number, at in self._asked if number == signal.SIGINT]
+        while len(presses) == 1 and time.monotonic() - presses[0] < PATIENCE_S:
+            time.sleep(0.05)
+            presses = [at for number, at in self._asked if number == signal.SIGINT]
+        return len(presses) > 1
+
+
+PATIENCE_S = 3.0
+"""Between the first Ctrl-C and the second."""
+_SECOND = (
+    "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: what "
+    "follows the last step is done, and the weights are written.\n"
+)
+
+
 @contextmanager
-def polite_stop() -> Iterator[Callable[[], bool]]:
+def polite_stop() -> Iterator[Wish]:
     """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
-    asked: list[int] = []
-
-    def remember(number: int, _: FrameType | None) -> None:
-        asked.append(number)
-
+    wish = Wish()
     try:
-        before = {s: signal.signal(s, remember) for s in (signal.SIGTERM, signal.SIGINT)}
+        before = {s: signal.signal(s, wish.remember) for s in (signal.SIGTERM, signal.SIGINT)}
     except ValueError:  # not the main thread: whoever runs us handles signals
         before = {}
     try:
-        yield lambda: bool(asked)
+        yield wish
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

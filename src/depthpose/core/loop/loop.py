@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop.config import LoopConfig
-from depthpose.core.loop.host import leave_signals_to_the_loop, make_accelerator, polite_stop
+from depthpose.core.loop.host import Wish, leave_signals_to_the_loop, make_accelerator, polite_stop
 from depthpose.core.loop.journal import Journal
 from depthpose.core.loop.state import Parts, restore_last, saved_states
 from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
@@ -43,13 +43,14 @@ class Progress:
     numbers: dict[str, float]
 
 
-def train(
+def train(  # noqa: PLR0913  what is trained, and how it is run
     task: Task,
     samples: Samples,
     config: LoopConfig,
     folder: Path,
     *,
     resume: bool = False,
+    finish: bool = False,
     on_step: Callable[[Progress], None] | None = None,
 ) -> float:
     """Train ``task`` until its last step; its modules hold the result.
@@ -63,6 +64,7 @@ def train(
         folder: the run folder.
         resume: go on from the folder's last state, or, where it is damaged, with a notice from the
             one before; the result is that of an uninterrupted run.
+        finish: take the steps of that state for all, and go no further.
         on_step: told after each step, in the main process.
 
     Returns:
@@ -77,9 +79,12 @@ def train(
     if not len(samples):
         raise InputError("there is no sample to train on; the dataset is empty.")
     run = _Run(task, samples, config, folder)
-    run.start(resume=resume)
-    with polite_stop() as is_asked_to_stop:
-        run.walk(on_step, is_asked_to_stop)
+    run.start(resume=resume or finish)
+    if finish and not run.step:
+        raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
+    run.steps = run.step if finish else run.steps
+    with polite_stop() as wish:
+        run.walk(on_step, wish)
     return run.seconds
 
 
@@ -122,19 +127,19 @@ class _Run:
         """What it took until now, with the runs before this one."""
         return time.monotonic() - self._began
 
-    def walk(
-        self, on_step: Callable[[Progress], None] | None, is_asked_to_stop: Callable[[], bool]
-    ) -> None:
-        """Take the remaining steps."""
+    def walk(self, on_step: Callable[[Progress], None] | None, wish: Wish) -> None:
+        """Take the remaining steps; asked to finish, the step at hand is the last."""
         batches = self._batches()
         while self.step < self.steps:
             micro_batches = [next(batches) for _ in range(self.config.accumulate)]
             self._take_step(micro_batches)
             self.step += 1
+            stop = self._any_process(wish.to_stop())
+            if stop and self._any_process(wish.to_finish()):
+                self.steps = self.step
             numbers = self._log()
             if self._is_due(self.config.validate_every_steps):
                 self._validate()
-            stop = self._any_process(is_asked_to_stop())
             if stop or self._is_due(self.config.save_every_steps):
                 self.save()
             if on_step is not None and self.accelerator.is_main_process:
@@ -143,7 +148,8 @@ class _Run:
                 self.journal.close()
                 self.accelerator.wait_for_everyone()  # rank 0 may still be writing
                 raise Interrupted(
-                    f"stopped after step {self.step} of {self.steps}, --resume goes on from there"
+                    f"stopped after step {self.step} of {self.steps}, --resume goes on from there, "
+                    "--finish makes weights of it"
                 )
         self.accelerator.wait_for_everyone()  # none leaves while another still needs it
         self._load(self.average)  # what is exported

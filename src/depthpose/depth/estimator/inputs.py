@@ -1,47 +1,113 @@
 """What an estimate can take: pictures of any form, pairs that are pairs."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped
+from PIL.Image import Image
 from torch import Tensor
 
 from depthpose.core.arrays import check_image
-from depthpose.core.camera import StereoRig, check_image_matches_camera, check_rectified
+from depthpose.core.camera import (
+    AnyLens,
+    StereoRig,
+    camera_of,
+    check_image_matches_camera,
+    check_rectified,
+)
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image
+from depthpose.core.files import picture_tensor, read_image, refused_as
 from depthpose.depth.types import StereoInput
 
-Picture = str | Path | Float[Tensor, "3 _ _"] | UInt8[np.ndarray, "_ _ 3"]
-"""A file, a tensor of RGB in [0, 1], or an array of 8-bit RGB. The order of the channels cannot be
-told from the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
+Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
+"""A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
+numbers of 8 bits or floats in [0, 1], (H, W, C), (C, H, W) or (H, W). The order of the channels
+cannot be told from the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
+_CHANNELS = (1, 3, 4)
+_VALUES = (
+    "give 8-bit numbers, or floats in [0, 1]: divide by the largest value that it can hold (65535 "
+    "of 16 bits)"
+)
 
 
-def as_tensor(image: object) -> Float[Tensor, "3 h w"]:
-    """Read a :data:`Picture`, or bring it to RGB in [0, 1].
+def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
+    """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image.
 
     Raises:
-        InputError: an array that is not 8-bit (H, W, 3), a tensor that is not (3, H, W) in
-            [0, 1], or a file that cannot be read.
+        InputError: a shape that is none of an image, a batch of several, values other than 8-bit
+            numbers and floats in [0, 1], or a file that cannot be read.
     """
     match image:
         case str() | Path():
             return read_image(Path(image))
-        case np.ndarray() if image.dtype != np.uint8:
-            raise InputError(
-                f"the image is an array of {image.dtype}; give 8-bit RGB (H, W, 3), or a tensor "
-                "(3, H, W) of float in [0, 1]"
-            )
-        case np.ndarray() if image.ndim != 3 or image.shape[2] != 3:
-            raise InputError(
-                f"the image is an array of shape {image.shape}; give 8-bit RGB (H, W, 3): drop "
-                "alpha, repeat grey three times"
-            )
+        case Image():
+            with refused_as(name, "picture", "give an intact one"):
+                return picture_tensor(image, name)
+        case np.ndarray() if image.dtype != np.uint8 and image.dtype.kind != "f":
+            raise InputError(f"{name} is an array of {image.dtype}; {_VALUES}")
         case np.ndarray():
-            return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
+            values = torch.from_numpy(np.ascontiguousarray(image))
+            return _rgb(values, (-1, 0), f"{name} is an array")
+        case Tensor() if image.dtype != torch.uint8 and not image.is_floating_point():
+            raise InputError(f"{name} is a tensor of {image.dtype}; {_VALUES}")
+        case Tensor():
+            return _rgb(image, (0, -1), f"{name} is a tensor")
         case _:
-            return check_image(image, "the image")
+            return check_image(image, name)
+
+
+def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 h w"]:
+    """Bring three channels in [0, 1] to the front.
+
+    Args:
+        values: of one image, or a batch of one.
+        sides: where channels are looked for, the likelier side first.
+        what: it is, for errors.
+    """
+    shape = tuple(values.shape)
+    if values.ndim == 4 and shape[0] != 1:
+        raise InputError(
+            f"{what} of shape {shape}, a batch; give one image, or the batch to "
+            "estimate_many(batch, camera)"
+        )
+    one = values[0] if values.ndim == 4 else values
+    planes = one[None] if one.ndim == 2 else one
+    found = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
+    side = 0 if one.ndim == 2 else next(found, None)
+    if side is None:
+        raise InputError(f"{what} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
+    planes = planes.movedim(side, 0)[:3]
+    scaled = planes.float() / 255 if planes.dtype == torch.uint8 else planes.float()
+    return check_image(scaled.expand(3, -1, -1), what.partition(" is ")[0])
+
+
+def as_inputs(images: object, camera: AnyLens | None) -> list[StereoInput]:
+    """Take inputs as they are, and pictures of one camera as inputs.
+
+    Raises:
+        InputError: as :func:`as_tensor`, or no camera of these images.
+    """
+    several = [images] if isinstance(images, str | Path | Image) else images
+    if isinstance(several, np.ndarray | Tensor) and several.ndim < 4:
+        several = [several]
+    assert isinstance(several, Iterable), "a caller's type"
+    return [
+        one if isinstance(one, StereoInput) else as_input(one, f"image {k}", camera)
+        for k, one in enumerate(several)
+    ]
+
+
+def as_input(image: object, name: str, camera: AnyLens | None) -> StereoInput:
+    """Take a picture and what is known of its camera.
+
+    Raises:
+        InputError: as :func:`as_tensor`, or no camera of this image.
+    """
+    left = as_tensor(image)
+    camera = camera_of(camera, (left.shape[2], left.shape[1]))
+    return StereoInput(name=name, left=left, right=None, camera=camera)
 
 
 def refuse_unrectified(pair: StereoInput) -> None:

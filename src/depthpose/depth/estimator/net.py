@@ -10,12 +10,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import check_image
-from depthpose.core.camera import Camera, StereoRig, check_image_matches_camera, read_camera
+from depthpose.core.camera import (
+    AnyCamera,
+    AnyLens,
+    Camera,
+    StereoRig,
+    check_image_matches_camera,
+    choose_lens,
+)
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.estimator.inputs import Picture, as_tensor, refuse_unrectified, usable_right
+from depthpose.depth.estimator.inputs import (
+    Picture,
+    as_input,
+    as_inputs,
+    as_tensor,
+    refuse_unrectified,
+    usable_right,
+)
 from depthpose.depth.estimator.matchers import choose_matcher, set_answer, work_focal_px
 from depthpose.depth.estimator.virtual import (
     focal_size,
@@ -29,6 +43,9 @@ from depthpose.depth.stereo import Matcher, PSMNetMatcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
+
+DEFAULT = "default"
+"""Name of the weights that are taken where none are named."""
 
 
 class FakestereoNet:
@@ -45,6 +62,7 @@ class FakestereoNet:
             ``answer`` is own), for one image alone.
         synthesiser: left view to right view; None matches real pairs only.
         terms: of the weights, where they bind whoever uses them.
+        weights: what they are called.
         with_unlike: answer images that are unlike what the weights know too, with a
             ``warning`` in the estimate, in place of refusing them.
     """
@@ -55,6 +73,7 @@ class FakestereoNet:
         synthesiser: Synthesiser | None = None,
         *,
         terms: str = "",
+        weights: str = "",
         with_unlike: bool = False,
     ) -> None:
         if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
@@ -66,6 +85,16 @@ class FakestereoNet:
         self.synthesiser = synthesiser
         self.terms = terms
         self.with_unlike = with_unlike
+        self.weights = weights
+
+    def __repr__(self) -> str:
+        """Say it in one line: what draws and what matches, weights, device."""
+        parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
+        said = [" + ".join(type(part).__name__ for part in parts)]
+        said += [f"weights {self.weights!r}"] if self.weights else []
+        known = (getattr(part, "device", None) for part in parts)
+        devices = {str(device) for device in known if device is not None}
+        return f"FakestereoNet({', '.join(said + sorted(devices))})"
 
     @classmethod
     def load(
@@ -84,7 +113,7 @@ class FakestereoNet:
         Args:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
-                ``matcher`` alone.
+                ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
                 What names weights: :func:`depthpose.core.checkpoint.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
@@ -98,6 +127,8 @@ class FakestereoNet:
             InputError: no such weights, no matcher in what was given, or an ``answer`` that these
                 weights cannot give.
         """
+        if weights is None and (matcher is None or matcher == "psmnet"):
+            weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
         if answer is not None:
             set_answer(found, answer)
@@ -109,16 +140,21 @@ class FakestereoNet:
         say_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = choose_matcher(weights, found, matcher, own, config)
+        said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
         if found is None or found.generator is None:
-            return cls(chosen, terms=terms)
+            return cls(chosen, terms=terms, weights=said)
         synthesiser = make_synthesiser(found.generator, run.device)
-        return cls(chosen, synthesiser, terms=terms, with_unlike=with_unlike)
+        return cls(chosen, synthesiser, terms=terms, weights=said, with_unlike=with_unlike)
+
+    from_pretrained = load
+    """The same as :meth:`load`."""
 
     def estimate(
         self,
         image: Picture,
-        camera: Camera | str | Path | None,
+        camera: AnyCamera | None = None,
         *,
+        focal_px: float | None = None,
         right: Picture | None = None,
         name: str | None = None,
         with_check: bool = True,
@@ -126,11 +162,14 @@ class FakestereoNet:
         """Estimate depth of ``image``, alone or as the left one of a rectified pair.
 
         Args:
-            image: the image, the left one of a pair: a file, a tensor of RGB in [0, 1], or an
-                array of 8-bit RGB (of OpenCV's BGR, ``image[..., ::-1]``).
-            camera: camera or rig, or its file of any format that is read. One image needs its
-                focal length, for the image is brought to the rig that the generator imitates; a
-                baseline is not looked at. A pair without camera gives disparity only.
+            image: the image, the left one of a pair: a file, a picture of Pillow's, an array or a
+                tensor, RGB, RGBA or grey, 8-bit numbers or floats in [0, 1] (of OpenCV's BGR,
+                ``image[..., ::-1]``).
+            camera: camera or rig, its file of any format that is read, a dict of what such a file
+                holds, or the 3x3 matrix K. One image needs its focal length, for the image is
+                brought to the rig that the generator imitates; a baseline is not looked at. A pair
+                without camera gives disparity only.
+            focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
             name: what to call the input in errors; the file's name by default.
             with_check: look whether the pair is rectified and in the right order first.
@@ -141,20 +180,9 @@ class FakestereoNet:
                 know.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
-        left = as_tensor(image)
-        if isinstance(camera, str | Path):
-            camera = read_camera(Path(camera), (left.shape[2], left.shape[1]))
-        if camera is not None and not isinstance(camera, Camera):
-            raise InputError(
-                f"camera is a {type(camera).__name__}; give a Camera(width=, height=, K=), or a "
-                "StereoRig for metres from a pair, or its file"
-            )
-        pair = StereoInput(
-            name=chosen,
-            left=left,
-            right=None if right is None else as_tensor(right),
-            camera=camera,
-        )
+        pair = as_input(image, chosen, choose_lens(camera, focal_px))
+        if right is not None:
+            pair = replace(pair, right=as_tensor(right, "the right image"))
         return self.estimate_pair(pair, with_check=with_check)
 
     @torch.inference_mode()
@@ -180,16 +208,28 @@ class FakestereoNet:
         )
 
     @torch.inference_mode()
-    def estimate_many(self, images: Sequence[StereoInput]) -> list[DepthEstimate]:
+    def estimate_many(
+        self,
+        images: Sequence[StereoInput] | Sequence[Picture] | Picture,
+        camera: AnyLens | None = None,
+        *,
+        focal_px: float | None = None,
+    ) -> list[DepthEstimate]:
         """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
 
         An input with a right view is matched with it, as :meth:`estimate_pair` does.
+
+        Args:
+            images: inputs; or pictures, or a batch of them as one array or tensor.
+            camera: of the pictures, as for :meth:`estimate`; inputs have their own.
+            focal_px: the same as its focal length alone [px].
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
         found: list[DepthEstimate] = []
-        for size, group in groupby(images, self._size_alone):
+        inputs = as_inputs(images, choose_lens(camera, focal_px))
+        for size, group in groupby(inputs, self._size_alone):
             alike = list(group)
             is_alone = size is not None
             found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)

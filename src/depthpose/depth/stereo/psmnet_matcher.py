@@ -41,13 +41,13 @@ class PSMNetMatcher:
 
     def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
-        self._device = usable_device(config.device)
+        self.device = usable_device(config.device)
         self.config = with_usable_precision(config)
         self.network_config = network.config
         self._inference = PSMNetInference(
             network,
             DTYPES[self.config.precision],
-            self._device,
+            self.device,
             with_compile=self.config.with_compile,
         )
 
@@ -92,7 +92,7 @@ class PSMNetMatcher:
         return self._match_both_ways(pair[0], pair[1], left.device, with_tiles=with_tiles)[0]
 
     def _normalised(self, views: Views) -> Views:
-        return normalise(views.to(self._device, torch.float32))
+        return normalise(views.to(self.device, torch.float32))
 
     def _match_both_ways(
         self, left: Views, right: Views, device: torch.device, *, with_tiles: bool = False

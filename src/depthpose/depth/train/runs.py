@@ -64,12 +64,19 @@ class Run:
         folder: the run folder; the weights are ``generator.safetensors``,
             ``matcher.safetensors`` or ``fakestereo.safetensors`` in it, and their card beside them.
         resume: go on from its last state.
+        finish: make weights of its last state, without another step.
         on_step: told after each step.
     """
 
     folder: Path
     resume: bool = False
+    finish: bool = False
     on_step: Callable[[Progress], None] | None = None
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """What the loop is told of it."""
+        return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
 def train_view(config: ViewTraining, run: Run) -> Path:
@@ -184,8 +191,15 @@ def _walk(
     claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
     try:
-        loop, told = config.loop, run.on_step
-        seconds = train(task, pairs, loop, run.folder, resume=run.resume, on_step=told)
+        seconds = train(
+            task,
+            pairs,
+            config.loop,
+            run.folder,
+            resume=run.resume,
+            finish=run.finish,
+            on_step=run.on_step,
+        )
     finally:
         release_folders()
     return facts, seconds

@@ -11,13 +11,14 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from depthpose.core.camera import (
+    AnyLens,
     Camera,
+    camera_of,
     check_image_matches_camera,
-    read_camera,
     refuse_other_resolution,
     refuse_outside,
 )
-from depthpose.core.camera.model import check_intrinsics
+from depthpose.core.camera.given import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
 from depthpose.pose.bop import mask_from_rle, read_mask
@@ -27,8 +28,6 @@ from depthpose.pose.types import CloudInput, ViewInput
 
 AnyArray = str | Path | np.ndarray | Tensor
 """A file, an array or a tensor."""
-AnyCamera = str | Path | Camera | np.ndarray | Tensor
-"""A camera, its file, or its intrinsic matrix alone."""
 AnyMask = AnyArray | Mapping[str, Any]
 """A mask, its file, or COCO's run lengths."""
 _SMALLEST_INSTANCE = 0.2
@@ -55,7 +54,7 @@ def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInp
 def view_input(
     depth: AnyArray,
     mask: AnyMask,
-    camera: AnyCamera,
+    camera: AnyLens | None,
     object: str,
     name: str,
     unit: Unit | None = None,
@@ -76,7 +75,8 @@ def view_input(
     """
     values = _values(depth, name)
     height, width = values.shape
-    known = read_camera(camera, (width, height)) if isinstance(camera, str | Path) else camera
+    is_said = isinstance(camera, str | Path | Mapping | float | int)
+    known = camera_of(camera, (width, height)) if is_said else camera
     said_m = known.depth_unit_m if isinstance(known, Camera) else None
     depth_m = _metres(values, said_m, unit, str(depth) if isinstance(depth, str | Path) else name)
     pixels = _mask(mask, name)
@@ -136,16 +136,13 @@ def _metres(
     return torch.where(values > 0, values.double() * unit_m, torch.nan).float()
 
 
-def _intrinsics(
-    camera: Camera | np.ndarray | Tensor, width: int, height: int, name: str
-) -> Float[Tensor, "3 3"]:
+def _intrinsics(camera: AnyLens | None, width: int, height: int, name: str) -> Float[Tensor, "3 3"]:
     is_bare = not isinstance(camera, Camera)
     if isinstance(camera, Camera):
         check_image_matches_camera(camera, width, height, name)
         K = camera.K
     else:
-        K = _tensor(camera).double()
-        check_intrinsics(K)
+        K = intrinsics_of(camera)
     try:
         # A crop may leave the centre; its camera says the size, which was compared above.
         (refuse_other_resolution if is_bare else refuse_outside)(K, width, height)

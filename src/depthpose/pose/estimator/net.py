@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError, nearest_name
@@ -16,7 +17,6 @@ from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.given import (
     AnyArray,
-    AnyCamera,
     AnyMask,
     cloud_input,
     split_instances,
@@ -49,6 +49,7 @@ class GeoPoseNet:
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
         self.config = EstimateConfig() if config is None else config
         self.weights = weights
+        self.name = ""
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights regress a depth image and cast no votes; load them as "
@@ -59,7 +60,9 @@ class GeoPoseNet:
         self._surfaces: dict[int, Surface] = {}
 
     @classmethod
-    def load(cls, weights: str | Path, config: EstimateConfig | None = None) -> "GeoPoseNet":
+    def load(
+        cls, weights: str | Path = "parts", config: EstimateConfig | None = None
+    ) -> "GeoPoseNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
         Weights whose terms bind the user say so (:class:`LicenceNotice`).
@@ -69,7 +72,18 @@ class GeoPoseNet:
         """
         found = read_pose_weights(find_weights(weights))
         say_terms(found.facts)
-        return cls(found, config)
+        net = cls(found, config)
+        net.name = str(weights)
+        return net
+
+    from_pretrained = load
+    """The same as :meth:`load`."""
+
+    def __repr__(self) -> str:
+        """Say it in one line: the network, its objects, weights, device."""
+        said = f"{type(self._network).__name__} of {', '.join(self.objects)}"
+        named = f", weights {self.name!r}" if self.name else ""
+        return f"GeoPoseNet({said}{named}, {self.config.device})"
 
     @property
     def terms(self) -> str:
@@ -81,7 +95,7 @@ class GeoPoseNet:
         """Names of the objects that the weights know."""
         return tuple(self._numbers)
 
-    def estimate(
+    def estimate(  # noqa: PLR0913  one input in several forms
         self,
         *,
         cloud: AnyArray | None = None,
@@ -89,6 +103,7 @@ class GeoPoseNet:
         depth: AnyArray | None = None,
         mask: AnyMask | None = None,
         camera: AnyCamera | None = None,
+        focal_px: float | None = None,
         object: str | None = None,
     ) -> PoseEstimate:
         """Estimate one pose, from a cloud or from a depth image with a mask.
@@ -98,7 +113,9 @@ class GeoPoseNet:
             unit: of the cloud, metres by default; of a depth image, where its camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths.
-            camera: of the depth image, or its file of any format that is read.
+            camera: of the depth image, its file of any format that is read, a dict of what such a
+                file holds, or the 3x3 matrix K.
+            focal_px: the focal length alone [px], in place of a camera.
             object: which one; None where the weights know one alone.
 
         Raises:
@@ -108,16 +125,19 @@ class GeoPoseNet:
         which = self._object(object)
         if cloud is not None and depth is None and mask is None:
             return self.estimate_many([cloud_input(cloud, unit or "m", which, _NAME)])[0]
-        if cloud is not None or depth is None or mask is None or camera is None:
+        lens = choose_lens(camera, focal_px)
+        if cloud is not None or depth is None or mask is None or lens is None:
             raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
-        return self.estimate_many([view_input(depth, mask, camera, which, _NAME, unit)])[0]
+        view = view_input(depth, mask, lens, which, _NAME, unit)
+        return self.estimate_many([view])[0]
 
     def estimate_instances(
         self,
         *,
         depth: AnyArray,
         mask: AnyMask,
-        camera: AnyCamera,
+        camera: AnyCamera | None = None,
+        focal_px: float | None = None,
         object: str | None = None,
         unit: Unit | None = None,
     ) -> list[PoseEstimate]:
@@ -128,14 +148,17 @@ class GeoPoseNet:
         Args:
             depth: as for :meth:`estimate`.
             mask: of all instances.
-            camera: of the depth image.
+            camera: of the depth image, as for :meth:`estimate`.
+            focal_px: the focal length alone [px], in place of a camera.
             object: which one; None where the weights know one alone.
             unit: of the depth, where its camera says none.
 
         Raises:
             InputError: as for :meth:`estimate`.
         """
-        view = view_input(depth, mask, camera, self._object(object), _NAME, unit)
+        view = view_input(
+            depth, mask, choose_lens(camera, focal_px), self._object(object), _NAME, unit
+        )
         pieces = split_instances(view.mask) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)

@@ -34,7 +34,7 @@ from depthpose.pose.objects import Objects
 from depthpose.pose.train.baselines_config import DepthImageTraining
 from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, card_facts, claim_run, packed, with_classes
+from depthpose.pose.train.run import Run, card_facts, claim_run, packed, train_words, with_classes
 from depthpose.pose.types import ObjectModel, ViewSample
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -188,14 +188,22 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     crops = TrainingCrops(models, config, config.loop.seed)
     task = DepthImageTask(network, models, config)
-    seconds = train(task, crops, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    seconds = train(
+        task,
+        crops,
+        config.loop,
+        run.folder,
+        resume=run.resume,
+        finish=run.finish,
+        on_step=run.on_step,
+    )
     path = run.folder / "depth-image.safetensors"
     if find_shard().rank:
         return path
     weights = packed(network, models, config)
     write_pose_weights(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, _MEASURED)
-    leave_card(path, "pose train --what depth-image", seconds, card_facts(weights), measured)
+    leave_card(path, train_words("depth-image", config), seconds, card_facts(weights), measured)
     return path
 
 

@@ -1,6 +1,7 @@
 """Where a training lives: its folder, claimed for one config, and the weights it leaves."""
 
 import dataclasses
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,14 +27,21 @@ class Run:
     Attributes:
         folder: the run folder; the weights lie in it, named after what was trained.
         resume: go on from its last state.
+        finish: make weights of its last state, without another step.
         on_step: told after each step.
         tell: told what a person should know before it begins.
     """
 
     folder: Path
     resume: bool = False
+    finish: bool = False
     on_step: Callable[[Progress], None] | None = None
     tell: Callable[[str], None] | None = None
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """What the loop is told of it."""
+        return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
@@ -59,6 +67,13 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     names = ("pose", "pointnet", "depth-image", "segmentation")
     claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
+
+
+def train_words(what: str, config: Any) -> str:  # noqa: ANN401
+    """Give the words of the command that trains this, the CAD files among them, for the card."""
+    cad = [word for path in config.models.cad for word in ("--cad", path)]
+    unit = ["--unit", config.models.unit] if cad else []
+    return shlex.join(["pose", "train", "--what", what, *cad, *unit])
 
 
 def packed(

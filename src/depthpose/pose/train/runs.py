@@ -22,7 +22,7 @@ from depthpose.pose.train.depth_image import train_depth_image
 from depthpose.pose.train.held_out import HeldOut
 from depthpose.pose.train.judge import calibrated, judged, table_text
 from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, card_facts, claim_run, packed, with_classes
+from depthpose.pose.train.run import Run, card_facts, claim_run, packed, train_words, with_classes
 from depthpose.pose.train.segmentation import train_segmentation
 from depthpose.pose.train.segmentation_config import SegmentationTraining
 from depthpose.pose.train.task import PoseTask
@@ -52,7 +52,17 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
-    seconds = train(task, clouds, config.loop, run.folder, resume=run.resume, on_step=run.on_step)
+    seconds = train(
+        task,
+        clouds,
+        config.loop,
+        run.folder,
+        resume=run.resume,
+        finish=run.finish,
+        on_step=run.on_step,
+    )
+    if run.tell is not None:
+        run.tell("trained; now the refusal is calibrated and judged on made views: minutes")
     if isinstance(network, PointNet):
         return _leave(run.folder / "pointnet.safetensors", network, models, config, seconds)
     return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
@@ -114,8 +124,9 @@ def _leave(
     write_pose_weights(path, weights, with_half=config.with_half)
     table = judged(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
-    words = f"pose train --what {path.stem}"
-    leave_card(path, words, seconds, card_facts(weights), table_text(table))
+    leave_card(
+        path, train_words(path.stem, config), seconds, card_facts(weights), table_text(table)
+    )
     return path
 
 
