@@ -41,6 +41,7 @@ def predict(
     voting: Voting = "ransac",
     hypotheses: int = 128,
     icp: bool = True,
+    up_to_symmetry: bool = False,
     batch: int = 16,
     device: str = "cpu",
     view: str | None = None,
@@ -49,10 +50,11 @@ def predict(
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
-    alone; the risk is of being wrong altogether), status and reason, and the seconds of each stage.
+    alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
+    none of them is right, status and reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
-    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv and
-    SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv
+    (depthpose-alternatives_... with the alternatives too) and SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
     what is finished; other settings need another --out; no file is written over that is not the
     run's own. Processes of torchrun share the work.
 
@@ -79,6 +81,7 @@ def predict(
         voting: ransac, or least-squares.
         hypotheses: of RANSAC, for each keypoint.
         icp: slide the voted pose onto the cloud.
+        up_to_symmetry: copies of an object that look nearly alike are one answer, not alternatives.
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
@@ -93,6 +96,7 @@ def predict(
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting), hypotheses=hypotheses),
         with_icp=icp,
+        up_to_symmetry=up_to_symmetry,
         device=own_device(device),
     )
     if engine.is_ray:

@@ -14,6 +14,7 @@ from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.estimator.alternatives import Copies, find_copies
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyCamera,
@@ -57,6 +58,7 @@ class GeoPoseNet:
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
         self._surfaces: dict[int, Surface] = {}
+        self._copies: dict[int, Copies] = {}
 
     @classmethod
     def load(cls, weights: str | Path, config: EstimateConfig | None = None) -> "GeoPoseNet":
@@ -219,8 +221,15 @@ class GeoPoseNet:
         model = self.weights.models[number]
         if number not in self._surfaces:
             self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+            up_to_symmetry = self.config.up_to_symmetry
+            self._copies[number] = find_copies(model, up_to_symmetry=up_to_symmetry)
         found = pose_from_directions(
-            voted, model, self._surfaces[number], self.weights.refusal, self.config
+            voted,
+            model,
+            self._surfaces[number],
+            self._copies[number],
+            self.weights.refusal,
+            self.config,
         )
         return replace(found, name=given.name, seconds={**seconds, **found.seconds})
 
