@@ -53,8 +53,9 @@ def predict(
     alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
     none of them is right, status and reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
-    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv
-    (depthpose-alternatives_... with the alternatives too) and SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, with the
+    alternatives too depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
+    shows some of them in 3D, and every refusal. A rerun skips
     what is finished; other settings need another --out; no file is written over that is not the
     run's own. Processes of torchrun share the work.
 

@@ -231,11 +231,13 @@ class Alternative:
         probability: that it is the right one, 0..1.
         difference: from the estimate's own pose, in words: "turned by 180 degrees about the long
             axis".
+        signals: what speaks against it, by name; not kept in files.
     """
 
     camera_from_model: Rigid
     probability: float
     difference: str
+    signals: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -189,19 +189,23 @@ def share_out(
 
 
 def alternatives_among(
-    candidates: Sequence[Candidate], shares: Float64[Tensor, " b"], best: int, copies: Copies
+    candidates: Sequence[Candidate],
+    evidence: Sequence[dict[str, float]],
+    shares: Float64[Tensor, " b"],
+    copies: Copies,
 ) -> tuple[Alternative, ...]:
     """Name the candidates beside the best, the likeliest first; unlikely ones are left out.
 
     Their probabilities are shares of one, in which the best has its own.
     """
-    order = [k for k in shares.argsort(descending=True).tolist() if k != best]
+    best, *order = shares.argsort(descending=True, stable=True).tolist()
     pose = candidates[best].pose
     return tuple(
         Alternative(
             camera_from_model=Rigid(other.R.float(), other.t_m.float()),
             probability=float(shares[k]),
             difference=difference_of(other, pose, copies),
+            signals=evidence[k],
         )
         for k in order
         for other in [candidates[k].pose]

@@ -182,14 +182,14 @@ def _refine(
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     evidence = [evidence_of(voted, one.pose, model, copies, surface) for one in candidates]
     shares = share_out(evidence, refusal.candidate_slopes)
-    number = int(shares.argmax())
+    number = int(shares.argsort(descending=True, stable=True)[0])
     chosen = candidates[number]
     signals = {
         **vote_signals(voted.cloud, fit),
         "scatter": scatter,
         **evidence[number],
     }
-    alternatives = alternatives_among(candidates, shares, number, copies)
+    alternatives = alternatives_among(candidates, evidence, shares, copies)
     return _Found(*chosen, signals, float(shares[number]), alternatives)
 
 

@@ -14,6 +14,7 @@ from depthpose.pose.types import PoseEstimate
 _FOLDS = 5
 _RIDGE = 3.0
 """Of the slopes in units of each signal's spread: no signal decides alone."""
+_CANDIDATE_RIDGE = 3.0
 _LEARNT = tuple(name for name in SIGNALS if name != "gap")
 """How far points lie off the surface is the sensor's noise as much as the pose's error. On made
 views it tells right from wrong best of all; a real sensor that is noisier than the made one would
@@ -104,6 +105,41 @@ def calibrate_refusal(
         slopes=dict(zip(_LEARNT, slopes.tolist(), strict=True)),
         means=_means(x[wrong == 0]),
     )
+
+
+def fit_candidate_slopes(
+    cases: Sequence[tuple[Sequence[Mapping[str, float]], int]],
+    ridge: float = _CANDIDATE_RIDGE,
+) -> dict[str, float]:
+    """Learn how to share the probability of one among poses that fit, from cases of known truth.
+
+    A conditional logit (McFadden 1974) on the logarithms of the signals; no slope is negative.
+
+    Args:
+        cases: the signals of all candidates of a view, and the number of the right one.
+        ridge: of the slopes; it keeps shares nearer to each other than made views ask for, as real
+            sensors err alike from pixel to pixel.
+
+    Raises:
+        InputError: there is no case.
+    """
+    if not cases:
+        raise InputError("fit_candidate_slopes: no view has several poses that fit; give more")
+    names = list(RefusalConfig().candidate_slopes)
+    x = [np.array([[log_signal(one[n]) for n in names] for one in some]) for some, _ in cases]
+
+    def loss(slopes: np.ndarray) -> tuple[float, np.ndarray]:
+        value, pull = 0.5 * ridge * (slopes @ slopes), ridge * slopes
+        for signals, (_, right) in zip(x, cases, strict=True):
+            odds = -signals @ slopes
+            log_share = odds - np.logaddexp.reduce(odds)
+            value -= log_share[right]
+            pull = pull + signals[right] - np.exp(log_share) @ signals
+        return value, pull
+
+    start = np.ones(len(names))
+    found = minimize(loss, start, jac=True, bounds=[(0.0, None)] * len(names), method="L-BFGS-B")
+    return dict(zip(names, found.x.tolist(), strict=True))
 
 
 def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:

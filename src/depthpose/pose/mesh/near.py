@@ -16,7 +16,7 @@ from depthpose.pose.mesh.propose import SurfaceDeviation, promising_turns
 from depthpose.pose.mesh.symmetry import symmetry_transforms, turn_about
 from depthpose.pose.types import ObjectModel, Symmetries
 
-ALIKE = 0.015
+ALIKE = 0.01
 """Deviation in diameters up to which a symmetry that was found in a scan is one; a copy that
 deviates by more differs in dents that are seen from near by, and is another pose."""
 _TOLERANCE = 0.05
@@ -76,7 +76,7 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
 def true_symmetries(model: ObjectModel) -> Symmetries:
     """Give the symmetries whose copies are one pose.
 
-    Declared ones are all. Of those that were found in the geometry, copies that lie 1.5 % of the
+    Declared ones are all. Of those that were found in the geometry, copies that lie 1 % of the
     diameter and more off the surface are left out: near-symmetries.
     """
     if not model.symmetries.is_found:
