@@ -6,12 +6,12 @@ from depthpose.core.errors import InputError
 from depthpose.pose.config.geometry import IcpConfig, VotingConfig
 
 _CANDIDATE_SLOPES = {
-    "tilt": 0.98,
-    "gap": 0.46,
-    "far": 1.46,
-    "front": 1.23,
-    "unseen": 0.63,
-    "disagree": 0.93,
+    "tilt": 1.52,
+    "gap": 0.78,
+    "far": 2.02,
+    "front": 1.43,
+    "unseen": 0.75,
+    "disagree": 0.77,
 }
 """Of a conditional logit on made views of all shipped objects, held by a ridge
 (``bench/pose_candidates.py``): how likely each of several poses is that fit."""
