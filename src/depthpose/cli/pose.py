@@ -61,6 +61,7 @@ def predict(
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
+        depthpose pose predict --depth d.png --camera cam.json --out out
         depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
 
     Args:
@@ -71,7 +72,8 @@ def predict(
         unit: of the clouds, metres by default; of depth images, where their camera says none.
         depth: 16-bit PNG in the camera's depth_unit_m, or a folder of them.
         mask: picture, not black is the object, or .json with COCO's run lengths; or a folder of
-            masks with the names of the depth images.
+            masks with the names of the depth images. Without, the image is searched: its planes
+            are taken away, and what is left is asked for every object, or for --object alone.
         camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of BOP, TUM RGB-D,
             ROS, OpenCV, KITTI or Middlebury.
         object: which of the objects that the weights know.
@@ -112,7 +114,14 @@ def predict(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
             "and --camera, or weights that vote"
         )
-    name, home = posing.object_named(object, method), Path(out)
+    home = Path(out)
+    if depth is not None and mask is None and camera is not None:
+        from depthpose.cli.pose_finding import find_all
+
+        known = tuple(model.name for model in method.models)
+        wanted = known if object is None else (posing.object_named(object, method),)
+        return find_all(method, Path(depth), camera, wanted, unit, home)
+    name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
         jobs = posing.cloud_jobs(Path(cloud), unit or "m", name, home)
@@ -120,7 +129,9 @@ def predict(
     else:
         assert depth is not None
         if mask is None or camera is None:
-            raise InputError("--depth needs --mask and --camera beside it")
+            raise InputError(
+                "--depth needs --camera beside it, and --mask unless it is to be found"
+            )
         jobs = posing.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
         settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}

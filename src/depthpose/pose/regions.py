@@ -35,7 +35,7 @@ def find_regions(
     K: Float[Tensor, "3 3"],
     largest_m: float,
     seed: int = 0,
-) -> list[Float[Tensor, "_ 3"]]:
+) -> tuple[list[Float[Tensor, "_ 3"]], Bool[Tensor, "h w"]]:
     """Take dominant planes away and part what is left where its depth jumps.
 
     Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted. One that
@@ -48,10 +48,12 @@ def find_regions(
         seed: of RANSAC.
 
     Returns:
-        The points of each region in the camera frame, the largest first, 40 at most.
+        The points of each region in the camera frame, the largest first, 40 at most; and which
+        pixels show a plane that was taken away.
     """
     points_m = back_project(depth_m.double(), K.double())
     is_left = points_m.isfinite().all(-1) & (depth_m > 0)
+    is_plane = torch.zeros_like(is_left)
     total = int(is_left.sum())
     generator = torch.Generator().manual_seed(seed)
     for _ in range(_PLANES):
@@ -63,11 +65,12 @@ def find_regions(
         if len(on_m) < _LEAST_SHARE * total or _width_m(on_m) < _WIDER * largest_m:
             break
         is_left &= ~near
+        is_plane |= near
     label = label_regions(depth_m, is_left)
     pixels = torch.bincount(label[is_left], minlength=1) if bool(is_left.any()) else torch.zeros(1)
     order = pixels.argsort(descending=True, stable=True)[:_MOST_REGIONS]
     wanted = [int(k) for k in order if int(pixels[k]) >= _LEAST_PIXELS]
-    return [points_m[is_left & (label == k)].float() for k in wanted]
+    return [points_m[is_left & (label == k)].float() for k in wanted], is_plane
 
 
 def label_regions(

@@ -5,15 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.core.camera import project
+from depthpose.core.camera import back_project, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.alternatives import share_out
 from depthpose.pose.regions import extent_m, find_regions, part_cloud
-from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.surface import NEAR, Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 _SMALLEST, _LARGEST = 0.25, 1.25
@@ -21,6 +21,10 @@ _SMALLEST, _LARGEST = 0.25, 1.25
 _TOGETHER = 1.1
 """Two regions may be parts of one object where together they are no longer than this."""
 _MOST_PAIRS = 20
+_CRUMB = 0.1
+"""A region of fewer points than this share of another adds nothing to it."""
+_HIDDEN = 0.5
+"""Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
 _REST = 0.25
 """A region of which so large a share is unexplained is asked again without the rest."""
 _LEAST_POINTS = 60
@@ -28,8 +32,11 @@ _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
 _SEEN_THROUGH = 0.2
 """Where the camera saw through more of the posed surface, there is no such object."""
-_BEHIND = 1.0
-"""By how many times what counts as near a reading lies behind the surface that it saw through."""
+_SUNK = 0.1
+"""Where a table or wall lies before more of the posed surface, there is no such object."""
+_WHOLE = 0.96
+"""An answer explains so much of its region, or leaves enough of it for another object: what has a
+little more to it than the object is another thing."""
 
 EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
 
@@ -52,6 +59,14 @@ class Known:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Scene:
+    """A view, and which of its pixels show a plane that was taken away."""
+
+    view: ViewInput
+    is_plane: Bool[Tensor, "h w"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Answer:
     """An answer for a region, and which of all readings it explains."""
 
@@ -59,6 +74,12 @@ class _Answer:
     points_m: Float[Tensor, "n 3"]
     explained: Tensor
     share: float
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether what it leaves of its region is nothing, or something of its own."""
+        explained = float(self.explained.double().mean())
+        return explained >= _WHOLE or explained <= 1 - _REST
 
     @property
     def worth(self) -> float:
@@ -73,8 +94,9 @@ def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
     Regions are asked for every object whose size they may have; so are pairs of them that may be
     parts of one object, and parts of one that is too long. Where several objects answer they share
     the probability of one by what speaks against each. What an answer leaves unexplained of its
-    region is asked once more. An answer through whose surface the camera saw is left out, and of
-    answers that explain the same points the best stays.
+    region is asked once more. An answer is left out through whose surface the camera saw, or that
+    lies behind a plane that was seen, or that explains not quite all of its region; of answers that
+    explain the same points the best stays.
 
     Args:
         view: depth and camera; its mask limits where is looked.
@@ -82,14 +104,15 @@ def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
     """
     largest_m = max(model.diameter_m for model in known.models.values())
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
-    clouds = find_regions(depth_m, view.K, largest_m)
-    clouds = [*clouds, *_pairs(clouds, largest_m), *_parts(clouds, largest_m)]
-    answers = _ask(clouds, view, known)
+    regions, is_plane = find_regions(depth_m, view.K, largest_m)
+    clouds = [*regions, *_pairs(regions, largest_m), *_parts(regions, largest_m)]
+    scene = _Scene(view=view, is_plane=is_plane)
+    answers = _ask(clouds, scene, known)
     rest = [answer.points_m[~answer.explained] for answer in answers]
     again = [cloud for cloud, answer in zip(rest, answers, strict=True)
              if len(cloud) >= max(_LEAST_POINTS, _REST * len(answer.points_m))]  # fmt: skip
-    answers += _ask(again, view, known)
-    kept = _without_overlap(answers, known)
+    answers += _ask(again, scene, known)
+    kept = _without_overlap([a for a in answers if a.is_whole], known)
     return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
 
 
@@ -99,7 +122,7 @@ def _pairs(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     for a, first in enumerate(clouds):
         for second in clouds[a + 1 :]:
             apart_m = float((first.median(0).values - second.median(0).values).norm())
-            if apart_m > largest_m:
+            if apart_m > largest_m or len(second) < _CRUMB * len(first):
                 continue
             both = torch.cat([first, second])
             if extent_m(both) <= _TOGETHER * largest_m:
@@ -117,20 +140,20 @@ def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     return [part for part in parts if len(part) >= _LEAST_POINTS]
 
 
-def _ask(clouds: Sequence[Tensor], view: ViewInput, known: Known) -> list[_Answer]:
+def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
     """Ask every cloud for every object of its size; give the best answer of each cloud."""
     asked: list[tuple[int, CloudInput]] = []
     for k, cloud in enumerate(clouds):
         size_m = extent_m(cloud)
         asked += [
-            (k, CloudInput(name=f"{view.name}_{k}", points_m=cloud, object=name))
+            (k, CloudInput(name=f"{scene.view.name}_{k}", points_m=cloud, object=name))
             for name, model in known.models.items()
             if _SMALLEST * model.diameter_m <= size_m <= _LARGEST * model.diameter_m
         ]
     found = known.estimate_many([given for _, given in asked]) if asked else []
     of_cloud: dict[int, list[PoseEstimate]] = {}
     for (k, _), estimate in zip(asked, found, strict=True):
-        if estimate.camera_from_model is not None and not _is_seen_through(view, estimate, known):
+        if estimate.is_ok and _is_possible(scene, estimate, known):
             of_cloud.setdefault(k, []).append(estimate)
     return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
 
@@ -159,23 +182,40 @@ def _is_explained(cloud: Tensor, pose: Rigid, surface: Surface) -> Tensor:
     return distance_m < NEAR * surface.diameter_m
 
 
-def _is_seen_through(view: ViewInput, estimate: PoseEstimate, known: Known) -> bool:
-    """Whether readings lie behind much of the posed surface that faces the camera."""
+def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a depth image whose points lie on a posed object."""
+    points_m = back_project(view.depth_m.double(), view.K.double())
+    is_read = points_m.isfinite().all(-1) & view.mask
+    near = is_read.clone()
+    middle_m = pose.apply(model.vertices_m.mean(0, keepdim=True).to(pose.R)).double()
+    near[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < model.diameter_m
+    explained = torch.zeros_like(near)
+    if bool(near.any()):
+        explained[near] = _is_explained(points_m[near], pose, prepare_surface(model))
+    return explained
+
+
+def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
+    """Whether the camera saw enough of the posed surface, not through it, and no plane before it."""
     pose = estimate.camera_from_model
     assert pose is not None
+    if estimate.signals["unseen"] > _HIDDEN:
+        return False
     surface = known.surface_of(estimate.object)
-    pose = Rigid(pose.R.double(), pose.t_m.double())
-    posed_m = pose.apply(surface.points_m)
-    u, v = project(posed_m, view.K.double()).round().long().unbind(-1)
-    height, width = view.depth_m.shape
+    posed_m = Rigid(pose.R.double(), pose.t_m.double()).apply(surface.points_m)
+    u, v = project(posed_m, scene.view.K.double()).round().long().unbind(-1)
+    height, width = scene.view.depth_m.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (posed_m[:, 2] > 0)
-    if not bool(inside.any()):
-        return True
-    measured_m = view.depth_m.double()[v[inside], u[inside]]
-    behind_m = measured_m - posed_m[inside, 2]
-    read = measured_m.isfinite()
-    through = behind_m[read] > _BEHIND * NEAR * surface.diameter_m
-    return bool(read.any()) and float(through.double().mean()) > _SEEN_THROUGH
+    u, v = u[inside], v[inside]
+    behind_m = scene.view.depth_m.double()[v, u] - posed_m[inside, 2]
+    behind_m = torch.where(scene.view.depth_m[v, u] > 0, behind_m, torch.nan)
+    read = behind_m.isfinite()
+    if not bool(read.any()):
+        return False
+    limit_m = NEAR * surface.diameter_m
+    through = (behind_m > limit_m)[read].double().mean()
+    sunk = (scene.is_plane[v, u] & (behind_m < -limit_m))[read].double().mean()
+    return float(through) <= _SEEN_THROUGH and float(sunk) <= _SUNK
 
 
 def _without_overlap(answers: Sequence[_Answer], known: Known) -> list[_Answer]:
