@@ -100,6 +100,16 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> Copies:
     )
 
 
+def near_symmetry_lines(model: ObjectModel) -> list[str]:
+    """Say after which turns a model looks nearly as before, and by how much it deviates."""
+    copies = find_copies(model, up_to_symmetry=False)
+    here = Rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    return [
+        f"{difference_of(one.model_from_model, here, copies)} ({one.deviation:.1%})"
+        for one in near_symmetries(model)
+    ]
+
+
 def find_candidates(
     cloud_m: Float[Tensor, "n 3"],
     best: Candidate,

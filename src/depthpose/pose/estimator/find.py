@@ -21,7 +21,7 @@ _SMALLEST, _LARGEST = 0.25, 1.25
 _TOGETHER = 1.1
 """Two regions may be parts of one object where together they are no longer than this."""
 _MOST_PAIRS = 20
-_CRUMB = 0.1
+_CRUMB = 0.03
 """A region of fewer points than this share of another adds nothing to it."""
 _HIDDEN = 0.5
 """Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
@@ -196,7 +196,7 @@ def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Ten
 
 
 def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
-    """Whether the camera saw enough of the posed surface, not through it, and no plane before it."""
+    """Whether the camera saw enough of the surface, not through it, and no plane before it."""
     pose = estimate.camera_from_model
     assert pose is not None
     if estimate.signals["unseen"] > _HIDDEN:
