@@ -36,6 +36,7 @@ from depthpose.core.files import (
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.bop.results import read_results
+from depthpose.pose.config import RefusalConfig
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.weights import write_pose_weights
@@ -91,6 +92,32 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     beside = read_cloud(out / "part.pose.ply")
     assert len(beside.points) == len(cloud) + 5000
     assert beside.color is not None
+
+
+def test_a_depth_image_alone_is_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truths = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
+    refusal = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
+    oracle = Oracle(tiny_weights(bracket(), refusal=refusal), truths)
+    weights = oracle_weights(tmp_path, monkeypatch, oracle)
+    seen, mask = view_of(bracket(), *truths)
+    wall = torch.full((240, 320), 1.2)
+    (tmp_path / "depth").mkdir()
+    write_depth_png(tmp_path / "depth/two.png", torch.where(mask, seen.float(), wall), 0.001)
+    write_depth_png(tmp_path / "depth/wall.png", wall, 0.001)
+    write_camera(tmp_path / "c.json", Camera(width=320, height=240, K=K, depth_unit_m=0.001))
+    words = ["--depth", str(tmp_path / "depth"), "--camera", str(tmp_path / "c.json")]
+    out = tmp_path / "out"
+    assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
+    assert "3 inputs: 1 doubtful, 2 ok" in capsys.readouterr().out
+    rows = poses_of(out)
+    assert sorted(rows) == ["two_0", "two_1", "wall"]
+    assert rows["wall"]["reason"].startswith("nothing beside the planes of the image is surely")
+    for name in ("two_0", "two_1"):
+        assert (out / f"{name}.pose.png").is_file()
+        assert len(read_cloud(out / f"{name}.pose.ply").points) > 5000
+    assert (out / "report.html").is_file()
 
 
 def test_results_never_take_the_place_of_inputs(
@@ -287,7 +314,7 @@ def test_two_processes_share_the_work(
         (["--cloud", ".", "--bop", "."], "2 of --cloud, --depth and --bop are given"),
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
-        (["--depth", ".", "--object", "bottle"], "--depth needs --mask and --camera beside it"),
+        (["--depth", ".", "--object", "bottle"], "--depth needs --camera beside it"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz file there"),
     ],
 )

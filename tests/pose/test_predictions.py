@@ -18,7 +18,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import PoseEstimate
+from depthpose.pose.types import Alternative, PoseEstimate
 
 
 def some_pose(seed: int) -> Rigid:
@@ -40,6 +40,14 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
         inlier_share=0.75,
         residual_m=0.002,
         risk=0.125,
+        certainty=0.5,
+        alternatives=(
+            Alternative(
+                camera_from_model=some_pose(seed + 9),
+                probability=0.375,
+                difference="turned by 180 degrees about the long axis",
+            ),
+        ),
         signals={"gap": 0.01, "far": 0.2},
         seconds={"network": 0.015, "voting": 0.007},
     )
@@ -66,6 +74,11 @@ def test_estimates_go_out_and_come_back(tmp_path: Path) -> None:
             elif isinstance(value, Rigid):
                 assert torch.equal(value.R.double(), after[name].R)
                 assert torch.equal(value.t_m.double(), after[name].t_m)
+            elif name == "alternatives":
+                for own, other in zip(value, after[name], strict=True):
+                    assert torch.equal(own.camera_from_model.R.double(), other.camera_from_model.R)
+                    assert own.probability == other.probability
+                    assert own.difference == other.difference
             else:
                 assert value == after[name], name
 
@@ -77,7 +90,7 @@ def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> Non
 
 
 def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
-    by_votes = replace(answer("c", 1), seconds={}, risk=None)
+    by_votes = replace(answer("c", 1), seconds={}, risk=None, certainty=None, alternatives=())
     slow = replace(refusal(), seconds={"segmentation": 0.1})
     sent = [
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
@@ -89,9 +102,12 @@ def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
     first, second = read_results(path)
     assert (first.scene_id, first.image_id, first.object_id) == (1, 20, 6)
     assert first.seconds == pytest.approx(0.122)
-    assert first.score == 0.875
+    assert first.score == 0.5
     assert (second.seconds, second.score) == (None, 0.75)
     assert torch.allclose(first.camera_from_model.t_m, some_pose(0).t_m.double(), atol=1e-7)
+    write_bop_results(path, sent, with_alternatives=True)
+    scores = [(row.image_id, row.score) for row in read_results(path)]
+    assert scores == [(20, 0.5), (20, 0.375), (0, 0.75)]
     with pytest.raises(InputError, match="a: belongs to no scene of a BOP data set"):
         write_bop_results(path, [Prediction(estimate=answer())])
 

@@ -369,10 +369,22 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
     assert "posed model" not in [layer["name"] for layer in found["scene"]["layers"]]
 
 
+def test_a_depth_image_without_a_mask_is_searched(
+    page: TestClient, samples: Path, truth: Rigid
+) -> None:
+    files = {"depth": "depth.png", "camera": "view.json"}
+    found = ask(page, "pose", samples, files, object=PART).json()
+    (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
+    assert row["object"] == PART
+    assert row["status"] == "ok", row["reason"]
+    off_m = torch.tensor(row["camera_from_model"])[:3, 3] - truth.t_m
+    assert float(off_m.norm()) < 0.005
+
+
 @pytest.mark.parametrize(
     ("files", "data", "said"),
     [
-        ({"depth": "depth.png"}, {"object": PART}, "mask: no file; choose a mask"),
+        ({"depth": "depth.png"}, {"object": PART}, "focal length: a depth image becomes points"),
         ({"depth": "depth.png", "mask": "mask.png"}, {"object": PART}, "focal length: a depth"),
         (VIEW | {"mask": "left.png"}, {"object": PART}, "give the mask of this very image"),
         (VIEW, {"object": "teapot"}, "object 'teapot': the weights know"),

@@ -212,7 +212,7 @@ def test_pose_good(page: Page, address: str, samples: Path) -> None:
 def test_pose_bad(page: Page, address: str, samples: Path) -> None:
     page.goto(f"{address}#pose")
     said = send(page, "pose", {"depth": samples / "depth.png"})
-    assert "mask: no file; choose a mask" in said
+    assert "focal length: a depth image becomes points by it" in said
     page.reload()
     page.locator("#pose select[name=object]").select_option("spool")
     view = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}

@@ -41,6 +41,7 @@ def predict(
     voting: Voting = "ransac",
     hypotheses: int = 128,
     icp: bool = True,
+    up_to_symmetry: bool = False,
     batch: int = 16,
     device: str = "cpu",
     view: str | None = None,
@@ -49,15 +50,18 @@ def predict(
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
-    alone; the risk is of being wrong altogether), status and reason, and the seconds of each stage.
+    alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
+    none of them is right, status and reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
-    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv and
-    SCENE_IMAGE.pose.png. report.html shows some of them in 3D, and every refusal. A rerun skips
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, with the
+    alternatives too depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
+    shows some of them in 3D, and every refusal. A rerun skips
     what is finished; other settings need another --out; no file is written over that is not the
     run's own. Processes of torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
+        depthpose pose predict --depth d.png --camera cam.json --out out
         depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
 
     Args:
@@ -68,7 +72,8 @@ def predict(
         unit: of the clouds, metres by default; of depth images, where their camera says none.
         depth: 16-bit PNG in the camera's depth_unit_m, or a folder of them.
         mask: picture, not black is the object, or .json with COCO's run lengths; or a folder of
-            masks with the names of the depth images.
+            masks with the names of the depth images. Without, the image is searched: its planes
+            are taken away, and what is left is asked for every object, or for --object alone.
         camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of BOP, TUM RGB-D,
             ROS, OpenCV, KITTI or Middlebury.
         object: which of the objects that the weights know.
@@ -79,6 +84,7 @@ def predict(
         voting: ransac, or least-squares.
         hypotheses: of RANSAC, for each keypoint.
         icp: slide the voted pose onto the cloud.
+        up_to_symmetry: copies of an object that look nearly alike are one answer, not alternatives.
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
@@ -93,6 +99,7 @@ def predict(
     config = EstimateConfig(
         voting=VotingConfig(method=voting_method(voting), hypotheses=hypotheses),
         with_icp=icp,
+        up_to_symmetry=up_to_symmetry,
         device=own_device(device),
     )
     if engine.is_ray:
@@ -107,7 +114,14 @@ def predict(
             f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
             "and --camera, or weights that vote"
         )
-    name, home = posing.object_named(object, method), Path(out)
+    home = Path(out)
+    if depth is not None and mask is None and camera is not None:
+        from depthpose.cli.pose_finding import find_all
+
+        known = tuple(model.name for model in method.models)
+        wanted = known if object is None else (posing.object_named(object, method),)
+        return find_all(method, Path(depth), camera, wanted, unit, home)
+    name = posing.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
         jobs = posing.cloud_jobs(Path(cloud), unit or "m", name, home)
@@ -115,7 +129,9 @@ def predict(
     else:
         assert depth is not None
         if mask is None or camera is None:
-            raise InputError("--depth needs --mask and --camera beside it")
+            raise InputError(
+                "--depth needs --camera beside it, and --mask unless it is to be found"
+            )
         jobs = posing.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
         settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}

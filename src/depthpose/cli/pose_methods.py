@@ -38,6 +38,7 @@ class PoseMethod:
 
     Attributes:
         takes_clouds: whether it can do without a depth image.
+        find: gives the poses of named objects in a view without a mask; None: it cannot.
     """
 
     name: str
@@ -45,6 +46,7 @@ class PoseMethod:
     takes_clouds: bool
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
+    find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
 
 
 def pose_methods(
@@ -100,6 +102,7 @@ def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
         takes_clouds=not is_regressor,
         models=found.models,
         settings={**facts, "estimate": config_to_dict(config)},
+        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
     )
 
 

@@ -16,7 +16,7 @@ from depthpose.pages.choose import (
     share_views,
     spread_evenly,
 )
-from depthpose.pages.pose import PoseShown, pose_section
+from depthpose.pages.pose import PoseShown, alternative_lines, pose_section
 from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.evaluate import match, nearest_copy, read_any
 from depthpose.pose.mesh import symmetry_transforms
@@ -128,6 +128,8 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         "y_m": y_m,
         "z_m": z_m,
         "risk": estimate.risk,
+        "certainty": estimate.certainty,
+        "alternatives": "; ".join(alternative_lines(estimate)),
         "reason": estimate.reason,
     }
 

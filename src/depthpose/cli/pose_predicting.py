@@ -34,6 +34,7 @@ from depthpose.core.run import (
     refuse_among_inputs,
     wait_for,
 )
+from depthpose.pages.pose import alternative_lines
 from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
@@ -46,6 +47,7 @@ from depthpose.pose.predictions import (
     POSES,
     Job,
     Prediction,
+    alternatives_name,
     is_finished,
     is_started,
     predict,
@@ -61,6 +63,8 @@ PAGE = "report.html"
 _MOST_SHOWN = 20
 """Of the answers, on the terminal; poses.json holds all."""
 _FRAME = "camera_from_model: x right, y down, z forward; risk: the chance that a pose is wrong"
+_SAID = 5
+"""Of so many inputs the alternatives are printed; of all they are in poses.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +193,8 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     """Make a folder the home of the poses of a data set; raises as :func:`claim`."""
     images = {(i.scene_id, i.image_id) for i in dataset.instances}
     pictures = (_picture_name(*image) for image in sorted(images))
-    claim_folder(out, settings, [POSES, PAGE, results_name(dataset), *pictures])
+    tables = [results_name(dataset), alternatives_name(dataset)]
+    claim_folder(out, settings, [POSES, PAGE, *tables, *pictures])
 
 
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
@@ -234,6 +239,9 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         print(_FRAME)
     if len(shown) == 1 and not shown[0].is_ok:
         print(f"refused: {shown[0].reason}")
+    for prediction in predictions[:_SAID]:
+        for line in alternative_lines(prediction.estimate):
+            print(f"{prediction.estimate.name}: {line}")
     said = ", ".join(f"{count} {status}" for status, count in sorted(reasons.items()))
     print(f"{len(predictions)} inputs: {said or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
@@ -276,6 +284,8 @@ def write_bop_files(
 ) -> None:
     """Write BOP's csv, and a picture SCENE_IMAGE.pose.png of each image."""
     write_bop_results(out / results_name(dataset), predictions)
+    if any(p.estimate.alternatives for p in predictions):
+        write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
     image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
     found: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
     for prediction in predictions:

@@ -23,6 +23,7 @@ LIVE = "live"
 _RECORDING = ".rrd"
 _MOST_POINTS = 100_000
 _SEEN, _POSED, _KEYPOINTS = (90, 150, 255), (255, 160, 60), (60, 220, 120)
+_OTHER = (170, 90, 220)
 
 
 class Viewer:
@@ -95,6 +96,11 @@ class Viewer:
             self._log("posed/model", mesh)
         else:
             self._log("posed/model", self._points(posed_m, _POSED))
+        for k, other in enumerate(estimate.alternatives):
+            other_m = other.camera_from_model.apply(model.vertices_m.to(pose.R))
+            self._log(f"posed/alternative {k + 1}", self._points(other_m, _OTHER))
+            said = f"{given.name}: {other.difference}, {other.probability:.0%}"
+            self._log("alternatives", rr.TextLog(said))
         keypoints_m = pose.apply(model.keypoints_m.to(pose.R))
         radius_m = 0.02 * model.diameter_m
         self._log("posed/keypoints", self._points(keypoints_m, _KEYPOINTS, radius_m))

@@ -16,7 +16,13 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.scene import Layer, Scene, colored_points
 from depthpose.pose.cloud import object_points
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.overlay import draw_pose, grey_depth, keypoint_layers, pose_layers
+from depthpose.pose.overlay import (
+    alternative_layers,
+    draw_pose,
+    grey_depth,
+    keypoint_layers,
+    pose_layers,
+)
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 _SEEN = (0.55, 0.55, 0.55)
@@ -68,7 +74,15 @@ def pose_sentence(found: PoseEstimate) -> str:
     if found.camera_from_model is None:
         return f"Refused ({found.status}): {found.reason}."
     x, y, z = found.camera_from_model.t_m.tolist()
-    return f"The {found.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    said = f"The {found.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    if not found.alternatives:
+        return said
+    return f"{said} Other poses fit as well: {'; '.join(alternative_lines(found))}."
+
+
+def alternative_lines(found: PoseEstimate) -> list[str]:
+    """Say of each alternative how it differs from the pose, and how likely it is."""
+    return [f"{one.difference}, {one.probability:.0%}" for one in found.alternatives]
 
 
 def pose_facts(
@@ -89,7 +103,10 @@ def pose_facts(
     if how:
         facts.append(("by", how))
     if found.risk is not None:
-        facts.append(("risk of being wrong", f"{found.risk:.3f}"))
+        facts.append(("risk that no named pose is right", f"{found.risk:.3f}"))
+    if found.certainty is not None:
+        facts.append(("certainty of this pose", f"{found.certainty:.3f}"))
+    facts += [("another pose that fits", line) for line in alternative_lines(found)]
     if found.inlier_share is not None:
         facts.append((agreeing, f"{found.inlier_share:.0%}"))
     if found.residual_m is not None and math.isfinite(found.residual_m):
@@ -149,6 +166,7 @@ def pose_scene(
     pose = found.camera_from_model
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
+        layers += alternative_layers(found, model)
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if found.keypoints_m is not None:

@@ -15,7 +15,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.scene import Layer, colored_lines, frame_axes
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.objects import drawn_triangles
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, PoseEstimate
 
 Color = tuple[float, float, float]
 FOUND: Color = (0.15, 0.35, 1.0)
@@ -24,6 +24,8 @@ TRUE: Color = (0.1, 0.8, 0.2)
 """Of the truth: green."""
 VOTED: Color = (1.0, 0.55, 0.1)
 """Of keypoints as voted: orange."""
+OTHER: Color = (0.6, 0.3, 0.85)
+"""Of an alternative: violet."""
 _SURFACE = 5000
 _BEND = math.radians(30)
 _CROSS = 0.04
@@ -114,6 +116,20 @@ def pose_layers(
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
     box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=with_box)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
+
+
+def alternative_layers(found: PoseEstimate, model: ObjectModel) -> list[Layer]:
+    """Show each alternative by its axes and its box, hidden at first."""
+    layers: list[Layer] = []
+    for other in found.alternatives:
+        pose = Rigid(other.camera_from_model.R.double(), other.camera_from_model.t_m.double())
+        ends_m = pose.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2)).float()
+        said = f"{other.difference}, {other.probability:.0%}"
+        box = colored_lines(ends_m, OTHER)
+        layers.append(Layer(name=f"box if {said}", shape=box, is_shown=False))
+        axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
+        layers.append(Layer(name=f"axes if {said}", shape=axes, is_shown=False))
+    return layers
 
 
 def keypoint_layers(

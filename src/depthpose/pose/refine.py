@@ -32,6 +32,8 @@ _LOST = 0.1
 it began farther off than exact steps reach."""
 _OTHER = 0.1
 """Mean distance between the points of two poses, in diameters, from which they are two."""
+_MOST_OTHERS = 3
+"""Poses beside the best at which starts ended, that are kept."""
 _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
 to be believed: a plane fits many places, and noise would choose among them."""
@@ -69,11 +71,13 @@ class Best(NamedTuple):
         start: number of the given pose that it began from.
         scatter: share of all starts that ended at another pose: where many do, the cloud says
             little about which is right.
+        others: the best of those other poses, three at most, roughly refined.
     """
 
     refined: Refined
     start: int
     scatter: float
+    others: Rigid
 
 
 def refine_pose(
@@ -151,8 +155,9 @@ def refine_best(
     if refined is None or float(refined.inlier_share) < float(near[best]) - _LOST:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, Rigid(tried.R[best], tried.t_m[best]), surface, short)
-    scatter = _scatter(tried, _doubled(refined.camera_from_model), surface)
-    return Best(refined, best % len(given.R), scatter)
+    away = _distances(tried, _doubled(refined.camera_from_model), surface) > _OTHER
+    others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
+    return Best(refined, best % len(given.R), float(away.double().mean()), others)
 
 
 def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
@@ -208,14 +213,33 @@ def _worth(
     return near, worth
 
 
-def _scatter(poses: Rigid, best: Rigid, surface: Surface) -> float:
-    """Share of the poses that are another than the best, where what looks alike is the same."""
+def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
+    """Mean distance to the best in diameters, where what looks alike is the same."""
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
     moved_m = (best.inverse() @ poses).apply(own_m.expand(len(poses.R), -1, -1))
     if surface.is_symmetric:
         own_m = surface.points_m[surface.boxes.look_up(moved_m)]
-    away_m = (moved_m - own_m).norm(dim=-1).mean(-1)
-    return float((away_m > _OTHER * surface.diameter_m).double().mean())
+    return (moved_m - own_m).norm(dim=-1).mean(-1) / surface.diameter_m
+
+
+def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> Rigid:
+    """Choose poses from the best down, each another than those before; worthless ones are none."""
+    chosen: list[int] = []
+    for k in worth.argsort(descending=True).tolist():
+        if len(chosen) == _MOST_OTHERS or worth[k] == -torch.inf:
+            break
+        if all(float(_distances(_pick(poses, [k]), _one(poses, c), surface)) > _OTHER
+               for c in chosen):  # fmt: skip
+            chosen.append(k)
+    return _pick(poses, chosen)
+
+
+def _pick(poses: Rigid, numbers: list[int]) -> Rigid:
+    return Rigid(poses.R[numbers], poses.t_m[numbers])
+
+
+def _one(poses: Rigid, number: int) -> Rigid:
+    return Rigid(poses.R[number], poses.t_m[number])
 
 
 def _doubled(pose: Rigid) -> Rigid:

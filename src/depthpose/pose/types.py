@@ -131,10 +131,12 @@ class Symmetries:
     Attributes:
         discrete: ``model_from_model``, the identity not among them; None where there is none.
         continuous: axes of revolution.
+        is_found: whether they were found in the geometry, within a tolerance, and not declared.
     """
 
     discrete: Rigid | None = None
     continuous: tuple[Axis, ...] = ()
+    is_found: bool = False
 
     @property
     def is_none(self) -> bool:
@@ -221,6 +223,24 @@ class PoseFit:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Alternative:
+    """Another pose that explains what was seen.
+
+    Attributes:
+        camera_from_model: the pose.
+        probability: that it is the right one, 0..1.
+        difference: from the estimate's own pose, in words: "turned by 180 degrees about the long
+            axis".
+        signals: what speaks against it, by name; not kept in files.
+    """
+
+    camera_from_model: Rigid
+    probability: float
+    difference: str
+    signals: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PoseEstimate:
     """The pose of one object, or the reason why there is none.
 
@@ -238,7 +258,11 @@ class PoseEstimate:
             symmetry makes the variance infinite; no row where there is none.
         inlier_share: share of the votes that agree, 0..1.
         residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
-        risk: chance of being wrong, as the weights' refusal was calibrated; None where none was.
+        risk: chance that neither the pose nor an alternative is right, as the weights' refusal was
+            calibrated; None where none was.
+        certainty: chance that this very pose is right, given the alternatives; None where there is
+            neither a risk nor an alternative.
+        alternatives: other poses that fit, the likeliest first.
         signals: what the risk is made of, by name; kept for refusals too.
         seconds: time of each stage.
     """
@@ -254,6 +278,8 @@ class PoseEstimate:
     inlier_share: float | None = None
     residual_m: float | None = None
     risk: float | None = None
+    certainty: float | None = None
+    alternatives: tuple[Alternative, ...] = ()
     signals: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 

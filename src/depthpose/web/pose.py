@@ -17,6 +17,7 @@ from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Voted
+from depthpose.pose.estimator.find import explained_mask
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface
 from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
@@ -54,12 +55,17 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """
     target = _target(form, net)
     given = _input(form, target.model)
+    found = voted = None
+    if "depth" in form.files and "mask" not in form.files:
+        given, found = _found_alone(given, target, net)
     points_m = object_points(given, target.model.diameter_m)
-    if target.registration is None:
+    if found is not None:
+        terms = net.terms
+    elif target.registration is None:
         (found, voted), terms = net.estimate_with_votes(given), net.terms
     else:
         cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-        found, voted, terms = target.registration.estimate(cloud), None, ""
+        found, terms = target.registration.estimate(cloud), ""
     folder = form.results()
     return Answer(
         is_ok=found.is_ok,
@@ -71,6 +77,31 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         terms=terms,
         files=read_files(folder),
     )
+
+
+def _found_alone(
+    given: CloudInput | ViewInput, target: _Target, net: GeoPoseNet
+) -> tuple[ViewInput, PoseEstimate]:
+    """Search a depth image without a mask; give the best answer, and what it explains as mask.
+
+    Raises:
+        InputError: the network does not know the object.
+    """
+    assert isinstance(given, ViewInput)
+    if target.registration is not None:
+        raise InputError("mask: no file; an object that the weights do not know needs its mask")
+    answers = net.find_in(given, [target.model.name])
+    if not answers:
+        return given, PoseEstimate(
+            name=given.name,
+            object=target.model.name,
+            status="doubtful",
+            reason="nothing beside the planes of the image is surely the object; give its mask",
+        )
+    best = replace(answers[0], name=given.name)
+    assert best.camera_from_model is not None
+    mask = explained_mask(given, best.camera_from_model, target.model)
+    return replace(given, mask=mask), best
 
 
 def _write(
@@ -133,9 +164,11 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
             raise InputError("a cloud and a depth image are both given; choose one of the two")
         path = form.file("cloud")
         return cloud_input(path, _unit(form, "cloud_unit"), model.name, path.stem)
-    depth, mask = form.file("depth"), form.file("mask")
+    depth = form.file("depth")
+    mask = form.file("mask") if "mask" in form.files else None
     is_picture = depth.suffix.lower() == ".png"
-    small_size(mask)
+    if mask is not None:
+        small_size(mask)
     size = _size(depth)
     camera = form.camera({} if "camera" in form.files else _keys(form, size), size)
     if camera.depth_unit_m is None and is_picture:

@@ -5,6 +5,17 @@ from dataclasses import dataclass, field
 from depthpose.core.errors import InputError
 from depthpose.pose.config.geometry import IcpConfig, VotingConfig
 
+_CANDIDATE_SLOPES = {
+    "tilt": 1.52,
+    "gap": 0.78,
+    "far": 2.02,
+    "front": 1.43,
+    "unseen": 0.75,
+    "disagree": 0.77,
+}
+"""Of a conditional logit on made views of all shipped objects, held by a ridge
+(``bench/pose_candidates.py``): how likely each of several poses is that fit."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RefusalConfig:
@@ -24,6 +35,9 @@ class RefusalConfig:
     means: dict[str, float] = field(default_factory=dict)
     """Of each signal's logarithm over right answers: a refusal names the signal that lies farthest
     above its mean, weighed by its slope. That of 0 where there is none."""
+
+    candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
+    """How much the logarithm of each signal speaks against a pose beside others that fit."""
 
     min_hold: float = 0.02
     """A motion that no declared symmetry excuses must carry the seen surface across itself by this
@@ -61,6 +75,10 @@ class EstimateConfig:
 
     with_icp: bool = True
     """Whether it does; without, the voted pose is the answer."""
+
+    up_to_symmetry: bool = False
+    """Whether copies of the object that look nearly alike count as one answer: its certainty is
+    then of them all, and they are not named as alternatives."""
 
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk judges what comes out: ICP

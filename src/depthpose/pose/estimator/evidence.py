@@ -1,5 +1,7 @@
 """What speaks for and against a pose: signals that need no truth, each larger where it is worse."""
 
+import math
+
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
@@ -19,6 +21,8 @@ _THINNED = 500
 sensor's noise, alike from pixel to pixel, does not turn."""
 _TILTED = 250
 """At so many of them the normal is looked at."""
+_FLOOR = 0.01
+"""Added to a signal before its logarithm is taken."""
 
 SIGNALS: dict[str, str] = {
     "misfit": "the keypoints fit the model badly for how sure they are (log misfit {:.2g})",
@@ -34,24 +38,28 @@ SIGNALS: dict[str, str] = {
 """Name of each signal, and what it says to people."""
 
 
-def vote_signals(
-    cloud: Prepared, outputs: Float[Tensor, "n k c"], fit: PoseFit, keypoints_m: Tensor
-) -> dict[str, float]:
-    """Say how well the keypoints fit the model, and the directions the posed keypoints.
+def vote_signals(cloud: Prepared, fit: PoseFit) -> dict[str, float]:
+    """Say how well the keypoints fit the model, and how little there was to vote.
 
     Args:
         cloud: what voted.
-        outputs: the network's, the directions first.
         fit: of the voted keypoints.
-        keypoints_m: of the model, posed as the answer says.
     """
+    return {"misfit": float(fit.misfit.log1p()), "few": 10 / len(cloud.points_m)}
+
+
+def disagreement(
+    cloud: Prepared, outputs: Float[Tensor, "n k c"], keypoints_m: Float[Tensor, "k 3"]
+) -> float:
+    """Mean angle between the network's directions and those to the posed keypoints [rad]."""
     way = normalize(keypoints_m[None] - cloud.points_m.double()[:, None], dim=-1)
     cosine = (normalize(outputs[..., :3].double(), dim=-1) * way).sum(-1).clamp(-1, 1)
-    return {
-        "misfit": float(fit.misfit.log1p()),
-        "disagree": float(cosine.arccos().mean()),
-        "few": 10 / len(cloud.points_m),
-    }
+    return float(cosine.arccos().mean())
+
+
+def log_signal(signal: float) -> float:
+    """Take the logarithm in which signals are weighed: finite where there is none."""
+    return math.log(_FLOOR + signal)
 
 
 def surface_signals(

@@ -53,7 +53,7 @@ def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInp
 
 def view_input(
     depth: AnyArray,
-    mask: AnyMask,
+    mask: AnyMask | None,
     camera: AnyLens | None,
     object: str,
     name: str,
@@ -63,7 +63,7 @@ def view_input(
 
     Args:
         depth: a file, whole numbers, or metres.
-        mask: the object's pixels.
+        mask: the object's pixels; None: all.
         camera: of the depth image.
         object: which one.
         name: of the view.
@@ -79,7 +79,7 @@ def view_input(
     known = camera_of(camera, (width, height)) if is_said else camera
     said_m = known.depth_unit_m if isinstance(known, Camera) else None
     depth_m = _metres(values, said_m, unit, str(depth) if isinstance(depth, str | Path) else name)
-    pixels = _mask(mask, name)
+    pixels = torch.ones(height, width).bool() if mask is None else _mask(mask, name)
     if tuple(pixels.shape) != (height, width):
         raise InputError(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "

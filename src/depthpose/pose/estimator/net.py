@@ -15,6 +15,8 @@ from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.estimator.alternatives import Copies, find_copies
+from depthpose.pose.estimator.find import Known, find_objects
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
@@ -25,7 +27,7 @@ from depthpose.pose.estimator.given import (
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.types import PoseEstimate, SeenPoints
+from depthpose.pose.types import PoseEstimate, SeenPoints, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _NAME = "input"
@@ -58,6 +60,7 @@ class GeoPoseNet:
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
         self._surfaces: dict[int, Surface] = {}
+        self._copies: dict[int, Copies] = {}
 
     @classmethod
     def load(
@@ -163,6 +166,44 @@ class GeoPoseNet:
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
 
+    def find(
+        self,
+        depth: AnyArray,
+        camera: AnyCamera,
+        objects: Sequence[str] | None = None,
+        unit: Unit | None = None,
+    ) -> list[PoseEstimate]:
+        """Find and pose known objects in a depth image without masks, the best answer first.
+
+        Dominant planes are taken away, the rest is parted where its depth jumps, and every region
+        is asked for every object of its size. What nothing fits, or what is refused, is left out.
+
+        Args:
+            depth: as for :meth:`estimate`.
+            camera: of the depth image.
+            objects: which may be there; None: all that the weights know.
+            unit: of the depth, where its camera says none.
+
+        Returns:
+            Estimates that are ok; none where nothing was found.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        names = self.objects if objects is None else [self._object(name) for name in objects]
+        view = view_input(depth, None, camera, names[0], _NAME, unit)
+        return self.find_in(view, names)
+
+    def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        """Do as :meth:`find` does for a view; its mask limits where is looked."""
+        known = Known(
+            models={name: self.weights.models[self._number(name)] for name in objects},
+            surface_of=lambda name: self._surface(self._number(name)),
+            refusal=self.weights.refusal,
+            estimate_many=self.estimate_many,
+        )
+        return find_objects(view, known)
+
     @torch.inference_mode()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate many at once, of any objects: the network is called for all of them together.
@@ -240,12 +281,24 @@ class GeoPoseNet:
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
     ) -> PoseEstimate:
         model = self.weights.models[number]
-        if number not in self._surfaces:
-            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        if number not in self._copies:
+            up_to_symmetry = self.config.up_to_symmetry
+            self._copies[number] = find_copies(model, up_to_symmetry=up_to_symmetry)
         found = pose_from_directions(
-            voted, model, self._surfaces[number], self.weights.refusal, self.config
+            voted,
+            model,
+            self._surface(number),
+            self._copies[number],
+            self.weights.refusal,
+            self.config,
         )
         return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+
+    def _surface(self, number: int) -> Surface:
+        if number not in self._surfaces:
+            model = self.weights.models[number]
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        return self._surfaces[number]
 
     def _object(self, name: str | None) -> str:
         if name is None and len(self._numbers) == 1:

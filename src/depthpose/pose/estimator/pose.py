@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -11,17 +11,25 @@ from torch import Tensor
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
+from depthpose.pose.estimator.alternatives import (
+    Candidate,
+    Copies,
+    alternatives_among,
+    evidence_of,
+    find_candidates,
+    share_out,
+)
 from depthpose.pose.estimator.evidence import (
     hold_of,
-    surface_signals,
     vote_signals,
     without_motions,
 )
 from depthpose.pose.estimator.prepare import Prepared, Refusal
+from depthpose.pose.estimator.prepare import Voted as Voted
 from depthpose.pose.estimator.refusal import reason_of, risk_of
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
-from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import (
     consistent_keypoints,
     fit_pose,
@@ -32,13 +40,6 @@ from depthpose.pose.voting import (
 
 _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
-
-
-class Voted(NamedTuple):
-    """A cloud and the network's outputs for its points."""
-
-    cloud: Prepared
-    outputs: Float[Tensor, "n k c"]
 
 
 @dataclass
@@ -55,18 +56,21 @@ class _Clock:
 
 
 class _Found(NamedTuple):
-    """A pose, its covariance and residual, and what speaks for it."""
+    """A pose, its covariance and residual, what speaks against it, and which others fit."""
 
     pose: Rigid
     covariance: Float[Tensor, "6 6"]
     residual_m: float
     signals: dict[str, float]
+    share: float
+    alternatives: tuple[Alternative, ...]
 
 
 def pose_from_directions(
     voted: Voted,
     model: ObjectModel,
     surface: Surface,
+    copies: Copies,
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> PoseEstimate:
@@ -77,6 +81,7 @@ def pose_from_directions(
             to trust each).
         model: the object.
         surface: of the same object.
+        copies: of the same object, what it may be confused with.
         refusal: when the answer is withheld.
         config: voting and ICP.
     """
@@ -87,7 +92,7 @@ def pose_from_directions(
     if isinstance(fits, Refusal):
         return _withheld(model, fits, clock)
     clock.note("svd")
-    found = _refine(voted, fits, model, surface, config)
+    found = _refine(voted, fits, (model, surface, copies), refusal, config)
     if config.with_icp:
         clock.note("icp")
     free = free_motions(model.symmetries.continuous, found.pose)
@@ -97,7 +102,16 @@ def pose_from_directions(
     risk = risk_of(found.signals, refusal)
     if reason is not None:
         return _withheld(model, reason, clock, answer, risk)
-    return PoseEstimate(**{**vars(answer), "risk": risk, "seconds": clock.seconds})
+    return _with_certainty(replace(answer, risk=risk, seconds=clock.seconds), found)
+
+
+def _with_certainty(answer: PoseEstimate, found: _Found) -> PoseEstimate:
+    """Share what the risk leaves among the pose and its alternatives."""
+    if answer.risk is None and not found.alternatives:
+        return answer
+    known = 1.0 if answer.risk is None else 1 - answer.risk
+    others = tuple(replace(a, probability=known * a.probability) for a in found.alternatives)
+    return replace(answer, certainty=known * found.share, alternatives=others)
 
 
 def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
@@ -146,27 +160,41 @@ def _fits(
 def _refine(
     voted: Voted,
     fits: PoseFit,
-    model: ObjectModel,
-    surface: Surface,
+    known: tuple[ObjectModel, Surface, Copies],
+    refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> _Found:
+    model, surface, copies = known
     cloud_m = voted.cloud.cloud_m
     fit, scatter, refined = _row(fits, 0), 0.0, None
+    others = _none_of(fit.camera_from_model)
     if config.with_icp:
         best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
         scatter = 1.0  # where ICP meets nothing, nothing speaks for the pose
         if float(best.refined.inlier_share) > 0:
             fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
-    given = fit.camera_from_model if refined is None else refined.camera_from_model
-    pose = Rigid(given.R.double(), given.t_m.double())
-    keypoints_m = pose.apply(model.keypoints_m.double())
-    signals = {
-        **vote_signals(voted.cloud, voted.outputs, fit, keypoints_m),
-        "scatter": scatter,
-        **surface_signals(cloud_m, pose, surface),
-    }
+            others = best.others
     source = fit if refined is None else refined
-    return _Found(pose, source.covariance, float(source.residual_m), signals)
+    given = source.camera_from_model
+    pose = Rigid(given.R.double(), given.t_m.double())
+    first = Candidate(pose, source.covariance, float(source.residual_m))
+    icp = None if refined is None else config.icp
+    candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
+    evidence = [evidence_of(voted, one.pose, model, copies, surface) for one in candidates]
+    shares = share_out(evidence, refusal.candidate_slopes)
+    number = int(shares.argsort(descending=True, stable=True)[0])
+    chosen = candidates[number]
+    signals = {
+        **vote_signals(voted.cloud, fit),
+        "scatter": scatter,
+        **evidence[number],
+    }
+    alternatives = alternatives_among(candidates, evidence, shares, copies)
+    return _Found(*chosen, signals, float(shares[number]), alternatives)
+
+
+def _none_of(pose: Rigid) -> Rigid:
+    return Rigid(pose.R.double().new_zeros(0, 3, 3), pose.t_m.double().new_zeros(0, 3))
 
 
 def _row(fits: PoseFit, number: int) -> PoseFit:

@@ -1,6 +1,7 @@
 """An input to the cloud that the network sees, or the reason why it cannot be posed."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -48,6 +49,13 @@ class Refusal:
 
     status: Status
     reason: str
+
+
+class Voted(NamedTuple):
+    """A cloud and the network's outputs for its points."""
+
+    cloud: Prepared
+    outputs: Float[Tensor, "n k c"]
 
 
 def prepare_cloud(

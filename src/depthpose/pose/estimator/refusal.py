@@ -8,14 +8,13 @@ from scipy.optimize import minimize
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.evidence import SIGNALS
+from depthpose.pose.estimator.evidence import SIGNALS, log_signal
 from depthpose.pose.types import PoseEstimate
 
 _FOLDS = 5
 _RIDGE = 3.0
 """Of the slopes in units of each signal's spread: no signal decides alone."""
-_FLOOR = 0.01
-"""Added to a signal before its logarithm is taken."""
+_CANDIDATE_RIDGE = 3.0
 _LEARNT = tuple(name for name in SIGNALS if name != "gap")
 """How far points lie off the surface is the sensor's noise as much as the pose's error. On made
 views it tells right from wrong best of all; a real sensor that is noisier than the made one would
@@ -39,7 +38,7 @@ def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None
             f"the refusal weighs {unknown[0]!r}, but the signals are {', '.join(signals)}; the "
             "weights are of another version: calibrate them again by 'depthpose pose calibrate'"
         )
-    odds = config.bias + sum(k * _log(signals[name]) for name, k in config.slopes.items())
+    odds = config.bias + sum(k * log_signal(signals[name]) for name, k in config.slopes.items())
     return 1 / (1 + math.exp(-max(-700.0, min(700.0, odds))))
 
 
@@ -47,7 +46,9 @@ def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) 
     """Say in a sentence what makes an answer doubtful most, by how far it is above the usual."""
 
     def excess(name: str) -> float:
-        return config.slopes[name] * (_log(signals[name]) - config.means.get(name, _log(0.0)))
+        return config.slopes[name] * (
+            log_signal(signals[name]) - config.means.get(name, log_signal(0.0))
+        )
 
     worst = max(config.slopes, key=excess)
     return (
@@ -89,7 +90,7 @@ def calibrate_refusal(
             "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
             "longer, or show easier views"
         )
-    x = np.array([[_log(e.signals[name]) for name in _LEARNT] for e, _ in answered])
+    x = np.array([[log_signal(e.signals[name]) for name in _LEARNT] for e, _ in answered])
     wrong = np.array([not ok for _, ok in answered], dtype=float)
     # Views go round the objects: in order, a fold would be an object.
     fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
@@ -104,6 +105,41 @@ def calibrate_refusal(
         slopes=dict(zip(_LEARNT, slopes.tolist(), strict=True)),
         means=_means(x[wrong == 0]),
     )
+
+
+def fit_candidate_slopes(
+    cases: Sequence[tuple[Sequence[Mapping[str, float]], int]],
+    ridge: float = _CANDIDATE_RIDGE,
+) -> dict[str, float]:
+    """Learn how to share the probability of one among poses that fit, from cases of known truth.
+
+    A conditional logit (McFadden 1974) on the logarithms of the signals; no slope is negative.
+
+    Args:
+        cases: the signals of all candidates of a view, and the number of the right one.
+        ridge: of the slopes; it keeps shares nearer to each other than made views ask for, as real
+            sensors err alike from pixel to pixel.
+
+    Raises:
+        InputError: there is no case.
+    """
+    if not cases:
+        raise InputError("fit_candidate_slopes: no view has several poses that fit; give more")
+    names = list(RefusalConfig().candidate_slopes)
+    x = [np.array([[log_signal(one[n]) for n in names] for one in some]) for some, _ in cases]
+
+    def loss(slopes: np.ndarray) -> tuple[float, np.ndarray]:
+        value, pull = 0.5 * ridge * (slopes @ slopes), ridge * slopes
+        for signals, (_, right) in zip(x, cases, strict=True):
+            odds = -signals @ slopes
+            log_share = odds - np.logaddexp.reduce(odds)
+            value -= log_share[right]
+            pull = pull + signals[right] - np.exp(log_share) @ signals
+        return value, pull
+
+    start = np.ones(len(names))
+    found = minimize(loss, start, jac=True, bounds=[(0.0, None)] * len(names), method="L-BFGS-B")
+    return dict(zip(names, found.x.tolist(), strict=True))
 
 
 def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
@@ -144,10 +180,6 @@ def _choose_limit(risks: np.ndarray, wrong: np.ndarray, share: float) -> float:
     # Halfway to the next one, which is refused; where all are good, as far beyond as below 1.
     after = 1.0 if last + 1 == len(order) else float(risks[order[last + 1]])
     return (float(risks[order[last]]) + after) / 2
-
-
-def _log(signal: float) -> float:
-    return math.log(_FLOOR + signal)
 
 
 def _sigmoid(odds: np.ndarray) -> np.ndarray:

@@ -3,6 +3,9 @@
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import make_model as make_model
 from depthpose.pose.mesh.models import read_model as read_model
+from depthpose.pose.mesh.near import NearSymmetry as NearSymmetry
+from depthpose.pose.mesh.near import near_symmetries as near_symmetries
+from depthpose.pose.mesh.near import true_symmetries as true_symmetries
 from depthpose.pose.mesh.propose import SURE as SURE
 from depthpose.pose.mesh.propose import SymmetryProposal as SymmetryProposal
 from depthpose.pose.mesh.propose import propose_symmetries as propose_symmetries

@@ -50,7 +50,7 @@ class SymmetryProposal:
     certainty: float
 
 
-class _Surface:
+class SurfaceDeviation:
     """Measures how far a turned surface lies from itself, in diameters."""
 
     def __init__(self, model: ObjectModel) -> None:
@@ -79,12 +79,20 @@ class _Surface:
         """Say coarsely, by few points, whether a turn is worth measuring."""
         return self.rough_distance(R) <= _COARSE
 
-    def deviation(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-        """The 98th percentile of the distance to the surface, both ways."""
-        return torch.maximum(self._one_way(R), self._one_way(R.mT))
+    def deviation(
+        self, R: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch"]:
+        """The 98th percentile of the distance to the surface, both ways.
 
-    def _one_way(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-        moved = self.many @ R.mT
+        Args:
+            R: turns about the centre of the surface.
+            shift: after the turn, in diameters.
+        """
+        turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
+        return torch.maximum(self._one_way(turn), self._one_way(turn.inverse()))
+
+    def _one_way(self, turn: Rigid) -> Float[Tensor, "*batch"]:
+        moved = self.many @ turn.R.mT + turn.t_m[..., None, :]
         distance, index = self.nearest(moved)
         gap = moved.numpy() - self.points.numpy()[index]
         height = np.abs((gap * self._normals[index]).sum(-1))
@@ -111,11 +119,11 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
-    surface = _Surface(model)
+    surface = SurfaceDeviation(model)
     limit = 2 * tolerance
     found: list[SymmetryProposal] = []
     tried: list[Tensor] = []
-    for R in _promising_turns(surface):
+    for R in promising_turns(surface):
         revolved = [p.axis.direction for p in found if p.kind == "continuous"]
         if len(revolved) >= 2 or len(tried) >= _MOST_AXES:
             break
@@ -172,7 +180,7 @@ def with_found_symmetries(
     if not (is_taken or tell) or not model.symmetries.is_none:
         return model
     proposals = propose_symmetries(model, tolerance)
-    found = symmetries_from_proposals(proposals)
+    found = replace(symmetries_from_proposals(proposals), is_found=True)
     if found.is_none:
         return model
     turns = 0 if found.discrete is None else len(found.discrete.R)
@@ -229,7 +237,7 @@ def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[
     return turn_about(direction, torch.zeros_like(direction), angles).R
 
 
-def _promising_turns(surface: _Surface) -> list[Float[Tensor, "3 3"]]:
+def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     """Try turns about principal axes and many directions; those that fit, the best first."""
     spread = surface.points.T @ surface.points
     candidates = torch.cat([torch.linalg.eigh(spread).eigenvectors.T, fibonacci_directions(400)])
@@ -248,7 +256,7 @@ def _is_known(direction: Tensor, tried: list[Tensor], revolved: list[Tensor]) ->
 
 
 def _measure(
-    surface: _Surface, direction: Tensor, limit: float, tolerance: float
+    surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
     """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12.
 
@@ -278,7 +286,7 @@ def _measure(
     return found + kept
 
 
-def _follow(surface: _Surface, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def _follow(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """Let the turned surface slide onto the surface (ICP about the fixed centre)."""
     points = surface.many
     weight = torch.ones(2 * len(points), dtype=torch.float64)

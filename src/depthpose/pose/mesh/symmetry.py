@@ -59,6 +59,8 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
 
+    ``symmetries_found`` is our own word: true where they were found in the geometry.
+
     Args:
         info: an object's entry of ``models_info.json``.
         source: what to call it in errors.
@@ -71,10 +73,12 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
         raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
     matrices = [_rigid_from_bop(row, source) for row in turns]
     axes = tuple(_axis_from_bop(entry, source) for entry in lines)
+    is_found = info.get("symmetries_found", False) is True
     if not matrices:
-        return Symmetries(continuous=axes)
+        return Symmetries(continuous=axes, is_found=is_found)
     stacked = torch.stack(matrices)
-    return Symmetries(discrete=Rigid(stacked[:, :3, :3], stacked[:, :3, 3]), continuous=axes)
+    discrete = Rigid(stacked[:, :3, :3], stacked[:, :3, 3])
+    return Symmetries(discrete=discrete, continuous=axes, is_found=is_found)
 
 
 def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
@@ -89,6 +93,8 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
             {"axis": axis.direction.tolist(), "offset": (1000 * axis.point_m).tolist()}
             for axis in symmetries.continuous
         ]
+    if symmetries.is_found and info:
+        info["symmetries_found"] = True
     return info
 
 

@@ -18,6 +18,7 @@ from depthpose.pose.predictions.records import prediction_row as prediction_row
 from depthpose.pose.predictions.records import read_predictions as read_predictions
 from depthpose.pose.predictions.records import score_of as score_of
 from depthpose.pose.predictions.records import write_predictions as write_predictions
+from depthpose.pose.predictions.results import alternatives_name as alternatives_name
 from depthpose.pose.predictions.results import read_bop_results as read_bop_results
 from depthpose.pose.predictions.results import results_name as results_name
 from depthpose.pose.predictions.results import write_bop_results as write_bop_results

@@ -14,7 +14,7 @@ from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import Instance
 from depthpose.pose.bop.parse import integer, number, read_rows
-from depthpose.pose.types import PoseEstimate, Status
+from depthpose.pose.types import Alternative, PoseEstimate, Status
 
 POSES = "poses.json"
 PICTURE, CLOUD = "pose.png", "pose.ply"
@@ -89,10 +89,12 @@ def read_predictions(folder: Path) -> list[Prediction]:
 
 
 def score_of(estimate: PoseEstimate) -> float:
-    """Say how sure an estimate is, 0..1: the chance of being right, where its risk is known.
+    """Say how sure an estimate is, 0..1: the chance of being right, where it is known.
 
     Else the share of the votes that agree, or 1 where nothing is said.
     """
+    if estimate.certainty is not None:
+        return estimate.certainty
     if estimate.risk is not None:
         return 1 - estimate.risk
     return 1.0 if estimate.inlier_share is None else estimate.inlier_share
@@ -109,10 +111,18 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    for name in ("inlier_share", "residual_m", "risk"):
+    for name in ("inlier_share", "residual_m", "risk", "certainty"):
         value: float | None = getattr(estimate, name)
         # JSON has no infinity, and nothing near the surface is no distance.
         row[name] = value if value is not None and math.isfinite(value) else None
+    row["alternatives"] = [
+        {
+            "camera_from_model": _matrix(other.camera_from_model),
+            "probability": other.probability,
+            "difference": other.difference,
+        }
+        for other in estimate.alternatives
+    ]
     return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
 
 
@@ -153,6 +163,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         inlier_share=_optional(row, "inlier_share", source),
         residual_m=_optional(row, "residual_m", source),
         risk=_optional(row, "risk", source),
+        certainty=_optional(row, "certainty", source),
+        alternatives=_alternatives(row.get("alternatives", []), source),
         signals=_named(row, "signals", source),
         seconds=_named(row, "seconds", source),
     )
@@ -181,6 +193,21 @@ def _pose(entry: object, source: str) -> Rigid | None:
             "metres, and 0 0 0 1 below"
         )
     return Rigid(R.clone(), matrix[:3, 3].clone())
+
+
+def _alternatives(entries: object, source: str) -> tuple[Alternative, ...]:
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
+    found: list[Alternative] = []
+    for k, entry in enumerate(entries):
+        where = f"{source}: alternative {k}"
+        pose = _pose(entry.get("camera_from_model"), where)
+        if pose is None:
+            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
+        probability = number(entry, "probability", None, where)
+        words = str(entry.get("difference", ""))
+        found.append(Alternative(camera_from_model=pose, probability=probability, difference=words))
+    return tuple(found)
 
 
 def _table(row: dict[str, Any], key: str, width: int, source: str) -> Tensor | None:

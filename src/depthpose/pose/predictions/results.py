@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from depthpose.core.errors import InputError
@@ -41,8 +42,22 @@ def read_bop_results(path: Path) -> list[Prediction]:
     return found
 
 
-def write_bop_results(path: Path, predictions: Iterable[Prediction]) -> None:
+def alternatives_name(dataset: BopDataset) -> str:
+    """Name the csv that holds alternatives too: ``depthpose-alternatives_DATASET-SPLIT.csv``."""
+    return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
+
+
+def write_bop_results(
+    path: Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
+) -> None:
     """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
+
+    Args:
+        path: the csv.
+        predictions: of a data set.
+        with_alternatives: give each alternative a row too, its probability the score. BOP's
+            measures take the surest rows of an image, so they are no row of the csv that is
+            measured.
 
     Raises:
         InputError: a pose belongs to no scene, or the disk refuses.
@@ -54,7 +69,26 @@ def write_bop_results(path: Path, predictions: Iterable[Prediction]) -> None:
             image = prediction.place[:2]
             spent = sum(prediction.estimate.seconds.values())
             seconds[image] = seconds.get(image, 0.0) + spent
-    write_results(path, [_result(p, seconds) for p in known if p.estimate.is_ok])
+    answered = [p for p in known if p.estimate.is_ok]
+    if with_alternatives:
+        answered = [other for p in answered for other in [p, *_others(p)]]
+    write_results(path, [_result(p, seconds) for p in answered])
+
+
+def _others(prediction: Prediction) -> list[Prediction]:
+    """Give each alternative as a prediction of its own."""
+    return [
+        replace(
+            prediction,
+            estimate=replace(
+                prediction.estimate,
+                camera_from_model=other.camera_from_model,
+                certainty=other.probability,
+                alternatives=(),
+            ),
+        )
+        for other in prediction.estimate.alternatives
+    ]
 
 
 def _result(prediction: Prediction, seconds: dict[tuple[int, int], float]) -> BopResult:

@@ -33,7 +33,8 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     if config.number == 0:
         return weights
     min_hold = weights.refusal.min_hold
-    opened = RefusalConfig(max_risk=1.0, min_hold=min_hold)
+    slopes = weights.refusal.candidate_slopes
+    opened = RefusalConfig(max_risk=1.0, min_hold=min_hold, candidate_slopes=slopes)
     open_weights = dataclasses.replace(weights, refusal=opened)
     views = dataclasses.replace(
         made,
@@ -55,7 +56,8 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
         refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
     except InputError:
         return weights
-    return dataclasses.replace(weights, refusal=dataclasses.replace(refusal, min_hold=min_hold))
+    refusal = dataclasses.replace(refusal, min_hold=min_hold, candidate_slopes=slopes)
+    return dataclasses.replace(weights, refusal=refusal)
 
 
 def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:

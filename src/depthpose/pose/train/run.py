@@ -12,10 +12,13 @@ from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.loop import Progress, run_files
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.pose.config import CloudConfig, RefusalConfig
+from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.train.config import FramesConfig
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import AnyNetwork, PoseWeights
 
+_SAID = 3
+"""Turns of an object that look nearly alike, on a card."""
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Knobs of the loop that change no weight: a resumed run may have others."""
 
@@ -102,9 +105,11 @@ def packed(
 
 
 def card_facts(weights: PoseWeights) -> dict[str, str]:
-    """Put before the facts of weights the objects that they know, and their sizes."""
+    """Put before the facts of weights their objects, sizes, and turns that look nearly alike."""
     known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
-    return {"objects": known, **weights.facts}
+    lines = {model.name: near_symmetry_lines(model) for model in weights.models}
+    near = "; ".join(f"{name}: {', '.join(some[:_SAID])}" for name, some in lines.items() if some)
+    return {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
 
 
 def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401

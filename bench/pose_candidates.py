@@ -1,0 +1,112 @@
+"""How likely each of several poses is that fit: slopes by made views, and how honest they are.
+
+    python bench/pose_candidates.py --weights linemod.safetensors bunny.safetensors parts ycb
+
+Made views of all objects, three in ten unoccluded, the others hidden by up to a half. Every
+candidate is compared with the truth by ADD; copies count as right where a declared symmetry, or
+one that was found and is exact to 1 % of the diameter, says so. Cases are views with several
+candidates one of which is right below 10 % of the diameter. Slopes are fitted on four fifths and
+judged on the other, five times; those of all are printed last.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.report import markdown_table
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import ObjectsConfig, RefusalConfig
+from depthpose.pose.estimator import GeoPoseNet, fit_candidate_slopes
+from depthpose.pose.estimator.alternatives import Copies, find_copies, share_out
+from depthpose.pose.objects import Objects
+from depthpose.pose.types import PoseEstimate
+from depthpose.pose.weights import read_pose_weights
+
+SEED = 0xCA5E
+BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.01))
+Case = tuple[list[dict[str, float]], int]
+
+
+def add_of(pose: Rigid, truth: Rigid, copies: Copies) -> float:
+    """ADD in diameters to the nearest true copy."""
+    double = Rigid(truth.R.double(), truth.t_m.double()) @ copies.same
+    there_m = Rigid(pose.R.double(), pose.t_m.double()).apply(copies.points_m)
+    gap_m = there_m - double.apply(copies.points_m.expand(len(double.R), -1, -1))
+    return float(gap_m.norm(dim=-1).mean(-1).min()) / copies.diameter_m
+
+
+def case_of(found: PoseEstimate, truth: Rigid, copies: Copies) -> Case | None:
+    """Give the signals of all candidates and which is right, where one of several is."""
+    if found.camera_from_model is None or not found.alternatives:
+        return None
+    poses = [found.camera_from_model, *(a.camera_from_model for a in found.alternatives)]
+    errors = [add_of(pose, truth, copies) for pose in poses]
+    right = min(range(len(errors)), key=errors.__getitem__)
+    signals = [found.signals, *(a.signals for a in found.alternatives)]
+    return (signals, right) if errors[right] < 0.1 else None
+
+
+def cases_of(name: str, number: int) -> tuple[list[Case], int]:
+    """Pose made views of the objects of weights, all candidates alike, nothing refused."""
+    weights = read_pose_weights(find_weights(name))
+    even = dict.fromkeys(RefusalConfig().candidate_slopes, 0.0)
+    opened = RefusalConfig(max_risk=1.0, candidate_slopes=even)
+    net = GeoPoseNet(dataclasses.replace(weights, refusal=opened))
+    made = ObjectsConfig(
+        number=number * len(weights.models), seed=SEED, views=None, resolution=(1.0, 1.0),
+        occluded_share=0.7, occlusion=(0.0, 0.5),
+    )  # fmt: skip
+    views = Objects(weights.models, made, weights.cloud)
+    copies = [find_copies(model, up_to_symmetry=False) for model in weights.models]
+    found: list[Case | None] = []
+    for k in range(len(views)):
+        view = views[k]
+        estimate = net.estimate_many([view.input])[0]
+        truth = view.truth.camera_from_model
+        found.append(case_of(estimate, truth, copies[k % len(weights.models)]))
+    return [case for case in found if case is not None], len(views)
+
+
+def judge(cases: Sequence[Case]) -> list[tuple[float, bool]]:
+    """Give the largest share of each case and whether it is the right one's, cross-validated."""
+    pairs: list[tuple[float, bool]] = []
+    for fold in range(5):
+        slopes = fit_candidate_slopes([c for k, c in enumerate(cases) if k % 5 != fold])
+        for signals, right in cases[fold::5]:
+            shares = share_out(signals, slopes)
+            pairs.append((float(shares.max()), int(shares.argmax()) == right))
+    return pairs
+
+
+def main() -> None:
+    """Print how honest the shares are, and the slopes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--weights", nargs="+", default=["parts", "ycb"])
+    parser.add_argument("--number", type=int, default=12, help="views of each object")
+    words = parser.parse_args()
+    torch.set_num_threads(1)
+    every: list[Case] = []
+    for name in words.weights:
+        cases, views = cases_of(name, words.number)
+        every += cases
+        first = sum(right == 0 for _, right in cases)
+        print(f"{name}: {views} views, {len(cases)} cases, ICP's best right in {first}")
+    pairs = judge(every)
+    rows = []
+    for low, high in BANDS:
+        some = [ok for share, ok in pairs if low <= share < high]
+        said = [share for share, _ in pairs if low <= share < high]
+        rows.append({
+            "largest share": f"{low:g} to {min(high, 1):g}", "cases": len(some),
+            "mean share": sum(said) / len(said) if said else None,
+            "right": sum(some) / len(some) if some else None,
+        })  # fmt: skip
+    print(markdown_table(rows))
+    print({name: round(value, 2) for name, value in fit_candidate_slopes(every).items()})
+
+
+if __name__ == "__main__":
+    main()

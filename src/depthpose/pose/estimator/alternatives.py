@@ -1,0 +1,267 @@
+"""Other poses that fit: where they come from, how likely each is, and how it differs in words."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.config import IcpConfig
+from depthpose.pose.estimator.evidence import disagreement, log_signal, surface_signals
+from depthpose.pose.estimator.prepare import Voted
+from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
+from depthpose.pose.mesh import true_symmetries as find_true
+from depthpose.pose.refine import refine_pose
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import Alternative, ObjectModel
+
+_SAME = 0.1
+"""Mean distance of the model's points at two poses, in diameters, up to which they are one."""
+_NAMED = 0.02
+"""Candidates of a smaller share are not named."""
+_STEP = math.pi / 16
+_ICP_POINTS = 250
+"""Of the cloud, by which candidates slide."""
+_POINTS = 100
+_ALONG = math.cos(math.radians(15))
+_LONGER = 1.15
+"""An axis is the longest or shortest where it differs by so much from the next."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Copies:
+    """How a model may be confused with itself.
+
+    Attributes:
+        same: ``model_from_model`` of the copies that are one answer, the identity first.
+        near: of those that are another answer and look nearly alike.
+        trained: of those that the network was taught to take for one, the identity first.
+        points_m: of the model, by which poses are compared.
+        middle_m: of its box.
+        axes: rows: its principal axes, from the longest.
+        lengths_m: its extent along each.
+        diameter_m: of the model.
+    """
+
+    same: Rigid
+    near: Rigid
+    trained: Rigid
+    points_m: Float64[Tensor, "n 3"]
+    middle_m: Float64[Tensor, "3"]
+    axes: Float64[Tensor, "3 3"]
+    lengths_m: Float64[Tensor, "3"]
+    diameter_m: float
+
+
+class Candidate(NamedTuple):
+    """A pose that may be the right one, its covariance and what distance is left [m]."""
+
+    pose: Rigid
+    covariance: Float[Tensor, "6 6"]
+    residual_m: float
+
+
+def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> Copies:
+    """Search a model for its near-symmetries, or count them as one answer with the true ones.
+
+    Args:
+        model: the object.
+        up_to_symmetry: copies that look nearly alike are one answer.
+    """
+    points_m = sample_surface(model, 2000)[0].double()
+    near = [one.model_from_model for one in near_symmetries(model)]
+    turns = (
+        _stacked(near) if near else Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
+    )
+    same = symmetry_transforms(find_true(model), _STEP)
+    same = Rigid(same.R.double(), same.t_m.double())
+    if up_to_symmetry:
+        every = symmetry_transforms(model.symmetries, _STEP)
+        same = _joined([same, Rigid(every.R.double(), every.t_m.double()), turns])
+        turns = Rigid(turns.R[:0], turns.t_m[:0])
+    trained = symmetry_transforms(model.symmetries, 2 * _STEP)
+    offset_m = points_m - points_m.mean(0)
+    axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
+    along_m = points_m @ axes.T
+    return Copies(
+        same=same,
+        near=turns,
+        trained=Rigid(trained.R.double(), trained.t_m.double()),
+        points_m=take_evenly(points_m, _POINTS),
+        middle_m=(points_m.amin(0) + points_m.amax(0)) / 2,
+        axes=axes,
+        lengths_m=along_m.amax(0) - along_m.amin(0),
+        diameter_m=model.diameter_m,
+    )
+
+
+def near_symmetry_lines(model: ObjectModel) -> list[str]:
+    """Say after which turns a model looks nearly as before, and by how much it deviates."""
+    copies = find_copies(model, up_to_symmetry=False)
+    here = Rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    return [
+        f"{difference_of(one.model_from_model, here, copies)} ({one.deviation:.1%})"
+        for one in near_symmetries(model)
+    ]
+
+
+def find_candidates(
+    cloud_m: Float[Tensor, "n 3"],
+    best: Candidate,
+    others: Rigid,
+    copies: Copies,
+    surface: Surface,
+    config: IcpConfig | None,
+) -> list[Candidate]:
+    """Refine the poses at which ICP ended elsewhere and the nearly symmetric copies of the best.
+
+    Args:
+        cloud_m: of the object, in the camera frame.
+        best: the pose that was found.
+        others: at which other starts of ICP ended.
+        copies: of the model.
+        surface: of the model.
+        config: of ICP; None: the copies stay where they are.
+
+    Returns:
+        The best first, then those that are other poses than it and than each other.
+    """
+    starts = _joined([others, best.pose @ copies.near])
+    kept = [best]
+    if len(starts.R) == 0:
+        return kept
+    for one in _refined(cloud_m, starts, best, surface, config):
+        if not any(is_same_pose(one.pose, other.pose, copies) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _refined(
+    cloud_m: Float[Tensor, "n 3"],
+    starts: Rigid,
+    best: Candidate,
+    surface: Surface,
+    config: IcpConfig | None,
+) -> list[Candidate]:
+    """Let starts slide, all at once; those that meet nothing are left out."""
+    if config is None:
+        return [best._replace(pose=Rigid(R, t_m))
+                for R, t_m in zip(starts.R, starts.t_m, strict=True)]  # fmt: skip
+    short = replace(
+        config,
+        iterations=(config.iterations + 1) // 2,
+        cloud_points=min(_ICP_POINTS, config.cloud_points),
+    )
+    found = refine_pose(cloud_m.double(), starts, surface, short)
+    pose = found.camera_from_model
+    return [
+        Candidate(Rigid(pose.R[k], pose.t_m[k]), found.covariance[k], float(found.residual_m[k]))
+        for k in range(len(starts.R))
+        if float(found.inlier_share[k]) > 0
+    ]
+
+
+def is_same_pose(first: Rigid, second: Rigid, copies: Copies, limit: float = _SAME) -> bool:
+    """Whether two poses, or a copy of one that counts as it, carry the model to one place."""
+    every = second @ copies.same
+    gap_m = first.apply(copies.points_m) - every.apply(copies.points_m.expand(len(every.R), -1, -1))
+    return float(gap_m.norm(dim=-1).mean(-1).min()) < limit * copies.diameter_m
+
+
+def evidence_of(
+    voted: Voted, pose: Rigid, model: ObjectModel, copies: Copies, surface: Surface
+) -> dict[str, float]:
+    """Give the signals by which candidates are compared.
+
+    The directions are compared with those to the nearest copy that the network could not learn to
+    tell from the pose: which one it points at is chance.
+    """
+    every = (pose @ copies.trained).apply(
+        model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
+    )
+    return {
+        **surface_signals(voted.cloud.cloud_m, pose, surface),
+        "disagree": min(disagreement(voted.cloud, voted.outputs, one) for one in every),
+    }
+
+
+def share_out(
+    candidates: Sequence[Mapping[str, float]], slopes: Mapping[str, float]
+) -> Float64[Tensor, " b"]:
+    """Share the probability of one among candidates: ``exp(-sum slope log(0.01 + signal))``."""
+    odds = [-sum(k * log_signal(one[name]) for name, k in slopes.items()) for one in candidates]
+    return torch.tensor(odds, dtype=torch.float64).softmax(0)
+
+
+def alternatives_among(
+    candidates: Sequence[Candidate],
+    evidence: Sequence[dict[str, float]],
+    shares: Float64[Tensor, " b"],
+    copies: Copies,
+) -> tuple[Alternative, ...]:
+    """Name the candidates beside the best, the likeliest first; unlikely ones are left out.
+
+    Their probabilities are shares of one, in which the best has its own.
+    """
+    best, *order = shares.argsort(descending=True, stable=True).tolist()
+    pose = candidates[best].pose
+    return tuple(
+        Alternative(
+            camera_from_model=Rigid(other.R.float(), other.t_m.float()),
+            probability=float(shares[k]),
+            difference=difference_of(other, pose, copies),
+            signals=evidence[k],
+        )
+        for k in order
+        for other in [candidates[k].pose]
+        if float(shares[k]) >= _NAMED
+    )
+
+
+def difference_of(pose: Rigid, from_pose: Rigid, copies: Copies) -> str:
+    """Say how a pose differs from another: by which turn about which axis of the model."""
+    turn = from_pose.R.double().mT @ pose.R.double()
+    angle = math.degrees(float(geodesic_rad(turn, torch.eye(3, dtype=torch.float64))))
+    middle_m = copies.middle_m[None]
+    shift_m = float((pose.apply(middle_m) - from_pose.apply(middle_m)).norm())
+    words = f"turned by {angle:.0f} degrees about {_axis_words(turn, copies)}"
+    if shift_m > _SAME / 2 * copies.diameter_m:
+        words += f" and shifted by {1000 * shift_m:.0f} mm"
+    return words
+
+
+def _axis_words(turn: Float64[Tensor, "3 3"], copies: Copies) -> str:
+    axis = _axis_of(turn)
+    lengths = copies.lengths_m
+    names = {}
+    if lengths[0] > _LONGER * lengths[1]:
+        names[0] = "the long axis"
+    if lengths[1] > _LONGER * lengths[2]:
+        names[2] = "the short axis"
+    if len(names) == 2:  # then the one between is known too
+        names[1] = "the middle axis"
+    for k, name in names.items():
+        if abs(float(copies.axes[k] @ axis)) > _ALONG:
+            return name
+    x, y, z = (round(value, 2) + 0.0 for value in axis.tolist())  # no -0.00
+    return f"the model's axis ({x:.2f}, {y:.2f}, {z:.2f})"
+
+
+def _axis_of(R: Float64[Tensor, "3 3"]) -> Float64[Tensor, "3"]:
+    """The direction that a rotation leaves alone, of the sign of a turn by up to 180 degrees."""
+    axis = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype)).Vh[-1]
+    skew = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return axis if float(axis @ skew) >= 0 else -axis
+
+
+def _stacked(poses: Sequence[Rigid]) -> Rigid:
+    return Rigid(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
+
+
+def _joined(poses: Sequence[Rigid]) -> Rigid:
+    return Rigid(torch.cat([p.R for p in poses]), torch.cat([p.t_m for p in poses]))

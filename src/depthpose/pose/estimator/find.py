@@ -1,0 +1,235 @@
+"""Known objects in a depth image without a mask: regions, questions, and answers that agree."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from depthpose.core.camera import back_project, project
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import RefusalConfig
+from depthpose.pose.estimator.alternatives import share_out
+from depthpose.pose.regions import extent_m, find_regions, part_cloud
+from depthpose.pose.surface import NEAR, Surface, prepare_surface
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+
+_SMALLEST, _LARGEST = 0.25, 1.25
+"""Shares of an object's diameter between which the extent of a region may lie."""
+_TOGETHER = 1.1
+"""Two regions may be parts of one object where together they are no longer than this."""
+_MOST_PAIRS = 20
+_CRUMB = 0.03
+"""A region of fewer points than this share of another adds nothing to it."""
+_HIDDEN = 0.5
+"""Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
+_REST = 0.25
+"""A region of which so large a share is unexplained is asked again without the rest."""
+_LEAST_POINTS = 60
+_SHARED = 0.3
+"""Answers that explain so large a share of the same points are of one thing; one of them stays."""
+_SEEN_THROUGH = 0.2
+"""Where the camera saw through more of the posed surface, there is no such object."""
+_SUNK = 0.1
+"""Where a table or wall lies before more of the posed surface, there is no such object."""
+_WHOLE = 0.96
+"""An answer explains so much of its region, or leaves enough of it for another object: what has a
+little more to it than the object is another thing."""
+
+EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Known:
+    """What is looked for.
+
+    Attributes:
+        models: the objects, by name.
+        surface_of: gives the surface of an object by its name.
+        refusal: how its candidates are compared.
+        estimate_many: clouds to poses.
+    """
+
+    models: Mapping[str, ObjectModel]
+    surface_of: Callable[[str], Surface]
+    refusal: RefusalConfig
+    estimate_many: EstimateMany
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Scene:
+    """A view, and which of its pixels show a plane that was taken away."""
+
+    view: ViewInput
+    is_plane: Bool[Tensor, "h w"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Answer:
+    """An answer for a region, and which of all readings it explains."""
+
+    estimate: PoseEstimate
+    points_m: Float[Tensor, "n 3"]
+    explained: Tensor
+    share: float
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether what it leaves of its region is nothing, or something of its own."""
+        explained = float(self.explained.double().mean())
+        return explained >= _WHOLE or explained <= 1 - _REST
+
+    @property
+    def worth(self) -> float:
+        """How sure it is, and how much it explains: of two that are equally sure the larger."""
+        risk = 0.0 if self.estimate.risk is None else self.estimate.risk
+        return (1 - risk) * self.share * float(self.explained.double().mean())
+
+
+def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
+    """Pose every known object that a depth image shows, the surest first; what is none is left out.
+
+    Regions are asked for every object whose size they may have; so are pairs of them that may be
+    parts of one object, and parts of one that is too long. Where several objects answer they share
+    the probability of one by what speaks against each. What an answer leaves unexplained of its
+    region is asked once more. An answer is left out through whose surface the camera saw, or that
+    lies behind a plane that was seen, or that explains not quite all of its region; of answers that
+    explain the same points the best stays.
+
+    Args:
+        view: depth and camera; its mask limits where is looked.
+        known: what for.
+    """
+    largest_m = max(model.diameter_m for model in known.models.values())
+    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
+    regions, is_plane = find_regions(depth_m, view.K, largest_m)
+    clouds = [*regions, *_pairs(regions, largest_m), *_parts(regions, largest_m)]
+    scene = _Scene(view=view, is_plane=is_plane)
+    answers = _ask(clouds, scene, known)
+    rest = [answer.points_m[~answer.explained] for answer in answers]
+    again = [cloud for cloud, answer in zip(rest, answers, strict=True)
+             if len(cloud) >= max(_LEAST_POINTS, _REST * len(answer.points_m))]  # fmt: skip
+    answers += _ask(again, scene, known)
+    kept = _without_overlap([a for a in answers if a.is_whole], known)
+    return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
+
+
+def _pairs(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
+    """Join regions that may be two parts of one object, something before it or a thin place."""
+    joined: list[Tensor] = []
+    for a, first in enumerate(clouds):
+        for second in clouds[a + 1 :]:
+            apart_m = float((first.median(0).values - second.median(0).values).norm())
+            if apart_m > largest_m or len(second) < _CRUMB * len(first):
+                continue
+            both = torch.cat([first, second])
+            if extent_m(both) <= _TOGETHER * largest_m:
+                joined.append(both)
+    return joined[:_MOST_PAIRS]
+
+
+def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
+    """Split regions that are too long for one object."""
+    parts: list[Tensor] = []
+    for cloud in clouds:
+        times = extent_m(cloud) / largest_m
+        if _LARGEST < times < math.inf:
+            parts += part_cloud(cloud, min(4, 1 + round(times)))
+    return [part for part in parts if len(part) >= _LEAST_POINTS]
+
+
+def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
+    """Ask every cloud for every object of its size; give the best answer of each cloud."""
+    asked: list[tuple[int, CloudInput]] = []
+    for k, cloud in enumerate(clouds):
+        size_m = extent_m(cloud)
+        asked += [
+            (k, CloudInput(name=f"{scene.view.name}_{k}", points_m=cloud, object=name))
+            for name, model in known.models.items()
+            if _SMALLEST * model.diameter_m <= size_m <= _LARGEST * model.diameter_m
+        ]
+    found = known.estimate_many([given for _, given in asked]) if asked else []
+    of_cloud: dict[int, list[PoseEstimate]] = {}
+    for (k, _), estimate in zip(asked, found, strict=True):
+        if estimate.is_ok and _is_possible(scene, estimate, known):
+            of_cloud.setdefault(k, []).append(estimate)
+    return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
+
+
+def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: Known) -> _Answer:
+    """Choose among objects that answered for one cloud; the others lower its certainty."""
+    slopes = known.refusal.candidate_slopes
+    shares = share_out([estimate.signals for estimate in some], slopes)
+    number = int(shares.argmax())
+    share, estimate = float(shares[number]), some[number]
+    certainty = None if estimate.certainty is None else share * estimate.certainty
+    others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
+    pose = estimate.camera_from_model
+    assert pose is not None
+    return _Answer(
+        estimate=replace(estimate, certainty=certainty, alternatives=others),
+        points_m=cloud,
+        explained=_is_explained(cloud, pose, known.surface_of(estimate.object)),
+        share=share,
+    )
+
+
+def _is_explained(cloud: Tensor, pose: Rigid, surface: Surface) -> Tensor:
+    local_m = Rigid(pose.R.double(), pose.t_m.double()).inverse().apply(cloud.double())
+    distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
+    return distance_m < NEAR * surface.diameter_m
+
+
+def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a depth image whose points lie on a posed object."""
+    points_m = back_project(view.depth_m.double(), view.K.double())
+    is_read = points_m.isfinite().all(-1) & view.mask
+    near = is_read.clone()
+    middle_m = pose.apply(model.vertices_m.mean(0, keepdim=True).to(pose.R)).double()
+    near[is_read] = (points_m[is_read] - middle_m).norm(dim=-1) < model.diameter_m
+    explained = torch.zeros_like(near)
+    if bool(near.any()):
+        explained[near] = _is_explained(points_m[near], pose, prepare_surface(model))
+    return explained
+
+
+def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
+    """Whether the camera saw enough of the surface, not through it, and no plane before it."""
+    pose = estimate.camera_from_model
+    assert pose is not None
+    if estimate.signals["unseen"] > _HIDDEN:
+        return False
+    surface = known.surface_of(estimate.object)
+    posed_m = Rigid(pose.R.double(), pose.t_m.double()).apply(surface.points_m)
+    u, v = project(posed_m, scene.view.K.double()).round().long().unbind(-1)
+    height, width = scene.view.depth_m.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (posed_m[:, 2] > 0)
+    u, v = u[inside], v[inside]
+    behind_m = scene.view.depth_m.double()[v, u] - posed_m[inside, 2]
+    behind_m = torch.where(scene.view.depth_m[v, u] > 0, behind_m, torch.nan)
+    read = behind_m.isfinite()
+    if not bool(read.any()):
+        return False
+    limit_m = NEAR * surface.diameter_m
+    through = (behind_m > limit_m)[read].double().mean()
+    sunk = (scene.is_plane[v, u] & (behind_m < -limit_m))[read].double().mean()
+    return float(through) <= _SEEN_THROUGH and float(sunk) <= _SUNK
+
+
+def _without_overlap(answers: Sequence[_Answer], known: Known) -> list[_Answer]:
+    """Keep answers from the best down that explain points which none before does."""
+    kept: list[_Answer] = []
+    for answer in sorted(answers, key=lambda a: -a.worth):
+        own = answer.points_m[answer.explained]
+        if len(own) == 0:
+            continue
+        taken = torch.zeros(len(own), dtype=torch.bool)
+        for other in kept:
+            pose = other.estimate.camera_from_model
+            assert pose is not None
+            taken |= _is_explained(own, pose, known.surface_of(other.estimate.object))
+        if float(taken.double().mean()) < _SHARED:
+            kept.append(answer)
+    return kept

@@ -1,0 +1,179 @@
+"""A depth image without masks to regions that may each be one object, its planes taken away."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.camera import back_project
+
+_TOLERANCE_M = 0.004
+_TOLERANCE_PER_M = 0.003
+"""Points lie on a plane up to 4 mm, and 3 mm for the square of their depth in metres: a Kinect's
+noise grows so."""
+_JUMP_M = 0.004
+_JUMP_PER_M = 0.012
+"""Neighbours are of one region up to this difference in depth, and this share of it."""
+_PLANES = 6
+_HYPOTHESES = 400
+_SAMPLE = 4000
+_LEAST_SHARE = 0.04
+"""Of the readings: a plane of fewer is no table or wall."""
+_WIDER = 1.3
+"""A plane is wider than the largest object by so much, or it may be a side of one."""
+_LEAST_PIXELS = 60
+_MOST_REGIONS = 40
+
+
+def find_regions(
+    depth_m: Float[Tensor, "h w"],
+    K: Float[Tensor, "3 3"],
+    largest_m: float,
+    seed: int = 0,
+) -> tuple[list[Float[Tensor, "_ 3"]], Bool[Tensor, "h w"]]:
+    """Take dominant planes away and part what is left where its depth jumps.
+
+    Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted. One that
+    is hardly wider than the largest object is kept: it may be a side of it.
+
+    Args:
+        depth_m: along the optical axis; NaN where there is no reading.
+        K: intrinsic matrix.
+        largest_m: diameter of the largest object.
+        seed: of RANSAC.
+
+    Returns:
+        The points of each region in the camera frame, the largest first, 40 at most; and which
+        pixels show a plane that was taken away.
+    """
+    points_m = back_project(depth_m.double(), K.double())
+    is_left = points_m.isfinite().all(-1) & (depth_m > 0)
+    is_plane = torch.zeros_like(is_left)
+    total = int(is_left.sum())
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(_PLANES):
+        plane = _largest_plane(points_m[is_left], generator)
+        if plane is None:
+            break
+        near = _is_on(points_m, plane) & is_left
+        on_m = points_m[near]
+        if len(on_m) < _LEAST_SHARE * total or _width_m(on_m) < _WIDER * largest_m:
+            break
+        is_left &= ~near
+        is_plane |= near
+    label = label_regions(depth_m, is_left)
+    pixels = torch.bincount(label[is_left], minlength=1) if bool(is_left.any()) else torch.zeros(1)
+    order = pixels.argsort(descending=True, stable=True)[:_MOST_REGIONS]
+    wanted = [int(k) for k in order if int(pixels[k]) >= _LEAST_PIXELS]
+    return [points_m[is_left & (label == k)].float() for k in wanted], is_plane
+
+
+def label_regions(
+    depth_m: Float[Tensor, "h w"], is_left: Bool[Tensor, "h w"]
+) -> Int64[Tensor, "h w"]:
+    """Number the pixels that hang together: neighbours, at corners too, without a jump in depth.
+
+    Args:
+        depth_m: of each pixel.
+        is_left: the pixels that count; what is beside them has the number of a region of its own.
+    """
+    height, width = depth_m.shape
+    index = torch.arange(height * width).reshape(height, width)
+    rows, columns = [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a, b = _beside(index, down, right)
+        z_a, z_b = _beside(depth_m, down, right)
+        both = torch.logical_and(*_beside(is_left, down, right))
+        joined = both & ((z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b))
+        rows.append(a[joined])
+        columns.append(b[joined])
+    a, b = torch.cat(rows).numpy(), torch.cat(columns).numpy()
+    size = height * width
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
+    return (
+        torch.from_numpy(connected_components(graph, directed=False)[1])
+        .long()
+        .reshape(height, width)
+    )
+
+
+def part_cloud(points_m: Float[Tensor, "n 3"], count: int) -> list[Float[Tensor, "_ 3"]]:
+    """Split a cloud that is too large for one object into parts of points near to each other.
+
+    Lloyd's k-means from farthest points.
+    """
+    some = take_evenly(points_m, 2000)
+    middles = some[:1]
+    for _ in range(count - 1):
+        middles = torch.cat([middles, some[torch.cdist(some, middles).amin(1).argmax()][None]])
+    for _ in range(10):
+        label = torch.cdist(some, middles).argmin(1)
+        middles = torch.stack(
+            [some[label == k].mean(0) if (label == k).any() else middles[k] for k in range(count)]
+        )
+    label = torch.cdist(points_m, middles).argmin(1)
+    return [points_m[label == k] for k in range(count)]
+
+
+def extent_m(points_m: Float[Tensor, "n 3"]) -> float:
+    """Say how long a cloud is: twice the distance from its median that 95 % stay within."""
+    distance = (points_m - points_m.median(0).values).norm(dim=-1)
+    return 2 * float(distance.quantile(0.95)) if len(distance) < 2**20 else math.inf
+
+
+def _beside(grid: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
+    """Give each pixel and its neighbour so many rows down and columns to the right."""
+    height, width = grid.shape
+    left = max(0, -right)
+    first = grid[: height - down, left : width - max(0, right)]
+    second = grid[down:, left + right : width - max(0, right) + right]
+    return first, second
+
+
+def _largest_plane(
+    points_m: Float64[Tensor, "n 3"], generator: torch.Generator
+) -> tuple[Tensor, Tensor] | None:
+    """Give normal and offset of the plane that most points lie on."""
+    some = take_evenly(points_m, _SAMPLE)
+    if len(some) < _LEAST_PIXELS:
+        return None
+    triple = torch.randint(len(some), (_HYPOTHESES, 3), generator=generator)
+    a, b, c = some[triple].unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    length = normal.norm(dim=-1, keepdim=True)
+    normal = normal / length.clamp(min=1e-12)
+    offset = (normal * a).sum(-1)
+    on = ((some @ normal.T - offset).abs() < _tolerance_m(some)[:, None]) & (length[:, 0] > 1e-8)
+    best = int(on.sum(0).argmax())
+    plane = (normal[best], offset[best])
+    for _ in range(3):
+        near = some[_is_on(some, plane)]
+        if len(near) < 3:
+            return None
+        middle = near.mean(0)
+        _, axes = torch.linalg.eigh((near - middle).T @ (near - middle))
+        plane = (axes[:, 0], axes[:, 0] @ middle)
+    return plane
+
+
+def _tolerance_m(points_m: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
+    return _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
+
+
+def _is_on(points_m: Tensor, plane: tuple[Tensor, Tensor]) -> Tensor:
+    normal, offset = plane
+    return (points_m @ normal - offset).abs() < _tolerance_m(points_m)
+
+
+def _width_m(points_m: Float64[Tensor, "n 3"]) -> float:
+    """How wide a plane is across its narrow direction, but for a tenth of its points."""
+    some = take_evenly(points_m, _SAMPLE)
+    offset = some - some.mean(0)
+    _, axes = torch.linalg.eigh(offset.T @ offset)
+    along = offset @ axes[:, 1]
+    return float(along.quantile(0.95) - along.quantile(0.05))

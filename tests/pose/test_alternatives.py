@@ -1,0 +1,135 @@
+"""Poses that fit as well as the best: found by the shape of the model, shared, named, counted."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.pose.made_object import (
+    Oracle,
+    bottle,
+    box_faces,
+    bracket,
+    cloud_of,
+    pose_at,
+    tiny_weights,
+)
+
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.estimator.alternatives import difference_of, find_copies, share_out
+from depthpose.pose.mesh import make_model, near_symmetries, true_symmetries, turn_about
+from depthpose.pose.metrics import add_m
+from depthpose.pose.types import ObjectModel, Symmetries
+
+EYE = torch.eye(3, dtype=torch.float64)
+
+
+def bar(bump_m: float = 0.004) -> ObjectModel:
+    """A bar of 20 x 7 x 3 cm, one end of which is a little narrower."""
+    corners, faces = box_faces()
+    vertices = corners * torch.tensor([0.2, 0.07, 0.03])
+    is_end = (vertices[:, 0] > 0)[:, None]
+    vertices = torch.where(is_end, vertices - bump_m * vertices.sign() * torch.tensor([0, 1, 0]),
+                           vertices)  # fmt: skip
+    return make_model(vertices, faces, name="bar", number=1)
+
+
+def half_turn(axis: list[float]) -> Rigid:
+    angle = torch.tensor(math.pi, dtype=torch.float64)
+    return turn_about(torch.tensor(axis).double(), torch.zeros(3).double(), angle)
+
+
+def test_near_symmetries_of_a_bar_are_its_half_turns_and_a_bracket_has_none() -> None:
+    found = near_symmetries(bar())
+    assert len(found) == 3
+    for axis in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]):
+        wanted = half_turn(axis).R
+        near = [one for one in found if float(geodesic_rad(one.model_from_model.R, wanted)) < 0.1]
+        assert len(near) == 1, axis
+        # About the long axis the copy is exact; end for end, the ends differ.
+        assert (near[0].deviation < 0.003) == (axis[0] == 1.0)
+    assert all(one.deviation > 0.05 for one in near_symmetries(bracket()))
+
+
+def test_declared_symmetries_are_no_other_pose_and_rough_found_ones_are() -> None:
+    turns = [half_turn([1.0, 0, 0]), half_turn([0, 0, 1.0])]
+    both = Rigid(torch.stack([t.R for t in turns]), torch.stack([t.t_m for t in turns]))
+    model = bar(0.008)
+    declared = replace(model, symmetries=Symmetries(discrete=both))
+    assert true_symmetries(declared).discrete is both
+    assert all(
+        float(geodesic_rad(one.model_from_model.R, turn.R)) > 0.5
+        for one in near_symmetries(declared)
+        for turn in turns
+    )
+    taken = replace(model, symmetries=Symmetries(discrete=both, is_found=True))
+    kept = true_symmetries(taken).discrete
+    assert kept is not None
+    assert len(kept.R) == 1
+    assert torch.equal(kept.R[0], turns[0].R)
+    assert any(
+        float(geodesic_rad(one.model_from_model.R, turns[1].R)) < 0.1
+        for one in near_symmetries(taken)
+    )
+
+
+def test_an_answer_that_may_be_turned_names_the_other_ends() -> None:
+    model, truth = bar(0.002), pose_at(seed=3)
+    cloud = cloud_of(model, truth)
+    found = Oracle(tiny_weights(model), [truth], noise=0.3).estimate(cloud=cloud)
+    assert found.is_ok, found.reason
+    assert found.certainty is not None
+    assert found.certainty < 0.9
+    assert {a.difference for a in found.alternatives} <= {
+        f"turned by {angle} degrees about the {axis} axis"
+        for axis in ("long", "middle", "short") for angle in (178, 179, 180)
+    }  # fmt: skip
+    likely = [a.probability for a in found.alternatives]
+    assert likely == sorted(likely, reverse=True)
+    assert 0.93 < found.certainty + sum(likely) <= 1 + 1e-9
+    for other in found.alternatives:
+        assert float(add_m(other.camera_from_model, truth, model.vertices_m)) > 0.02
+
+
+def test_up_to_symmetry_the_copies_are_one_answer() -> None:
+    model, truth = bar(), pose_at(seed=3)
+    config = EstimateConfig(up_to_symmetry=True)
+    net = Oracle(tiny_weights(model), [truth], config=config)
+    found = net.estimate(cloud=cloud_of(model, truth))
+    assert found.is_ok, found.reason
+    assert found.alternatives == ()
+    assert found.certainty is None  # these weights know no risk
+
+
+def test_what_has_no_copy_is_as_certain_as_its_risk_says() -> None:
+    refusal = RefusalConfig(max_risk=0.9, bias=-3.0, slopes={"far": 0.1})
+    for model in (bracket(), bottle()):
+        truth = pose_at(seed=5)
+        net = Oracle(tiny_weights(model, refusal=refusal), [truth])
+        found = net.estimate(cloud=cloud_of(model, truth))
+        assert found.is_ok, found.reason
+        assert found.alternatives == ()
+        assert found.risk is not None
+        assert found.certainty == pytest.approx(1 - found.risk, abs=0.02)
+
+
+def test_shares_are_of_one_and_fall_with_what_speaks_against() -> None:
+    shares = share_out([{"far": 0.0}, {"far": 0.01}, {"far": 0.03}], {"far": 1.0})
+    # exp(-log x) is 1 / x: 1 / 0.01, 1 / 0.02 and 1 / 0.04.
+    assert shares.tolist() == pytest.approx([4 / 7, 2 / 7, 1 / 7])
+
+
+def test_words_tell_the_axis_and_the_shift() -> None:
+    copies = find_copies(bar(), up_to_symmetry=False)
+    first = pose_at(seed=1)
+    first = Rigid(first.R.double(), first.t_m.double())
+    turned = first @ half_turn([0, 0, 1.0])
+    assert difference_of(turned, first, copies) == "turned by 180 degrees about the short axis"
+    moved = Rigid(turned.R, turned.t_m + torch.tensor([0.03, 0, 0]))
+    words = "turned by 180 degrees about the short axis and shifted by 30 mm"
+    assert difference_of(moved, first, copies) == words
+    oblique = first @ turn_about(torch.tensor([1.0, 1.0, 0]).double(), torch.zeros(3).double(),
+                                 torch.tensor(math.pi / 2, dtype=torch.float64))  # fmt: skip
+    said = difference_of(oblique, first, copies)
+    assert said == "turned by 90 degrees about the model's axis (0.71, 0.71, 0.00)"

@@ -1,0 +1,89 @@
+"""Known objects in depth without masks: planes go, regions are parted, answers do not overlap."""
+
+import pytest
+import torch
+from tests.pose.made_object import K, Oracle, bottle, bracket, pose_at, tiny_weights, view_of
+
+from depthpose.core.camera import Camera, back_project
+from depthpose.core.errors import InputError
+from depthpose.pose.config import RefusalConfig
+from depthpose.pose.metrics import add_m
+from depthpose.pose.regions import extent_m, find_regions, part_cloud
+
+CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
+TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
+REFUSAL = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
+
+
+def table(with_thing: bool = True) -> torch.Tensor:
+    """Two brackets before a wall that leans back, and a thing that nobody knows."""
+    v = torch.arange(240)[:, None].expand(240, 320)
+    depth_m = 1.25 - 0.0005 * v.float()
+    if with_thing:
+        r2 = (torch.arange(320) - 280.0)[None].square() + (torch.arange(240) - 40.0)[
+            :, None
+        ].square()
+        depth_m = torch.where(r2 < 400, 0.9 - 0.03 * (1 - r2 / 400).clamp(min=0).sqrt(), depth_m)
+    seen, mask = view_of(bracket(), *TRUTHS)
+    noise = 0.0005 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
+    return torch.where(mask, seen.float(), depth_m) + noise
+
+
+def test_planes_go_and_regions_stay() -> None:
+    depth_m = table()
+    regions, is_plane = find_regions(depth_m, K.float(), bracket().diameter_m)
+    _, mask = view_of(bracket(), *TRUTHS)
+    assert len(regions) == 3
+    assert float(is_plane[~mask].float().mean()) > 0.95
+    assert not bool(is_plane[mask].any())
+    assert abs(sum(map(len, regions[:2])) - int(mask.sum())) < 0.02 * int(mask.sum())
+    assert extent_m(regions[2]) < 0.1
+    # A wall no wider than an object may be an object's side: it stays.
+    assert max(map(len, find_regions(depth_m, K.float(), 5.0)[0])) > 0.5 * 320 * 240
+
+
+def test_a_depth_image_without_readings_has_no_region() -> None:
+    regions, is_plane = find_regions(torch.full((24, 32), torch.nan), K.float(), 0.2)
+    assert regions == []
+    assert not bool(is_plane.any())
+
+
+def test_what_is_too_long_is_parted_by_place() -> None:
+    generator = torch.Generator().manual_seed(0)
+    blobs = [0.02 * torch.randn(500, 3, generator=generator) + torch.tensor([0.3 * k, 0, 1.0])
+             for k in range(3)]  # fmt: skip
+    parts = part_cloud(torch.cat(blobs), 3)
+    assert sorted(len(part) for part in parts) == [500, 500, 500]
+
+
+def test_two_instances_are_found_and_an_unknown_thing_is_not() -> None:
+    model = bracket()
+    net = Oracle(tiny_weights(model, bottle(), refusal=REFUSAL), TRUTHS)
+    found = net.find(table(), CAMERA, ["bracket"])
+    assert [estimate.name for estimate in found] == ["input_0", "input_1"]
+    errors = []
+    for truth in TRUTHS:
+        poses = [e.camera_from_model for e in found]
+        errors += [min(float(add_m(p, truth, model.vertices_m)) for p in poses if p is not None)]
+    assert max(errors) < 0.003
+
+
+def test_the_same_thing_is_found_once_however_it_is_parted() -> None:
+    """Half of a bracket hides behind a bar: its two parts are one answer."""
+    model = bracket()
+    depth_m = table(with_thing=False)
+    points_m = back_project(depth_m.double(), K)
+    column = int((K @ TRUTHS[0].t_m.double() / TRUTHS[0].t_m[2])[0])
+    depth_m[:, column - 4 : column + 4] = 0.45
+    assert bool(points_m.isfinite().all())
+    net = Oracle(tiny_weights(model, refusal=REFUSAL), TRUTHS)
+    found = net.find(depth_m, CAMERA)
+    near = [e for e in found if e.camera_from_model is not None
+            and float(add_m(e.camera_from_model, TRUTHS[0], model.vertices_m)) < 0.02]  # fmt: skip
+    assert len(near) == 1
+
+
+def test_an_object_that_the_weights_do_not_know_is_refused() -> None:
+    net = Oracle(tiny_weights(bracket()), TRUTHS)
+    with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
+        net.find(table(), CAMERA, ["spoon"])
