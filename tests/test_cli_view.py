@@ -172,7 +172,7 @@ def test_another_word_is_refused(
 
 def test_without_rerun_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ImportError, match=r"pip install 'depthpose\[view\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '.\[view\]'"):
         Viewer("live")
 
 

@@ -142,7 +142,7 @@ def test_a_missing_extra_is_named(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'depthpose\[export\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.\[export\]'"):
         freeze(tmp_path / "line.onnx", line_export(graph=never))
     assert list(tmp_path.iterdir()) == []
 

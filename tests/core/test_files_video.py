@@ -72,5 +72,5 @@ def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
         raise ImportError(name)
 
     monkeypatch.setattr(errors, "import_module", refuse)
-    with pytest.raises(MissingExtraError, match=r"reading a video.*pip install 'depthpose\[opencv"):
+    with pytest.raises(MissingExtraError, match=r"reading a video.*pip install -e '.\[opencv"):
         read_video("v.mp4")

@@ -169,7 +169,7 @@ def test_a_hub_that_does_not_answer_is_said(
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     hub.fetch_weights.cache_clear()
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'depthpose\[hub\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.\[hub\]'"):
         find_weights("hf://me/part")
 
 

@@ -102,7 +102,7 @@ def test_sgbm_refuses_images_narrower_than_its_range() -> None:
 
 def test_missing_opencv_says_which_extra_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'depthpose\[opencv\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.\[opencv\]'"):
         SGBMMatcher()
 
 

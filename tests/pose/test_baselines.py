@@ -264,7 +264,7 @@ def test_a_training_step_takes_a_cloud_of_one_point() -> None:
 
 def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'depthpose\[open3d\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.\[open3d\]'"):
         FpfhRegistration(bracket())
 
 

@@ -114,7 +114,7 @@ class FakestereoNet:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
                 ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
-                What names weights: :func:`depthpose.core.checkpoint.find_weights`.
+                What names weights: :func:`depthpose.core.shipped.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.
