@@ -177,7 +177,7 @@ class Bench:
         config = ViewTraining(
             generator=generator, discriminator_width=32, generator_adam=adam,
             discriminator_adam=adam, loop=replace(self.loop(0), clip_norm=None, ema_decay=None),
-            pairs=replace(self.pairs(folders), truth=None),
+            pairs=replace(self.pairs(folders), truth=None, augment=replace(CROP, scale=(1.0, 1.0))),
         )  # fmt: skip
         both = self.packed(self.train("view", config, folder), "matched", folder)
         return {"arm": "painted view, matched", "seed": 0} | self.measure(folder, "matched", both)
@@ -231,8 +231,9 @@ def predict(net: FakestereoNet, data: Path, folder: Path) -> None:
     dataset = open_dataset(data)
     for index, frame in enumerate(dataset.frames):
         given = dataset.read_input(index)
-        depth_m = net.estimate(given.left, given.camera).depth_m
-        np.save(folder / f"{frame.name}.depth_m.npy", depth_m.numpy())
+        found = net.estimate(given.left, given.camera)
+        assert found.depth_m is not None
+        np.save(folder / f"{frame.name}.depth_m.npy", found.depth_m.numpy())
 
 
 def last_held_out(folder: Path) -> dict[str, float]:
