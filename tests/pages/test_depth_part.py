@@ -23,8 +23,8 @@ def truth_m() -> torch.Tensor:
 
 def estimate(**more: torch.Tensor) -> DepthEstimate:
     assert SAMPLE.truth.disparity_px is not None
-    disparity_px = SAMPLE.truth.disparity_px
-    return DepthEstimate(depth_m=truth_m(), disparity_px=disparity_px, **more)
+    found = DepthEstimate(depth_m=truth_m(), disparity_px=SAMPLE.truth.disparity_px)
+    return replace(found, **more)
 
 
 def test_what_there_is_is_shown_in_its_colours() -> None:

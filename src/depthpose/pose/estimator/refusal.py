@@ -135,7 +135,7 @@ def fit_candidate_slopes(
             log_share = odds - np.logaddexp.reduce(odds)
             value -= log_share[right]
             pull = pull + signals[right] - np.exp(log_share) @ signals
-        return value, pull
+        return float(value), pull
 
     start = np.ones(len(names))
     found = minimize(loss, start, jac=True, bounds=[(0.0, None)] * len(names), method="L-BFGS-B")
