@@ -112,9 +112,9 @@ class DepthImageRegressor:
         if (few := refusal_of(points_m, self.weights.cloud)) is not None:
             return replace(found, status="too few points", reason=few, camera_from_model=None)
         assert found.camera_from_model is not None
-        refined, _, _ = refine_best(
+        refined = refine_best(
             points_m, found.camera_from_model, self._surfaces[number], self.config.icp
-        )
+        ).refined
         found = replace(found, seconds={**found.seconds, "icp": time.perf_counter() - start})
         if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
             return found
