@@ -51,7 +51,7 @@ def test_the_numbers_are_those_of_the_estimate() -> None:
     assert [float(cell) for cell in spread[1][1:]] == pytest.approx(turn_deg, abs=1e-3)
     assert [float(cell) for cell in spread[2][1:]] == pytest.approx(origin_mm, abs=1e-3)
     assert [float(row[k]) for k, row in enumerate(covariance)] == [1e-6] * 6
-    assert dict(section.facts)["risk of being wrong"] == "0.125"
+    assert dict(section.facts)["risk that no named pose is right"] == "0.125"
     x, y, z = POSE.t_m.tolist()
     assert (
         section.text

@@ -11,7 +11,8 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.estimator import calibrate_refusal, risk_of
+from depthpose.pose.estimator import calibrate_refusal, fit_candidate_slopes, risk_of
+from depthpose.pose.estimator.alternatives import share_out
 from depthpose.pose.estimator.evidence import SIGNALS, hold_of, surface_signals
 from depthpose.pose.estimator.refusal import reason_of
 from depthpose.pose.metrics import risk_coverage
@@ -172,3 +173,20 @@ def test_risk_and_coverage_of_a_toy() -> None:
     coverage, wrong = risk_coverage(risks, is_right)
     assert coverage.tolist() == pytest.approx([0.4, 0.6, 0.8])
     assert wrong.tolist() == pytest.approx([1 / 2, 1 / 3, 2 / 4])
+
+
+def test_slopes_of_candidates_are_those_that_made_the_cases() -> None:
+    """Right candidates are drawn by shares of known slopes; the fit finds these again."""
+    generator = torch.Generator().manual_seed(0)
+    names = list(RefusalConfig().candidate_slopes)
+    true = dict(zip(names, (2.0, 0.0, 1.0, 0.5, 0.0, 3.0), strict=True))
+    cases = []
+    for _ in range(1500):
+        rows = torch.rand(3, len(names), generator=generator).square()
+        some = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
+        right = int(torch.multinomial(share_out(some, true), 1, generator=generator))
+        cases.append((some, right))
+    found = fit_candidate_slopes(cases)
+    assert all(abs(found[name] - true[name]) < 0.35 for name in names)
+    with pytest.raises(InputError, match="no view has several poses that fit"):
+        fit_candidate_slopes([])

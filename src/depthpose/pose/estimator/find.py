@@ -32,11 +32,11 @@ _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
 _SEEN_THROUGH = 0.2
 """Where the camera saw through more of the posed surface, there is no such object."""
-_SUNK = 0.1
+_SUNK = 0.15
 """Where a table or wall lies before more of the posed surface, there is no such object."""
-_WHOLE = 0.96
-"""An answer explains so much of its region, or leaves enough of it for another object: what has a
-little more to it than the object is another thing."""
+_WHOLE, _HALF = 0.96, 0.5
+"""An answer explains so much of its region, or half of it and leaves enough for another object:
+what has a little more to it than the object is another thing."""
 
 EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
 
@@ -79,7 +79,7 @@ class _Answer:
     def is_whole(self) -> bool:
         """Whether what it leaves of its region is nothing, or something of its own."""
         explained = float(self.explained.double().mean())
-        return explained >= _WHOLE or explained <= 1 - _REST
+        return explained >= _WHOLE or _HALF <= explained <= 1 - _REST
 
     @property
     def worth(self) -> float:

@@ -129,11 +129,11 @@ def fit_candidate_slopes(
     x = [np.array([[log_signal(one[n]) for n in names] for one in some]) for some, _ in cases]
 
     def loss(slopes: np.ndarray) -> tuple[float, np.ndarray]:
-        value, pull = 0.5 * ridge * (slopes @ slopes), ridge * slopes
+        value, pull = 0.5 * ridge * float(slopes @ slopes), ridge * slopes
         for signals, (_, right) in zip(x, cases, strict=True):
             odds = -signals @ slopes
             log_share = odds - np.logaddexp.reduce(odds)
-            value -= log_share[right]
+            value -= float(log_share[right])
             pull = pull + signals[right] - np.exp(log_share) @ signals
         return float(value), pull
 
