@@ -17,8 +17,8 @@ setup: $(READY)
 # torch first and exactly, so that nothing else chooses a build of several gigabytes.
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@echo "1 of 2: torch into .venv. On Linux this is a GPU build of several GB; for the CPU build,"
-	@echo "   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make ..."
+	@echo "1 of 2: torch into .venv. On Linux this is a GPU build of several GB; for the CPU"
+	@echo "   build (0.9 GB): PIP_EXTRA_INDEX_URL=URL make ..., URL as PyTorch's 'Start Locally' page says."
 	$(BIN)/python -m pip install -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
 	@echo "2 of 2: depthpose and what its tests need"
 	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
