@@ -40,7 +40,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[Limits]:
 
     class Unloaded:
         @staticmethod
-        def load(_: str) -> None:
+        def load(_: str, **__: bool) -> None:
             return None
 
     monkeypatch.setattr("depthpose.depth.estimator.FakestereoNet", Unloaded)

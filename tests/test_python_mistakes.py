@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from depthpose.cli import main
-from depthpose.core.files import write_image
+from depthpose.core.files import Cloud, write_cloud, write_image
 
 MISTAKES = {
     "unit of a cloud": (
@@ -87,7 +87,7 @@ from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.pose.config import EstimateConfig, EvaluationConfig, VotingConfig
 from depthpose.pose.mesh import read_model
 
-pose, depth = GeoPoseNet.load("parts"), FakestereoNet.load("default")
+pose, depth = GeoPoseNet.load("parts"), FakestereoNet.load("default", with_unlike=True)
 K = [[50.0, 0.0, 31.5], [0.0, 50.0, 23.5], [0.0, 0.0, 1.0]]
 camera = Camera(width=64, height=48, K=torch.tensor(K, dtype=torch.float64))
 points, depth_m, mask = torch.rand(99, 3), torch.ones(48, 64), torch.ones(48, 64) > 0
@@ -148,6 +148,7 @@ def test_a_device_that_is_not_there_ends_in_a_line(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_image(tmp_path / "x.png", torch.rand(3, 48, 64))
+    write_cloud(tmp_path / "x.ply", Cloud(points=torch.rand(9, 3)))
     with contextlib.chdir(tmp_path):
         assert main([*words, "--device", "toaster", "--out", "out"]) == 2
     assert "device 'toaster' cannot be used here" in capsys.readouterr().err

@@ -62,6 +62,7 @@ def test_the_commands_that_need_data_run(demo_folder: Path, real: Path) -> None:
         assert run(line + more) in allowed, line
 
 
+@pytest.mark.filterwarnings("ignore::depthpose.core.devices.PrecisionNotice")
 def test_the_commands_that_train_run(demo_folder: Path) -> None:
     """On three streets and for one step, in place of a thousand and of three thousand."""
     (demo_folder / "configs").symlink_to(ROOT / "configs")

@@ -171,4 +171,4 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller holds
         )
     if array.dtype == np.uint16:
         array = array.astype(np.int32)  # torch computes little with uint16
-    return torch.from_numpy(np.ascontiguousarray(array))
+    return torch.from_numpy(np.require(array, requirements=["C", "W"]))  # Pillow lends read-only
