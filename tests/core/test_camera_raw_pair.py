@@ -124,7 +124,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"cam0": {**KALIBR, "distortion_model": "equidistant"}, "cam1": KALIBR},
         "one lens is a fisheye and the other is none",
     ),
-    "no intrinsics": ({"cam0": {**KALIBR, "intrinsics": [1]}, "cam1": KALIBR}, "cam0 has no intrinsics"),
+    "no intrinsics": (
+        {"cam0": {**KALIBR, "intrinsics": [1]}, "cam1": KALIBR},
+        "cam0 has no intrinsics",
+    ),
 }
 
 
