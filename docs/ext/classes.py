@@ -54,10 +54,25 @@ def write_pages(app: Sphinx) -> None:
             path.write_text(text)
 
 
-def list_classes(app: Sphinx, name: str, content: list[str]) -> None:
-    """Put the list of a module's classes behind what is said of the module."""
+def add_pages(*event: object) -> None:
+    """Put the pages of a module's classes into the sidebar, under the page of the module."""
+    _, name, content = event
+    assert isinstance(name, str)
+    assert isinstance(content, list)
     if re.fullmatch(r"api/\w+", name):
-        content[0] = _MODULE.sub(_with_list, content[0])
+        content[0] = _MODULE.sub(_with_pages, content[0])
+
+
+def list_classes(*event: object) -> None:
+    """Put the list of a module's classes behind what is said of the module."""
+    _, what, module, _, options, lines = event
+    assert isinstance(lines, list)
+    if what != "module":
+        return
+    found = classes_of(str(module), with_imported=bool(getattr(options, "imported_members", None)))
+    if found:
+        rows = [f"- :py:class:`{n} <{module}.{n}>`: {_summary(c)}" for n, c in found.items()]
+        lines += ["", *rows, ""]
 
 
 def skip_class(*event: object) -> bool | None:
@@ -70,26 +85,21 @@ def _classes(match: re.Match[str]) -> dict[str, type]:
     return classes_of(match["name"], with_imported=":imported-members:" in match["options"])
 
 
-def _with_list(match: re.Match[str]) -> str:
-    found = _classes(match)
-    if not found:
-        return match[0]
-    pages = {name: f"classes/{match['name']}.{name}" for name in found}
-    rows = [f"- [`{name}`]({page}.rst): {_summary(found[name])}" for name, page in pages.items()]
-    tree = ["```{toctree}", ":hidden:", "", *pages.values(), "```"]
-    return "\n".join([match[0], *rows, "", *tree, ""])
+def _with_pages(match: re.Match[str]) -> str:
+    pages = [f"classes/{match['name']}.{name}" for name in _classes(match)]
+    tree = ["```{toctree}", ":hidden:", "", *pages, "```", ""]
+    return "\n".join([match[0], *tree]) if pages else match[0]
 
 
 def _summary(found: type) -> str:
-    """Give the first sentence of a docstring, its code in Markdown."""
-    first = " ".join((inspect.getdoc(found) or "").partition("\n\n")[0].split())
-    plain = re.sub(r":\w+:`~?([^`]+)`", r"``\1``", first)
-    return plain.replace("``", "`")
+    """Give the first sentence of a docstring."""
+    return " ".join((inspect.getdoc(found) or "").partition("\n\n")[0].split())
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Tell Sphinx of all."""
     app.connect("builder-inited", write_pages)
-    app.connect("source-read", list_classes)
+    app.connect("source-read", add_pages)
+    app.connect("autodoc-process-docstring", list_classes)
     app.connect("autodoc-skip-member", skip_class)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
