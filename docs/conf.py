@@ -16,12 +16,13 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "classes",
     "imports",
     "networks",
     "names",
 ]
 exclude_patterns = ["ext", "static"]
-source_suffix = {".md": "markdown"}
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 
 # A link that leads nowhere or a name that nobody documents fails the build (with -W).
 nitpicky = True

@@ -1,6 +1,7 @@
 """The built documentation: strict, and read without a network."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -56,3 +57,48 @@ def test_the_pictures_show_every_room_and_module(site: Path) -> None:
                 and path.suffix in ("", ".py")
             ):
                 assert f">{path.stem}</text>" in page, path
+
+
+@pytest.mark.slow
+def test_each_class_of_the_api_has_a_page(site: Path) -> None:
+    for module, name in (
+        ("core.camera", "StereoRig"),
+        ("core.camera", "Rectifier"),
+        ("depth.estimator", "FakestereoNet"),
+        ("pose.estimator", "GeoPoseNet"),
+        ("core.errors", "InputError"),
+    ):
+        full = f"depthpose.{module}.{name}"
+        assert f'id="{full}"' in (site / f"api/classes/{full}.html").read_text()
+        room = (site / f"api/{module.partition('.')[0]}.html").read_text()
+        assert f'href="classes/{full}.html"' in room
+        assert f'<dt class="sig sig-object py" id="{full}">' not in room
+
+
+@pytest.mark.slow
+def test_install_and_quick_start_lead_the_sidebar(site: Path) -> None:
+    links = re.findall(r'toctree-l1[^>]*><a[^>]*href="([^"]+)"', (site / "index.html").read_text())
+    assert links[:2] == ["install.html", "quickstart.html"]
+    for page, words in (("install", "make demo"), ("quickstart", "depthpose demo")):
+        shown = re.sub(r"<[^>]+>", "", (site / f"{page}.html").read_text())
+        assert f"{words}\n" in shown, page
+
+
+CUT = """() => [...document.querySelectorAll("article pre")]
+    .filter(code => code.scrollWidth > code.clientWidth + 1).map(code => code.innerText)"""
+
+
+@pytest.mark.slow
+def test_no_code_is_cut_off_on_a_small_laptop(site: Path) -> None:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("there is no chromium on PATH: apt-get install chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        look = browser.new_page(viewport={"width": 1280, "height": 800})
+        for page in sorted(site.glob("*.html")) + sorted(site.glob("tutorials/*.html")):
+            look.goto(page.as_uri())
+            assert look.evaluate(CUT) == [], page.name
+        browser.close()

@@ -196,7 +196,7 @@ WRONG: dict[str, tuple[str, str]] = {
     ),
     "turned pair": (
         "K: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nT: [-0.1, 0.02, 0]",
-        r"not rectified, and no P1 and P2; rectify the images by cv2\.stereoRectify",
+        r"not rectified, and no P1 and P2; rectify the images by 'depthpose data rectify'",
     ),
     "units a metre": (
         json.dumps({**BOP, "height": 480, "depth_scale": 5000000}),

@@ -47,6 +47,10 @@ COMMANDS = {
         "data:make_objects",
         "made frames of your CAD files on a table, in BOP's layout",
     ),
+    "data rectify": (
+        "rectifying:rectify",
+        "raw pairs and their calibration to rectified pairs that depth match takes",
+    ),
     "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
     "data label": (
         "data:label",

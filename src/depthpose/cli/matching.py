@@ -37,18 +37,8 @@ class Pairs:
     @classmethod
     def find(cls, left: str, right: str, camera: Path) -> "Pairs":
         """List both sides, and refuse sides that cannot be paired."""
-        lefts, rights = list_images(left), list_images(right)
-        rig = read_rig(camera, image_size(lefts[0]))
-        if len(lefts) != len(rights):
-            raise InputError(
-                f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
-                "needs one right image. Remove the ones without a partner."
-            )
-        stems = [path.stem for path in lefts]
-        if len(set(stems)) != len(stems):
-            twice = next(stem for stem in stems if stems.count(stem) > 1)
-            raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
-        return cls(left=lefts, right=rights, rig=rig)
+        lefts, rights = list_pairs(left, right)
+        return cls(left=lefts, right=rights, rig=read_rig(camera, image_size(lefts[0])))
 
     def read(self, index: int) -> StereoInput:
         """Read one pair."""
@@ -58,6 +48,25 @@ class Pairs:
             right=read_image(self.right[index]),
             camera=self.rig,
         )
+
+
+def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
+    """List the images of both sides, which are paired in the order of their names.
+
+    Raises:
+        InputError: a side has none, the sides cannot be paired, or two results had one name.
+    """
+    lefts, rights = list_images(left), list_images(right)
+    if len(lefts) != len(rights):
+        raise InputError(
+            f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
+            "needs one right image. Remove the ones without a partner."
+        )
+    stems = [path.stem for path in lefts]
+    if len(set(stems)) != len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
+    return lefts, rights
 
 
 def refuse_unusable_first(pairs: Pairs) -> None:

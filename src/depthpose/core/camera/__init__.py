@@ -25,5 +25,13 @@ from depthpose.core.camera.pinhole import pad_camera as pad_camera
 from depthpose.core.camera.pinhole import pixel_grid as pixel_grid
 from depthpose.core.camera.pinhole import project as project
 from depthpose.core.camera.pinhole import resize_camera as resize_camera
+from depthpose.core.camera.raw_pair import RawCamera as RawCamera
+from depthpose.core.camera.raw_pair import RawPair as RawPair
+from depthpose.core.camera.raw_pair import read_raw_pair as read_raw_pair
 from depthpose.core.camera.rectified import RectificationReport as RectificationReport
 from depthpose.core.camera.rectified import check_rectified as check_rectified
+from depthpose.core.camera.rectify import EpipolarResidual as EpipolarResidual
+from depthpose.core.camera.rectify import Rectifier as Rectifier
+from depthpose.core.camera.rectify import epipolar_residual as epipolar_residual
+from depthpose.core.camera.rectify import make_rectifier as make_rectifier
+from depthpose.core.camera.rectify import match_features as match_features

@@ -138,7 +138,7 @@ def _message(
         findings.append(
             f"rows do not agree: the right image lies {offset:+.1f} px lower, with a spread of "
             f"{spread:.1f} px (at most {_MAX_OFFSET_PX:g} and {_MAX_SPREAD_PX:g} are allowed); "
-            "rectify the pair"
+            "rectify the pair ('depthpose data rectify', with the calibration of both cameras)"
         )
     good = f"rows agree to {abs(offset):.1f} px, with a spread of {spread:.1f} px"
     return f"{'. '.join(findings) or good} ({len(shift_px)} matches)"

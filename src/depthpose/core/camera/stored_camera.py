@@ -27,8 +27,8 @@ _UNDISTORT_FISHEYE = (
     "cv2.fisheye.undistortImage(image, K, distortion, Knew=K), or Knew=P[:, :3] where there is a P"
 )
 _RECTIFY = (
-    "cv2.initUndistortRectifyMap and cv2.remap, each view with its own K, R and P "
-    "(stereo_image_proc in ROS)"
+    "'depthpose data rectify', or by cv2.initUndistortRectifyMap and cv2.remap, each view with its "
+    "own K, R and P (stereo_image_proc in ROS)"
 )
 
 
@@ -38,17 +38,22 @@ def facts_from_names(names: Names) -> CameraFacts | None:
     Raises:
         InputError: a value is no number, or there are too many or too few of them.
     """
+    if "cam0" in names and "cam1" in names:
+        raise InputError(
+            "a camchain of Kalibr, whose images are not rectified; 'depthpose data rectify' "
+            "rectifies them and writes the camera of the result"
+        )
     settings = next((who for who in ("camera", "camera1") if f"{who}fx" in names), None)
     if settings is not None:
         return _from_settings(names, settings)
     left, right = (matrix(names, which, 12) for which in (_P, ("p2",)))
     distortion = _distortion(names)
     if right is not None:
-        facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, _size(names))
+        facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
         return _bent(facts, distortion, _RECTIFY)
     Q = matrix(names, ("q",), 16)
     if Q is not None:
-        return _bent(_from_reprojection(Q, _size(names)), distortion, _RECTIFY)
+        return _bent(_from_reprojection(Q, size_of(names)), distortion, _RECTIFY)
     if left is not None and left[0, 0] != 0:
         return _from_projection(names, left, distortion)
     return _from_intrinsics(names, distortion)
@@ -65,6 +70,21 @@ def read_folder(folder: Path) -> CameraFacts:
     Raises:
         InputError: there are others, or they do not belong together.
     """
+    first, second = read_two_files(folder)
+    if is_ros(first) and is_ros(second) and "p2" not in first | second:
+        return _from_ros_pair(first, second)
+    facts = facts_from_names(first | second)
+    if facts is None:
+        raise InputError("its two files together describe no camera")
+    return facts
+
+
+def read_two_files(folder: Path) -> tuple[Names, Names]:
+    """Read what the two files of a folder say, in the order of their names.
+
+    Raises:
+        InputError: there are more or fewer, or one is damaged.
+    """
     with refused_as(folder, "folder", "check who may read it"):
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
     found = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
@@ -75,12 +95,7 @@ def read_folder(folder: Path) -> CameraFacts:
             "a folder of their own"
         )
     first, second = (names for names in found if names is not None)
-    if is_ros(first) and is_ros(second) and "p2" not in first | second:
-        return _from_ros_pair(first, second)
-    facts = facts_from_names(first | second)
-    if facts is None:
-        raise InputError(f"{files[0].name} and {files[1].name} together describe no camera")
-    return facts
+    return first, second
 
 
 def _from_settings(names: Names, who: str) -> CameraFacts:
@@ -105,7 +120,7 @@ def _from_settings(names: Names, who: str) -> CameraFacts:
 
 def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...]) -> CameraFacts:
     """One ``camera_info``: of a single camera, or of the right one of a pair (``Tx = -fx B``)."""
-    kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", _size(names)
+    kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", size_of(names)
     if P[0, 3] == 0 and P[1, 3] == 0:
         facts = facts_from_projections(kind, P, None, size)
         return _bent(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
@@ -124,9 +139,9 @@ def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
             "where the left one has 0 and the right one -fx times the baseline; calibrate them as "
             "a pair"
         )
-    if _size(first) != _size(second):
+    if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
-    facts = facts_from_projections("a pair of camera_info", left, right, _size(first))
+    facts = facts_from_projections("a pair of camera_info", left, right, size_of(first))
     return _bent(facts, (*_distortion(first), *_distortion(second)), _RECTIFY)
 
 
@@ -150,7 +165,7 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
         return None
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     facts = CameraFacts(
-        kind=kind, K=torch.from_numpy(K), size=_size(names), baseline_m=_level_baseline(names)
+        kind=kind, K=torch.from_numpy(K), size=size_of(names), baseline_m=_level_baseline(names)
     )
     return _bent(facts, distortion, _lens_remedy(names, facts.undistort))
 
@@ -164,7 +179,7 @@ def _level_baseline(names: Names) -> float | None:
     if is_turned or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
         raise InputError(
             "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "
-            "cv2.stereoRectify and write its P1 and P2 too"
+            "'depthpose data rectify', or by cv2.stereoRectify and write its P1 and P2 too"
         )
     return -T[0]
 
@@ -197,7 +212,8 @@ def _distortion(names: Names) -> tuple[float, ...]:
     return tuple(value for value in found if value is not None)
 
 
-def _size(names: Names) -> Size | None:
+def size_of(names: Names) -> Size | None:
+    """Take the image's size, where some names say it."""
     width, height = (
         next((v for name in which if (v := scalar(names, name)) is not None), None)
         for which in (_WIDTH, _HEIGHT)

@@ -20,7 +20,7 @@ MAX_FILE_BYTES = 2**28
 
 
 def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole, or one in a tar shard (:mod:`depthpose.core.files.shards`).
+    """Read a regular file whole, or one in a tar shard (``core.files.shards``).
 
     Args:
         path: the file.

@@ -1,0 +1,248 @@
+"""Dockerfile, CI file and release checklist, read line by line: what they name exists.
+
+No builder of images is at hand where these tests run; the CI file builds one.
+"""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import threading
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatch
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tests.written import ROOT
+
+from depthpose import __version__
+from depthpose.cli import COMMANDS
+
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
+
+
+def read_dockerfile() -> list[tuple[str, str]]:
+    """Each instruction of the Dockerfile and what follows it, in order."""
+    text = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    return [(name, rest.strip()) for name, _, rest in (line.partition(" ") for line in lines)]
+
+
+STEPS = read_dockerfile()
+
+
+def of(name: str) -> list[str]:
+    return [rest for instruction, rest in STEPS if instruction == name]
+
+
+def place(instruction: str, words: str) -> int:
+    (found,) = (k for k, (name, rest) in enumerate(STEPS) if name == instruction and words in rest)
+    return found
+
+
+def is_sent(path: str) -> bool:
+    """Whether .dockerignore lets a file through: the last line that matches decides."""
+    sent = True
+    for line in (ROOT / ".dockerignore").read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        pattern, is_kept = line.removeprefix("!"), line.startswith("!")
+        names = [path, *(str(parent) for parent in Path(path).parents)]
+        bare = pattern.removeprefix("**/")
+        if any(fnmatch(name, pattern) or fnmatch(Path(name).name, bare) for name in names):
+            sent = is_kept
+    return sent
+
+
+def test_every_instruction_is_one_that_is_known() -> None:
+    known = {"FROM", "ARG", "ENV", "RUN", "WORKDIR", "COPY", "USER", "EXPOSE", "HEALTHCHECK",
+             "ENTRYPOINT", "CMD"}  # fmt: skip
+    assert {name for name, _ in STEPS} == known
+    assert STEPS[0][0] == "FROM"
+
+
+def test_the_base_is_the_public_image_of_our_python() -> None:
+    (base,) = of("FROM")
+    version = re.fullmatch(r"python:(3\.\d+)-slim", base)
+    assert version
+    assert f"Programming Language :: Python :: {version[1]}" in PROJECT["project"]["classifiers"]
+    assert PROJECT["project"]["requires-python"] == f">={version[1]}"
+
+
+@pytest.mark.parametrize("name", ["Dockerfile", ".dockerignore", ".github/workflows/ci.yml"])
+def test_no_host_is_named_but_this_machine(name: str) -> None:
+    hosts = re.findall(r"://([^/'\"\s:]+)", (ROOT / name).read_text())
+    assert set(hosts) <= {"127.0.0.1"}
+
+
+def test_what_is_copied_exists_and_is_sent() -> None:
+    for line in of("COPY"):
+        *sources, target = shlex.split(line)
+        assert target.startswith("./")
+        for source in sources:
+            assert (ROOT / source).exists(), source
+            assert is_sent(source), source
+    assert is_sent("src/depthpose/weights/default.safetensors")
+    assert is_sent("src/depthpose/weights/parts.safetensors")
+
+
+def test_what_is_not_for_everyone_is_not_sent() -> None:
+    weights = [path.name for path in (ROOT / "src/depthpose/weights").iterdir()]
+    kept_back = [name for name in weights if "-nc." in name or name.startswith("ycb.")]
+    assert kept_back
+    for name in (*(f"src/depthpose/weights/{kept}" for kept in kept_back), ".git", "out", "tests"):
+        assert not is_sent(name), name
+
+
+def test_the_package_is_installed_after_all_that_its_build_reads() -> None:
+    project = PROJECT["project"]
+    needed = [project["readme"], *project["license-files"], "pyproject.toml"]
+    needed += [PROJECT["tool"]["hatch"]["version"]["path"]]
+    needed += PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    installed = place("RUN", "'.[")
+    copied = [source for name, rest in STEPS[:installed] if name == "COPY"
+              for source in shlex.split(rest)[:-1]]  # fmt: skip
+    for path in needed:
+        parts = [path, *map(str, Path(path).parents)]
+        assert set(parts) & set(copied), path
+
+
+def test_what_pip_installs_is_named_by_the_project() -> None:
+    torch, package = (rest for rest in of("RUN") if rest.startswith("pip install"))
+    for words in (torch, package):
+        assert shlex.split(words)[:4] == ["pip", "install", "-c", "constraints.txt"]
+    assert re.search(r"^torch==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert any(re.match(r"torch\b", need) for need in PROJECT["project"]["dependencies"])
+    (extras,) = re.findall(r"\.\[([\w,]+)\]", package)
+    assert set(extras.split(",")) <= set(PROJECT["project"]["optional-dependencies"])
+    assert "serve" in extras
+
+
+def test_pip_asks_its_own_way_for_the_cpu_build() -> None:
+    assert of("ARG") == ["PIP_EXTRA_INDEX_URL"]
+    help_text = subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--help"], capture_output=True, check=True
+    ).stdout.decode()
+    assert "--extra-index-url" in help_text
+
+
+def test_nothing_runs_as_root() -> None:
+    (user,) = of("USER")
+    made = place("RUN", "useradd")
+    assert shlex.split(STEPS[made][1])[-1] == user != "root"
+    assert made < place("USER", user) < place("ENTRYPOINT", "")
+    assert max(k for k, (name, _) in enumerate(STEPS) if name == "RUN") < place("USER", user)
+
+
+def test_what_starts_is_a_command_with_its_options() -> None:
+    (entry,), (first, *options) = (json.loads(of(name)[0]) for name in ("ENTRYPOINT", "CMD"))
+    assert entry in PROJECT["project"]["scripts"]
+    home, _, function = COMMANDS[first][0].partition(":")
+    known = signature(getattr(import_module(f"depthpose.cli.{home}"), function)).parameters
+    given = dict(zip(options[::2], options[1::2], strict=True))
+    assert {name.removeprefix("--").replace("-", "_") for name in given} <= set(known)
+    assert given["--host"] == "0.0.0.0"  # else nothing outside the container reaches it
+    assert given["--port"] == of("EXPOSE")[0]
+    assert f"127.0.0.1:{given['--port']}/" in of("HEALTHCHECK")[0]
+
+
+class _Answer(BaseHTTPRequestHandler):
+    status = 200
+
+    def do_GET(self) -> None:
+        self.send_response(self.status)
+        self.end_headers()
+
+    def log_message(self, *_: object, **__: object) -> None: ...
+
+
+@contextmanager
+def answering(status: int) -> Iterator[int]:
+    handler = type("Handler", (_Answer,), {"status": status})
+    server = HTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield server.server_address[1]
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def health(port: int) -> int:
+    """Run the image's health check against a port of this machine; give its exit code."""
+    python, *words = json.loads(of("HEALTHCHECK")[0].partition("CMD")[2])
+    assert python == "python"
+    words = [word.replace(":8000/", f":{port}/") for word in words]
+    return subprocess.run([sys.executable, *words], capture_output=True, check=False).returncode
+
+
+def test_the_health_check_tells_a_page_from_none() -> None:
+    with answering(200) as port:
+        assert health(port) == 0
+    assert health(port) != 0
+    with answering(500) as port:
+        assert health(port) != 0
+
+
+def read_ci() -> dict[str, Any]:
+    return yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+
+
+def test_ci_runs_what_must_pass_and_builds_the_image() -> None:
+    jobs = read_ci()["jobs"]
+    runs = [step["run"] for step in jobs["everything"]["steps"] if "run" in step]
+    assert runs == [".ci/run"]
+    assert os.access(ROOT / ".ci/run", os.X_OK)
+    image = " ".join(step.get("run", "") for step in jobs["image"]["steps"])
+    assert "docker build --build-arg PIP_EXTRA_INDEX_URL --tag depthpose ." in image
+    (command,) = re.findall(r"docker run --rm depthpose (\w+)", image)
+    assert command in COMMANDS
+    assert ".State.Health.Status" in image
+
+
+def test_ci_checks_out_reads_only_and_knows_our_python() -> None:
+    ci = read_ci()
+    assert ci["permissions"] == {"contents": "read"}
+    for job in ci["jobs"].values():
+        assert job["steps"][0]["uses"].startswith("actions/checkout@v")
+        assert {step["uses"].partition("/")[0] for step in job["steps"] if "uses" in step} == {
+            "actions"
+        }
+    base = ci["jobs"]["everything"]["container"]
+    assert f"{base}-slim" == of("FROM")[0]
+
+
+def checklist() -> str:
+    return CONTRIBUTING.partition("## A release\n")[2].partition("\n## ")[0]
+
+
+def test_the_release_checklist_names_what_is_there() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"`make (\w+)`", checklist()):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+    names = re.findall(r"`([\w./-]+(?:\.(?:py|md|cff|toml|txt)|/run|Dockerfile))`", checklist())
+    assert len(names) >= 5
+    for name in names:
+        assert (ROOT / name).exists(), name
+    for command in re.findall(r"`depthpose (\w+)`", checklist()):
+        assert command in COMMANDS, command
+    assert re.findall(r"\[([\w,]+)\]", checklist())
+
+
+def test_one_version_stands_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert str(citation["version"]) == __version__
+    newest = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0]
+    assert newest == __version__
