@@ -187,7 +187,7 @@ class Bench:
 
 def made_quality(weights: Path) -> dict[str, float]:
     """What is drawn and measured where the left view shows it and where it hides it."""
-    net = FakestereoNet.load(weights)
+    net = FakestereoNet.load(weights, with_unlike=True)
     config = StreetsConfig(seed=9, scale=0.25)
     rows = [measure(net, draw_street(config, index)) for index in range(HELD_OUT_STREETS)]
     return {key: float(torch.tensor([r[key] for r in rows]).nanmean()) for key in rows[0]}

@@ -23,7 +23,7 @@ CAP_M = 80.0
 
 def measure(name: str, sees: str, streets: list[StereoSample]) -> dict[str, object]:
     """One row: what a network says of the sky and of the rest; no depth counts as far."""
-    net = FakestereoNet.load(name)
+    net = FakestereoNet.load(name, with_unlike=True)
     depths: dict[bool, list[Tensor]] = {True: [], False: []}
     sure: dict[bool, list[Tensor]] = {True: [], False: []}
     for street in tqdm(streets, f"{name}, {sees}"):
