@@ -82,7 +82,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args()
     config = StreetsConfig(seed=9, scale=options.scale)
-    nets = {name: FakestereoNet.load(find_weights(name), with_unlike=True) for name in options.weights}
+    nets = {
+        name: FakestereoNet.load(find_weights(name), with_unlike=True) for name in options.weights
+    }
     found: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
     for index in range(options.number):
         frame = draw_street(config, index)
