@@ -144,7 +144,9 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         ({"status": "votes do not meet"}, "an estimate that is ok has a camera_from_model"),
         ({"camera_from_model": None}, "an estimate that is ok has a camera_from_model"),
         ({"camera_from_model": flipped}, "camera_from_model is no rigid transform; write 4 rows"),
-        ({"covariance": [[1.0, "x"]]}, "covariance is not rows of 6 numbers"),
+        ({"covariance": [[1.0, "x"]]}, "covariance is not 6 rows of 6 numbers"),
+        ({"covariance": 7 * [6 * [0.0]]}, "covariance is not 6 rows of 6 numbers"),
+        ({"camera_from_model": [[1.0, 0.0, 0.0, 0.0]]}, "is not 4 rows of 4 numbers"),
         ({"seconds": [0.1]}, "where names to numbers belong"),
         ({"im_id": None}, "im_id is None, where a number from 0 to 1000000000 belongs"),
     ):

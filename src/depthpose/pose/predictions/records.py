@@ -158,7 +158,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         reason=str(reason),
         camera_from_model=pose,
         keypoints_m=_table(row, "keypoints_m", 3, source),
-        covariance=_table(row, "covariance", 6, source),
+        covariance=_table(row, "covariance", 6, source, rows=6),
         free_motions=_table(row, "free_motions", 6, source),
         inlier_share=_optional(row, "inlier_share", source),
         residual_m=_optional(row, "residual_m", source),
@@ -183,11 +183,11 @@ def _status(entry: object, source: str) -> Status:
 def _pose(entry: object, source: str) -> Rigid | None:
     if entry is None:
         return None
-    matrix = _numbers(entry, 4, f"{source}: camera_from_model")
+    matrix = _numbers(entry, 4, f"{source}: camera_from_model", rows=4)
     R = matrix[:3, :3]
     eye = torch.eye(3, dtype=torch.float64)
     is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
-    if len(matrix) != 4 or not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+    if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
             f"{source}: camera_from_model is no rigid transform; write 4 rows of 4, a rotation, "
             "metres, and 0 0 0 1 below"
@@ -210,16 +210,21 @@ def _alternatives(entries: object, source: str) -> tuple[Alternative, ...]:
     return tuple(found)
 
 
-def _table(row: dict[str, Any], key: str, width: int, source: str) -> Tensor | None:
-    return None if row.get(key) is None else _numbers(row[key], width, f"{source}: {key}")
+def _table(
+    row: dict[str, Any], key: str, width: int, source: str, rows: int | None = None
+) -> Tensor | None:
+    return None if row.get(key) is None else _numbers(row[key], width, f"{source}: {key}", rows)
 
 
-def _numbers(entry: object, width: int, source: str) -> Tensor:
+def _numbers(entry: object, width: int, source: str, rows: int | None = None) -> Tensor:
+    """Read a table of ``width`` columns, and of ``rows`` rows where that is told."""
     try:
-        values = torch.tensor(entry, dtype=torch.float64).reshape(-1, width)
+        return torch.tensor(entry, dtype=torch.float64).reshape(rows or -1, width)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{source} is not rows of {width} numbers; write them so") from error
-    return values
+        count = "" if rows is None else f"{rows} "
+        raise InputError(
+            f"{source} is not {count}rows of {width} numbers; write them so"
+        ) from error
 
 
 def _optional(row: dict[str, Any], key: str, source: str) -> float | None:
