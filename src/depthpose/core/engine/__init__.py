@@ -19,11 +19,11 @@ from depthpose.core.engine.job import shard_results as shard_results
 from depthpose.core.engine.on_ray import RayEngine as RayEngine
 from depthpose.core.engine.shard import ShardFormat as ShardFormat
 from depthpose.core.engine.shard import read_shard as read_shard
-from depthpose.core.engine.store import absolute as absolute
-from depthpose.core.engine.store import is_url as is_url
-from depthpose.core.engine.store import local_copy as local_copy
 from depthpose.core.engine.work import Done as Done
 from depthpose.core.engine.work import Function as Function
 from depthpose.core.engine.work import Sample as Sample
 from depthpose.core.engine.work import first_sample as first_sample
 from depthpose.core.engine.work import run_here as run_here
+from depthpose.core.files.store import absolute as absolute
+from depthpose.core.files.store import is_url as is_url
+from depthpose.core.files.store import local_copy as local_copy

@@ -8,8 +8,8 @@ from importlib import import_module
 from pathlib import PurePosixPath
 from typing import Any
 
-from depthpose.core.engine.store import absolute, is_url, join, list_files, read_from
 from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.files.store import absolute, is_url, join, list_files, read_from
 
 TARS = (".tar", ".tgz", ".gz")
 MANIFESTS = (".parquet", ".csv")

@@ -11,7 +11,10 @@ from typing import Any
 from depthpose.core.engine.items import Item
 from depthpose.core.engine.plan import PLAN, Block, make_plan
 from depthpose.core.engine.shard import ShardFormat, read_shard
-from depthpose.core.engine.store import (
+from depthpose.core.engine.work import SHARDS, Done, Work
+from depthpose.core.errors import InputError
+from depthpose.core.files import remove_parts
+from depthpose.core.files.store import (
     absolute,
     exists,
     join,
@@ -21,9 +24,6 @@ from depthpose.core.engine.store import (
     read_from,
     refuse_unsafe,
 )
-from depthpose.core.engine.work import SHARDS, Done, Work
-from depthpose.core.errors import InputError
-from depthpose.core.files import remove_parts
 from depthpose.core.run import RECORD, refuse_other_settings, run_record
 
 MANIFEST = "manifest.csv"

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from depthpose.core.engine.items import Item
-from depthpose.core.engine.store import exists, join, publish_bytes, read_from
 from depthpose.core.errors import InputError
+from depthpose.core.files.store import exists, join, publish_bytes, read_from
 
 PLAN = "plan.jsonl"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from depthpose.core.engine.items import import_pyarrow
-from depthpose.core.engine.store import opened, read_from
 from depthpose.core.errors import InputError
+from depthpose.core.files.store import opened, read_from
 
 ShardFormat = Literal["tar", "parquet"]
 

@@ -12,8 +12,8 @@ from typing import Protocol, runtime_checkable
 from depthpose.core.engine.items import Files, Item, refuse_name
 from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat, read_tar, shard_writer
-from depthpose.core.engine.store import exists, join, local_copy, publish, publish_bytes, read_from
 from depthpose.core.errors import InputError
+from depthpose.core.files.store import exists, join, local_copy, publish, publish_bytes, read_from
 
 SHARDS = "shards"
 

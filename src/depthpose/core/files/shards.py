@@ -62,19 +62,10 @@ def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, i
 
 
 def _fetch(shard: Path) -> None:
-    """Bring a shard from where its folder says that it lies, whole or not at all."""
-    from fsspec.core import url_to_fs  # where shards are remote alone: it costs time to load
-
-    from depthpose.core.files.disk import atomic_write
+    """Bring a shard from where its folder says that it lies."""
+    from depthpose.core.files.store import fetch, join  # fsspec takes time to load
 
     source = shard.parent / SOURCE
     if not source.is_file():
         raise InputError(f"{shard}: no such file; check the path")
-    url = f"{json.loads(source.read_text())['url'].rstrip('/')}/{shard.name}"
-    with atomic_write(shard) as part:
-        try:
-            fs, inner = url_to_fs(url)
-            fs.get_file(inner, str(part))
-        except Exception as error:  # a store's client may raise anything
-            said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise InputError(f"{url}: cannot be fetched: {said}") from error
+    fetch(join(json.loads(source.read_text())["url"], shard.name), shard)

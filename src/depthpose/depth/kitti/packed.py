@@ -100,28 +100,21 @@ def local_folder(folder: Path | str) -> Path:
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
     cache = Path(os.environ.get("DEPTHPOSE_CACHE", Path.home() / ".cache/depthpose"))
     here = cache / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
-    for name, data in _small_files(url):
-        write_bytes(here / name, data)
+    _fetch_small(url, here)
     write_json(here / SOURCE, {"url": url})
     return here
 
 
-def _small_files(url: str) -> Iterator[tuple[str, bytes]]:
+def _fetch_small(url: str, here: Path) -> None:
     """Fetch calibration and, last, the index."""
-    from fsspec.core import url_to_fs
+    from depthpose.core.files.store import exists, fetch, join, list_tree  # fsspec takes time
 
-    try:
-        fs, root = url_to_fs(url)
-        for path in fs.find(f"{root}/{_CALIBRATION}"):
-            name = path.removeprefix(root).lstrip("/")
-            if ".." not in Path(name).parts:
-                yield name, fs.cat_file(path)
-        yield INDEX, fs.cat_file(f"{root}/{INDEX}")
-    except FileNotFoundError as error:
-        raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one") from error
-    except Exception as error:  # a store's client may raise anything
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise InputError(f"{url}: cannot be read: {said}") from error
+    if not exists(join(url, INDEX)):
+        raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one")
+    for name, of_file in list_tree(join(url, _CALIBRATION)).items():
+        if ".." not in Path(name).parts:
+            fetch(of_file, here / _CALIBRATION / name)
+    fetch(join(url, INDEX), here / INDEX)
 
 
 def _numbered(frames: list[Frame], shard_bytes: int) -> Iterator[tuple[int, Frame]]:

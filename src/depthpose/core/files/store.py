@@ -143,15 +143,29 @@ def local_copy(url: str, scratch: Path) -> Iterator[Path]:
         yield path
         return
     copy = Path(tempfile.mkdtemp(dir=scratch)) / PurePosixPath(url).name
-    with _refused(url, "read"):
-        fs, inner = url_to_fs(url)
-        fs.get_file(inner, str(copy))
+    _get(url, copy)
     try:
         yield copy
     except InputError as error:
         raise InputError(str(error).replace(str(copy), url)) from error
     finally:
         shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def fetch(url: str, path: Path) -> None:
+    """Copy a file to the disk, whole or not at all.
+
+    Raises:
+        InputError: it is not there or cannot be read, or the disk refuses.
+    """
+    with atomic_write(path) as part:
+        _get(url, part)
+
+
+def _get(url: str, path: Path) -> None:
+    with _refused(url, "read"):
+        fs, inner = url_to_fs(url)
+        fs.get_file(inner, str(path))
 
 
 @contextmanager
@@ -195,6 +209,20 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
         )
     prefix = f"{path.partition('://')[0]}://" if is_url(path) else ""
     return [f"{prefix}{p}" for p in kept]
+
+
+def list_tree(url: str) -> dict[str, str]:
+    """List all files below a folder: their URLs by their names in it; none without a folder.
+
+    Raises:
+        InputError: the store does not answer.
+    """
+    with _refused(url, "listed"):
+        fs, inner = url_to_fs(url)
+        fs.invalidate_cache()
+        root = inner.rstrip("/")
+        names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]
+    return {name: join(url, name) for name in sorted(names)}
 
 
 def _entries(fs: Any, folder: str) -> list[str]:  # noqa: ANN401  fsspec carries no types
