@@ -11,11 +11,10 @@ from typing import Any
 
 import pytest
 import torch
-from tests.core.engine.doubles import InProcessEngine
+from tests.core.engine.doubles import InProcessEngine, unpacked
 from tests.pose.made_object import bottle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.cli import engine, main
-from depthpose.core.engine import read_results, shard_results
 from depthpose.core.files import (
     Cloud,
     write_cloud,
@@ -60,16 +59,6 @@ def double(monkeypatch: pytest.MonkeyPatch) -> InProcessEngine:
     double = InProcessEngine()
     monkeypatch.setattr(engine.EngineOptions, "build", lambda _: double)
     return double
-
-
-def unpacked(out: Path) -> dict[str, dict[str, bytes]]:
-    """All results of a folder of shards; a name that is there twice fails."""
-    found: dict[str, dict[str, bytes]] = {}
-    for done in read_results(str(out)):
-        for name, files in shard_results(str(out), done):
-            assert name not in found
-            found[name] = files
-    return found
 
 
 def files_of(out: Path) -> dict[str, dict[str, bytes]]:

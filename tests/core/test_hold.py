@@ -9,9 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
 from depthpose.core.hold import hold, release_folders, write_once
+from depthpose.core.loop import LoopConfig, train
 from depthpose.core.run import RECORD, claim_folder
 
 HOLDER = """
@@ -71,6 +73,14 @@ def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"a": 1})
     claim_folder(tmp_path, {"a": 1})
     release_folders()
+    with holder(tmp_path, 0) as process:
+        assert process.wait() == 0
+
+
+def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    config = LoopConfig(steps=1, batch_size=2, device="cpu")
+    train(ToyTask(), ToySamples(), config, tmp_path)
     with holder(tmp_path, 0) as process:
         assert process.wait() == 0
 

@@ -17,7 +17,7 @@ from tests.made_street import write_pairs
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.depth.kitti import Dataset, lidar_truth, open_dataset
+from depthpose.depth.kitti import Dataset, lidar_truth, open_dataset, pack_frames
 
 CONFIG = """
 generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],
@@ -83,8 +83,6 @@ def test_shards_give_what_the_folder_gives(
 
 
 def test_a_full_shard_is_closed(pairs: Path, tmp_path: Path) -> None:
-    from depthpose.depth.kitti import pack_frames
-
     assert pack_frames(open_dataset(pairs).frames, tmp_path, 1) == 4
     assert_same(open_dataset(pairs), open_dataset(tmp_path))
 
@@ -92,8 +90,6 @@ def test_a_full_shard_is_closed(pairs: Path, tmp_path: Path) -> None:
 def test_shards_of_a_store_come_when_they_are_read(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from depthpose.depth.kitti import pack_frames
-
     pack_frames(open_dataset(pairs).frames, tmp_path / "shards", 1)
     store = fsspec.filesystem("memory")
     store.put(str(tmp_path / "shards"), "/bucket/streets", recursive=True)

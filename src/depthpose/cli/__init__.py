@@ -37,14 +37,17 @@ COMMANDS = {
         "training:train",
         "stages view, select, stereo, finetune: generator, matcher, one through the other",
     ),
-    "depth calibrate": ("depth:calibrate", "choose when an image is refused as unlike the known"),
+    "depth calibrate": (
+        "calibrating:calibrate",
+        "choose when an image is refused as unlike the known",
+    ),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
-        "data:make_streets",
+        "making:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
     "data make objects": (
-        "data:make_objects",
+        "making:make_objects",
         "made frames of your CAD files on a table, in BOP's layout",
     ),
     "data rectify": (

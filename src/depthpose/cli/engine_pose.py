@@ -6,8 +6,9 @@ from functools import partial
 from pathlib import Path
 
 from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
+from depthpose.cli.pose_inputs import CLOUDS, input_job, object_named
 from depthpose.cli.pose_methods import PoseMethod, pose_methods
-from depthpose.cli.pose_predicting import CLOUDS, estimate_jobs, input_job, object_named
+from depthpose.cli.pose_predicting import estimate_jobs
 from depthpose.core.camera import Camera, read_camera
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Files, Function, Job, Sample, stem

@@ -90,7 +90,7 @@ def predict(
         view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
         engine: where the work is done.
     """
-    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli import pose_inputs, pose_predicting
     from depthpose.cli.pose_methods import pose_methods
     from depthpose.cli.pose_page import write_pose_page
     from depthpose.core.run import own_device
@@ -119,12 +119,12 @@ def predict(
         from depthpose.cli.pose_finding import find_all
 
         known = tuple(model.name for model in method.models)
-        wanted = known if object is None else (posing.object_named(object, method),)
+        wanted = known if object is None else (pose_inputs.object_named(object, method),)
         return find_all(method, Path(depth), camera, wanted, unit, home)
-    name = posing.object_named(object, method)
+    name = pose_inputs.object_named(object, method)
     settings: dict[str, Any] = {"object": name}
     if cloud is not None:
-        jobs = posing.cloud_jobs(Path(cloud), unit or "m", name, home)
+        jobs = pose_inputs.cloud_jobs(Path(cloud), unit or "m", name, home)
         settings |= {"unit": unit or "m"}
     else:
         assert depth is not None
@@ -132,17 +132,17 @@ def predict(
             raise InputError(
                 "--depth needs --camera beside it, and --mask unless it is to be found"
             )
-        jobs = posing.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
+        jobs = pose_inputs.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
         settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}
     settings = {**method.settings, **settings}
-    posing.claim(home, settings, jobs, Path(cloud or depth or out))
-    predictions = posing.predict_all(method, jobs, home, settings, batch, view)
+    pose_predicting.claim(home, settings, jobs, Path(cloud or depth or out))
+    predictions = pose_predicting.predict_all(method, jobs, home, settings, batch, view)
     if predictions is None:
         return 0
-    posing.write_files(predictions, jobs, home, method)
+    pose_predicting.write_files(predictions, jobs, home, method)
     write_pose_page(home, predictions, jobs, method)
-    return posing.say_result(predictions, home)
+    return pose_predicting.say_result(predictions, home)
 
 
 def evaluate(
@@ -219,25 +219,25 @@ def _predict_bop(
     device: str,
     view: str | None,
 ) -> int:
-    from depthpose.cli import pose_predicting as posing
+    from depthpose.cli import pose_inputs, pose_predicting
     from depthpose.cli.pose_masks import find_masks
     from depthpose.cli.pose_page import write_pose_page
     from depthpose.pose.bop import open_bop
 
     folder, split, word = given
     dataset = open_bop(folder, split)
-    dataset = dataset.of_objects(*posing.known_objects(dataset, method))
+    dataset = dataset.of_objects(*pose_inputs.known_objects(dataset, method))
     (masks,) = find_masks([word], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
-    jobs = posing.bop_jobs(dataset, masks, method)
+    jobs = pose_inputs.bop_jobs(dataset, masks, method)
     settings = {**method.settings, **settings, **masks.settings}
-    posing.claim_bop(out, settings, dataset)
-    predictions = posing.predict_all(method, jobs, out, settings, batch, view)
+    pose_predicting.claim_bop(out, settings, dataset)
+    predictions = pose_predicting.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
         return 0
-    posing.write_bop_files(predictions, dataset, out, method)
+    pose_predicting.write_bop_files(predictions, dataset, out, method)
     write_pose_page(out, predictions, jobs, method, dataset)
-    return posing.say_result(predictions, out)
+    return pose_predicting.say_result(predictions, out)
 
 
 def _predict_on_ray(

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from depthpose.cli.pose_inputs import Unreadable
 from depthpose.cli.pose_methods import PoseMethod
-from depthpose.cli.pose_predicting import PAGE, Unreadable
+from depthpose.cli.pose_predicting import PAGE
 from depthpose.core.files import read_image
 from depthpose.core.report import Section, write_page
 from depthpose.core.run import environment

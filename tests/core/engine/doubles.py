@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from depthpose.core.engine import Done, Files, Function, Sample
+from depthpose.core.engine import Done, Files, Function, Sample, read_results, shard_results
 from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat
 from depthpose.core.engine.work import Runner, Work
@@ -70,3 +70,13 @@ def write_texts(folder: Path, texts: dict[str, str]) -> Path:
     for name, text in texts.items():
         (folder / f"{name}.txt").write_text(text)
     return folder
+
+
+def unpacked(out: Path) -> dict[str, dict[str, bytes]]:
+    """All results of a folder of shards; a name that is there twice fails."""
+    found: dict[str, dict[str, bytes]] = {}
+    for done in read_results(str(out)):
+        for name, files in shard_results(str(out), done):
+            assert name not in found
+            found[name] = files
+    return found

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from tests.core.engine.doubles import InProcessEngine, ReverseWork, write_texts
+from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, write_texts
 
-from depthpose.core.engine import Done, Job, find_items, read_results, run_job, shard_results
+from depthpose.core.engine import Done, Job, find_items, read_results, run_job
 from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat, read_shard
 from depthpose.core.engine.work import Work
@@ -20,16 +20,6 @@ def job_of(tmp_path: Path, words: list[str], **changed: object) -> Job:
     given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block": 2} | changed
     items = find_items(words, work.files) if words else []
     return Job(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]
-
-
-def results(out: Path) -> dict[str, dict[str, bytes]]:
-    """All results of a folder; a name that is there twice fails."""
-    found: dict[str, dict[str, bytes]] = {}
-    for done in read_results(str(out)):
-        for name, files in shard_results(str(out), done):
-            assert name not in found
-            found[name] = files
-    return found
 
 
 def calls(tmp_path: Path) -> list[str]:
@@ -60,7 +50,7 @@ def test_every_input_has_its_result_in_one_shard(tmp_path: Path, form: ShardForm
         name: {"back.txt": text[::-1].encode(), "length": str(len(text)).encode()}
         for name, text in texts.items()
     }
-    assert results(tmp_path / "out") == wanted
+    assert unpacked(tmp_path / "out") == wanted
     rows = list(csv.DictReader((tmp_path / "out" / "manifest.csv").read_text().splitlines()))
     assert {row["name"]: row["reason"] for row in rows} == dict.fromkeys(texts, "")
     assert [row["shard"] for row in rows] == [f"00000{k}.{form}" for k in (0, 0, 1, 1, 2)]
@@ -85,7 +75,7 @@ def test_a_rerun_does_what_is_missing_and_nothing_else(tmp_path: Path) -> None:
     assert calls(tmp_path) == ["start", "a", "b", "start", "c", "d", "e", "f"]
     run_job(job, InProcessEngine())
     assert len(calls(tmp_path)) == 8, "where nothing is left, nothing starts"
-    assert list(results(tmp_path / "out")) == list("abcdef")
+    assert list(unpacked(tmp_path / "out")) == list("abcdef")
 
 
 def test_a_shard_without_its_record_is_written_anew(tmp_path: Path) -> None:
@@ -116,11 +106,11 @@ def test_a_failure_stops_no_other_and_is_tried_again(tmp_path: Path) -> None:
     folder = write_texts(tmp_path / "in", {"a": "one", "b": "bad", "c": "two"})
     done = run_job(job_of(tmp_path, [str(folder)], block=3), InProcessEngine())
     assert done[0].failures == [("b", f"{folder / 'b.txt'}: is bad")]
-    assert list(results(tmp_path / "out")) == ["a", "c"]
+    assert list(unpacked(tmp_path / "out")) == ["a", "c"]
     (folder / "b.txt").write_text("mended")
     done = run_job(job_of(tmp_path, [str(folder)], block=3), InProcessEngine())
     assert not done[0].failures
-    assert list(results(tmp_path / "out")) == ["a", "b", "c"]
+    assert list(unpacked(tmp_path / "out")) == ["a", "b", "c"]
 
 
 def test_an_input_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -151,7 +141,7 @@ def test_tar_shards_are_inputs_too(tmp_path: Path) -> None:
     done = run_job(job_of(tmp_path, [], tars=list(map(str, tars))), InProcessEngine())
     assert [one.shard for one in done] == ["000000.tar", "000001.tar"]
     assert [name for one in done for name, _ in one.entries] == ["x/1", "x/2", "3", "4"]
-    found = results(tmp_path / "out")
+    found = unpacked(tmp_path / "out")
     assert {name: files["back.txt"] for name, files in found.items()} == {
         "x/1": b"eno", "x/2": b"owt", "3": b"eerht",
     }  # fmt: skip

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
+from depthpose.core.hold import release_folders
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.host import Wish, leave_signals_to_the_loop, make_accelerator, polite_stop
 from depthpose.core.loop.journal import Journal
@@ -83,8 +84,11 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
     if finish and not run.step:
         raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
     run.steps = run.step if finish else run.steps
-    with polite_stop() as wish:
-        run.walk(on_step, wish)
+    try:
+        with polite_stop() as wish:
+            run.walk(on_step, wish)
+    finally:
+        release_folders()
     return run.seconds
 
 

@@ -10,7 +10,6 @@ import torch
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
-from depthpose.core.hold import release_folders
 from depthpose.core.loop import (
     LoopConfig,
     Progress,
@@ -190,18 +189,15 @@ def _walk(
     names = ("generator", "matcher", "fakestereo")
     claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
     write_config(run.folder / "config.yaml", config)
-    try:
-        seconds = train(
-            task,
-            pairs,
-            config.loop,
-            run.folder,
-            resume=run.resume,
-            finish=run.finish,
-            on_step=run.on_step,
-        )
-    finally:
-        release_folders()
+    seconds = train(
+        task,
+        pairs,
+        config.loop,
+        run.folder,
+        resume=run.resume,
+        finish=run.finish,
+        on_step=run.on_step,
+    )
     return facts, seconds
 
 

@@ -16,6 +16,7 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.alternatives import Copies, find_copies
+from depthpose.pose.estimator.batches import batches, network_directions
 from depthpose.pose.estimator.find import Known, find_objects
 from depthpose.pose.estimator.given import (
     AnyArray,
@@ -27,7 +28,7 @@ from depthpose.pose.estimator.given import (
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.types import PoseEstimate, SeenPoints, ViewInput
+from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _NAME = "input"
@@ -243,7 +244,7 @@ class GeoPoseNet:
                 yield k, _refused(given, prepared, {"cloud": spent_s}), None
             else:
                 ready.append((k, prepared, spent_s))
-        for some in _batches(ready, self.config.batch_voxels):
+        for some in batches(ready, self.config.batch_voxels):
             numbers = [self._number(inputs[k].object) for k, _, _ in some]
             directions, network_s = self._directions([p for _, p, _ in some], numbers)
             total = sum(map(len, directions))
@@ -259,23 +260,8 @@ class GeoPoseNet:
         self, clouds: list[Prepared], numbers: list[int]
     ) -> tuple[list[Float[Tensor, "n k c"]], float]:
         start = time.perf_counter()
-        counts = [len(cloud.points_m) for cloud in clouds]
-        cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
-        grids = [cloud.voxels for cloud in clouds]
-        coordinates = torch.cat([grid.coordinates for grid in grids])
-        turned = (c.points_m @ c.voxels.grid_from_camera.mT for c in clouds)
-        seen = SeenPoints(
-            points_m=torch.cat(list(turned)),
-            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
-            features=torch.cat([grid.features for grid in grids]),
-            class_of_point=torch.tensor(numbers)[cloud_of_point],
-        )
-        outputs = self._network.directions(seen.to(self.config.device)).float().cpu()
-        answers = [
-            _in_camera(some, grid.grid_from_camera)
-            for some, grid in zip(outputs.split(counts), grids, strict=True)
-        ]
-        return answers, time.perf_counter() - start
+        found = network_directions(self._network, clouds, numbers, self.config.device)
+        return found, time.perf_counter() - start
 
     def _pose(
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
@@ -318,14 +304,6 @@ class GeoPoseNet:
         return self._numbers[name]
 
 
-def _in_camera(
-    outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
-) -> Float[Tensor, "n k c"]:
-    """Turn directions back from the network's grid; what stands behind them stays."""
-    directions = outputs[..., :3] @ grid_from_camera
-    return torch.cat([directions, outputs[..., 3:]], -1)
-
-
 def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
     return PoseEstimate(
         name=given.name,
@@ -334,20 +312,3 @@ def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> Po
         reason=refusal.reason,
         seconds=seconds,
     )
-
-
-def _batches(
-    ready: list[tuple[int, Prepared, float]], most: int
-) -> Iterator[list[tuple[int, Prepared, float]]]:
-    """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
-    group: list[tuple[int, Prepared, float]] = []
-    total = 0
-    for item in ready:
-        count = len(item[1].points_m)
-        if group and total + count > most:
-            yield group
-            group, total = [], 0
-        group.append(item)
-        total += count
-    if group:
-        yield group
