@@ -153,8 +153,10 @@ def test_waiting_in_vain_names_what_is_missing() -> None:
         wait_for(["a", "b"], lambda name: name == "a", patience_s=0.1)
 
 
-def test_a_nested_setting_is_named_by_its_path_and_a_new_knob_may_be_none(tmp_path: Path) -> None:
+def test_a_nested_setting_is_named_by_its_path_and_a_new_knob_may_be_off(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"pairs": {"limit": 3}})
-    claim_folder(tmp_path, {"pairs": {"limit": 3, "later": None}})
+    claim_folder(tmp_path, {"pairs": {"limit": 3, "later": None, "share": 0.0}})
+    with pytest.raises(InputError, match=r"pairs\.share = None, but now it is 0\.5"):
+        claim_folder(tmp_path, {"pairs": {"limit": 3, "share": 0.5}})
     with pytest.raises(InputError, match=r"pairs\.limit = 3, but now it is 4"):
         claim_folder(tmp_path, {"pairs": {"limit": 4}})

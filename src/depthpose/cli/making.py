@@ -21,6 +21,7 @@ def make_streets(
     scale: float = 1.0,
     with_antialiasing: bool = True,
     with_lidar: bool = True,
+    clutter_share: float = 0.0,
 ) -> int:
     """Make street scenes with exact disparity, in KITTI's raw layout.
 
@@ -36,6 +37,8 @@ def make_streets(
         scale: size of the pictures: 0.5 makes half as many rows and columns.
         with_antialiasing: smooth edges.
         with_lidar: scan each scene with a LiDAR of 64 beams.
+        clutter_share: share of the scenes that are clutter in place of a street: shapes of all
+            kinds, floating before a ground, a wall or in a box. For matchers.
     """
     from tqdm import tqdm
 
@@ -50,7 +53,11 @@ def make_streets(
             "seed of four digits at most"
         )
     config = StreetsConfig(
-        seed=seed, scale=scale, with_antialiasing=with_antialiasing, with_lidar=with_lidar
+        seed=seed,
+        scale=scale,
+        clutter_share=clutter_share,
+        with_antialiasing=with_antialiasing,
+        with_lidar=with_lidar,
     )
     # Seeds have drives of their own, so they may share a folder.
     days = [_day(day) for day in range(1, 6)]

@@ -245,10 +245,11 @@ def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[
     earlier = record.get("settings") if isinstance(record, dict) else None
     if not isinstance(earlier, dict):
         raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
-    # A knob that one of the two does not know counts as None: a later version may add knobs.
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):
-        if before.get(name) != now.get(name):
+        # A later version may add knobs: one that either does not know counts as off.
+        is_off = (name not in before or name not in now) and not (before | now)[name]
+        if before.get(name) != now.get(name) and not is_off:
             raise InputError(
                 f"{folder}: holds results made with {name} = {before.get(name)!r}, but now it is "
                 f"{now.get(name)!r}. Two settings never share a folder: choose another, or "

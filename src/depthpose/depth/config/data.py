@@ -118,6 +118,10 @@ class StreetsConfig:
     crop: tuple[int, int] | None = None
     """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
 
+    clutter_share: float = 0.0
+    """Share of the scenes that are clutter in place of a street: shapes of all kinds and surfaces,
+    floating before a ground, a wall or in a box."""
+
     with_antialiasing: bool = True
     """Four samples in pixels where edges show."""
 
@@ -141,12 +145,16 @@ class StreetsConfig:
             raise InputError(f"scale must be from 0.02 to 4, got {self.scale}; 1 is full size")
         if self.crop is not None and min(self.crop) < 1:
             raise InputError(f"crop must be two positive sizes, got {self.crop}; None: no crop")
-        if not 0 <= self.jpeg_share <= 1:
-            raise InputError(f"jpeg_share must be from 0 to 1, got {self.jpeg_share}")
+        self._refuse_shares()
         if not 0 <= self.rectification_error_px < 10:
             raise InputError(
                 f"rectification_error_px must be from 0 to 10, got {self.rectification_error_px}"
             )
+
+    def _refuse_shares(self) -> None:
+        for name, share in (("jpeg_share", self.jpeg_share), ("clutter_share", self.clutter_share)):
+            if not 0 <= share <= 1:
+                raise InputError(f"{name} must be from 0 to 1, got {share}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
 """Made street scenes with exact disparity: the data that costs nothing and knows everything."""
 
+from depthpose.depth.streets.clutter import make_clutter as make_clutter
 from depthpose.depth.streets.dataset import Streets as Streets
 from depthpose.depth.streets.frame import StreetFrame as StreetFrame
 from depthpose.depth.streets.frame import draw_scene as draw_scene

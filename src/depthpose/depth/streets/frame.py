@@ -11,6 +11,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.streets.clutter import make_clutter
 from depthpose.depth.streets.lidar import scan, sparse_depth
 from depthpose.depth.streets.materials import NUMBER
 from depthpose.depth.streets.rigs import street_rig
@@ -68,8 +69,15 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     if index < 0:
         raise InputError(f"index is {index}, but frames are counted from 0; take another")
     rig, mount_height_m = street_rig(config, index)
-    scene = make_scene((config.seed, index), mount_height_m)
+    scene = _make_scene(config, index, mount_height_m)
     return draw_scene(scene, rig, config, (config.seed, index))
+
+
+def _make_scene(config: StreetsConfig, index: int, mount_height_m: float) -> StreetScene:
+    seed = (config.seed, index)
+    if np.random.default_rng([75, *seed]).random() < config.clutter_share:
+        return make_clutter(seed)
+    return make_scene(seed, mount_height_m)
 
 
 def draw_scene(

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from depthpose.depth.streets.materials import NUMBER, Color, Number, Surface, Values
 
@@ -39,6 +39,10 @@ class Mesh:
 
     def __len__(self) -> int:
         return len(self.corners)
+
+    def part(self, kept: Bool[np.ndarray, " n"]) -> "Mesh":
+        """Some of its triangles."""
+        return Mesh(**{field.name: getattr(self, field.name)[kept] for field in fields(Mesh)})
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:

@@ -1,6 +1,7 @@
 """One made street: its mesh, its light and where the camera is mounted."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -49,7 +50,7 @@ class StreetScene:
     markings: Markings
     weather: Weather
     camera_from_world: Float64[np.ndarray, "3 3"]
-    place: Place
+    place: Place | Literal["clutter"]
 
 
 def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
@@ -101,7 +102,7 @@ def _seen_from(
     moved = replace(mesh, corners=corners, normals=mesh.normals @ turn)
     # What is far behind casts no shadow that is seen.
     kept = corners[:, :, 2].max(1) > -12
-    return Mesh(**{name: getattr(moved, name)[kept] for name in Mesh.__dataclass_fields__})
+    return moved.part(kept)
 
 
 def _join_far(street: Mesh, hills: Mesh) -> Mesh:
