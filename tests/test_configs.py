@@ -9,8 +9,8 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
-from depthpose.depth.estimator import focal_size
 from depthpose.depth.kitti import open_dataset, read_split
+from depthpose.depth.sizes import focal_size
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.streets import kitti_rig
 from depthpose.depth.synthesis import UNetGenerator

@@ -1,7 +1,7 @@
 """One image: the virtual rig gives the scale, whatever camera took the image."""
 
-import dataclasses
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,20 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint
 from depthpose.core.errors import InputError, Notice
-from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig, SGBMConfig
+from depthpose.depth.config import (
+    Answer,
+    GeneratorConfig,
+    MatcherConfig,
+    PSMNetConfig,
+    SGBMConfig,
+    Speed,
+)
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.estimator import DepthPipeline, resize_image
+from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.virtual import join_matches
-from depthpose.depth.stereo import CallableMatcher, PSMNet
+from depthpose.depth.sizes import resize_image
+from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.unlike import calibrate, measure_familiarity
@@ -137,22 +145,23 @@ def test_one_file_serves_one_image_and_pairs(generator: UNetGenerator, tmp_path:
 def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     generator: UNetGenerator, tmp_path: Path
 ) -> None:
-    sizes: list[torch.Size] = []
+    sizes: list[tuple[int, ...]] = []
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path)
     assert net.matcher is not None
-    match = net.matcher.match
+    assert isinstance(net.matcher, PSMNetMatcher)
+    work_size = net.matcher.work_size
 
-    def spy(left: Tensor, right: Tensor) -> object:
-        sizes.append(left.shape)
-        return match(left, right)
+    def spy(seen: Camera) -> tuple[int, int]:
+        sizes.append(work_size(seen))
+        return sizes[-1]
 
-    net.matcher.match = spy  # pyright: ignore[reportAttributeAccessIssue]
+    net.matcher.work_size = spy  # pyright: ignore[reportAttributeAccessIssue]
     image = torch.rand(3, 40, 60)
     net.estimate(image, camera(60, 40, 100.0, 0.2), right=image, with_check=False)
     net.estimate(image, camera(60, 40, 100.0))
-    assert sizes == [(3, 20, 30), (3, 20, 30)]
+    assert sizes == [(40, 60), (48, 72)]
 
 
 def test_a_generator_alone_takes_any_matcher(generator: UNetGenerator, tmp_path: Path) -> None:
@@ -457,7 +466,7 @@ def test_the_answer_may_be_another_than_the_weights_say(
 def unsure(least: float) -> SelectionGenerator:
     """A network that says sky with a probability of 0.3 and one disparity with 0.7."""
     network = sure_of(1)
-    network.config = dataclasses.replace(network.config, least_confidence=least)
+    network.config = replace(network.config, least_confidence=least)
     network.head.bias = nn.Parameter(torch.tensor([20 + math.log(0.3 / 0.7), 20, 0, 0, 0] * 2))
     return network
 
@@ -506,3 +515,51 @@ def test_a_generator_without_confidence_cannot_be_calibrated(
                         camera=camera(60, 40, FOCAL_PX))  # fmt: skip
     with pytest.raises(InputError, match="no generator with a confidence of its own"):
         measure_familiarity(net, [image])
+
+
+def speed_of(matcher: PSMNet, speed: Speed) -> PSMNetMatcher:
+    return PSMNetMatcher(matcher, MatcherConfig(speed=speed))
+
+
+@pytest.mark.parametrize(
+    ("own_px", "size", "quick", "fine"),
+    [
+        (FOCAL_PX / 2, (40, 60), (80, 120), (80, 120)),
+        (FOCAL_PX, (40, 60), (40, 60), (40, 60)),
+        (FOCAL_PX * 2, (40, 60), (20, 30), (40, 60)),
+        (FOCAL_PX * 10, (700, 1600), (70, 160), (350, 800)),
+        (FOCAL_PX, (700, 1600), (700, 1600), (700, 1600)),
+    ],
+)
+def test_a_fine_match_looks_closer_but_never_enlarges_for_it(
+    own_px: float, size: tuple[int, int], quick: tuple[int, int], fine: tuple[int, int]
+) -> None:
+    network = small_matcher(FOCAL_PX)
+    seen = camera(size[1], size[0], own_px)
+    assert speed_of(network, "quick").work_size(seen) == quick
+    assert speed_of(network, "fine").work_size(seen) == fine
+    free = small_matcher(None)
+    assert speed_of(free, "fine").work_size(seen) == size
+
+
+def test_a_fine_match_is_the_same_network_at_a_larger_size_and_range() -> None:
+    network = small_matcher(FOCAL_PX)
+    left, right = torch.rand(2, 3, 80, 120)
+    seen = camera(120, 80, 1.25 * FOCAL_PX)
+    found = speed_of(network, "fine").match_many([(left, right)], seen)[0]
+    farther = PSMNet(replace(network.config, max_disparity_px=32))
+    farther.load_state_dict(network.state_dict())
+    # 1.25 times 16 px of disparity takes a range of 32, a multiple of 16.
+    expected = PSMNetMatcher(farther).match(left, right)
+    assert torch.equal(found.disparity_px, expected.disparity_px)
+    quick = speed_of(network, "quick").match_many([(left, right)], seen)[0]
+    assert not torch.equal(found.disparity_px, quick.disparity_px)
+
+
+def test_at_the_focal_length_of_training_there_is_one_speed() -> None:
+    network = small_matcher(FOCAL_PX)
+    pairs = [(torch.rand(3, 40, 60), torch.rand(3, 40, 60)) for _ in range(2)]
+    seen = camera(60, 40, FOCAL_PX)
+    quick, fine = (speed_of(network, s).match_many(pairs, seen) for s in ("quick", "fine"))
+    for one, other in zip(quick, fine, strict=True):
+        assert torch.equal(one.disparity_px, other.disparity_px)

@@ -18,7 +18,8 @@ WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start",
 """Arguments that name weights, by name or file."""
 _WORDS = ("psmnet", "sgbm", "nothing", "open3d")
 """What they may say in place of weights."""
-_PREFIXES = ("both:", "sgbm:")
+_PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
+"""Before the name of weights: how they are used."""
 
 
 def refuse_missing(given: Mapping[str, object]) -> None:

@@ -12,7 +12,7 @@ from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import own_device
-from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig
+from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig, Speed
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.floors import NearestImageFloor, RowDepthFloor
 from depthpose.depth.kitti import Dataset
@@ -103,13 +103,17 @@ def weights_method(
 def named_method(word: str, config: MatcherConfig) -> Method:
     """Build the method of a word: weights by file or name, perhaps with ``both:`` and the like.
 
-    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from.
+    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
+    ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.
     """
     how, _, name = word.rpartition(":")
     if how in get_args(Answer):
         return weights_method(name, config, with_right=False, answer=cast("Answer", how))
     if how == "both":
         return weights_method(name, config, with_right=True)
+    if how in get_args(Speed):
+        method = weights_method(name, replace(config, speed=how), with_right=True)
+        return method._replace(name=f"{method.name}-{how}")
     if how == "sgbm":
         return weights_method(name, config, with_right=False, matcher="sgbm")
     return weights_method(word, config)

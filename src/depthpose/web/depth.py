@@ -6,8 +6,11 @@ import time
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
-from depthpose.depth.estimator import FakestereoNet, focal_size, work_focal_px
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator.virtual import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
+from depthpose.depth.sizes import focal_size
+from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.pages.depth import depth_facts, depth_scene, said_grey
 from depthpose.web.answer import Answer, Shown, read_files
@@ -110,18 +113,22 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
     camera = pair.camera
     assert camera is not None
     rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
-    wanted_px = [] if rig is not None and rig.answer == "own" else [work_focal_px(net.matcher)]
-    if rig is not None:
-        wanted_px.append(rig.virtual_focal_px)
-    sizes = [focal_size(camera, focal_px) for focal_px in wanted_px if focal_px is not None]
     height, width = pair.left.shape[1:]
-    if not sizes and height * width > _MOST_WORK_PIXELS:
+    sizes = []
+    if rig is not None:
+        sizes.append(focal_size(camera, rig.virtual_focal_px))
+        camera = square_camera(sizes[0], rig.virtual_focal_px)
+    if rig is None or rig.answer != "own":
+        own = (camera.height, camera.width)
+        matcher = net.matcher
+        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else own)
+    rows, columns = max(sizes, key=math.prod)
+    if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
             f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
             f"they are, and this page computes {_MOST_WORK_PIXELS / 1e6:g} million at most; scale "
             "both images down, and the focal length with them, or use the command line"
         )
-    rows, columns = max(sizes, key=math.prod, default=(0, 0))
     if rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
             f"a focal length of {float(camera.K[0, 0]):g} px for {camera.width}x{camera.height} "

@@ -1,12 +1,16 @@
 """Knobs of the stereo matchers, and the floors they must beat."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from depthpose.core.errors import InputError
 
 FloorName = Literal["rows", "nearest"]
 """The best constant depth of each image row; the depth of the training image most alike."""
+
+
+Speed = Literal["quick", "fine"]
+"""How much time a match may take: see :class:`MatcherConfig`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +68,12 @@ class MatcherConfig:
     """fp32 is exact; bf16 is faster and halves the memory, at some hundredths of a pixel. A
     processor without bf16 (AVX-512, AMX) takes fp32."""
 
+    speed: Speed = "fine"
+    """quick: pairs of a known camera are matched at the focal length that the weights were trained
+    at; fine: at up to 280,000 pixels where that is more, never enlarged beyond it, and through up
+    to 1.5 times the disparities: for KITTI 3 to 4 times the time. Weights that match pairs as they
+    are have one speed."""
+
     max_memory_bytes: int | None = None
     """Bound on the memory of activations, exact (no tiles); None: no bound."""
 
@@ -86,6 +96,8 @@ class MatcherConfig:
         """Refuse values that no run can have."""
         if self.precision not in ("fp32", "bf16"):
             raise InputError(f"precision must be 'fp32' or 'bf16', got {self.precision!r}")
+        if self.speed not in get_args(Speed):
+            raise InputError(f"speed must be 'quick' or 'fine', got {self.speed!r}")
         if self.max_memory_bytes is not None and self.max_memory_bytes < 1:
             raise InputError(
                 f"max_memory_bytes must be positive, got {self.max_memory_bytes}; None: no bound"

@@ -2,10 +2,7 @@
 
 from depthpose.depth.estimator.inputs import Picture as Picture
 from depthpose.depth.estimator.inputs import refuse_unrectified as refuse_unrectified
-from depthpose.depth.estimator.matchers import work_focal_px as work_focal_px
 from depthpose.depth.estimator.net import DEFAULT as DEFAULT
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
 from depthpose.depth.estimator.pipeline import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.pipeline import pipeline as pipeline
-from depthpose.depth.estimator.virtual import focal_size as focal_size
-from depthpose.depth.estimator.virtual import resize_image as resize_image

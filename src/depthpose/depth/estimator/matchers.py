@@ -10,11 +10,6 @@ from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.weights import DepthWeights
 
 
-def work_focal_px(matcher: Matcher | None) -> float | None:
-    """Focal length that the matcher's weights were trained at, where they say so [px]."""
-    return matcher.network_config.work_focal_px if isinstance(matcher, PSMNetMatcher) else None
-
-
 def set_answer(found: DepthWeights | None, answer: Answer) -> None:
     """Let depth of one image come from elsewhere than the weights say.
 

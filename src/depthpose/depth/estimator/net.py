@@ -30,16 +30,10 @@ from depthpose.depth.estimator.inputs import (
     refuse_unrectified,
     usable_right,
 )
-from depthpose.depth.estimator.matchers import choose_matcher, set_answer, work_focal_px
-from depthpose.depth.estimator.virtual import (
-    focal_size,
-    from_virtual,
-    join_matches,
-    resize_image,
-    resized_match,
-    square_camera,
-)
-from depthpose.depth.stereo import Matcher, PSMNetMatcher
+from depthpose.depth.estimator.matchers import choose_matcher, set_answer
+from depthpose.depth.estimator.virtual import from_virtual, join_matches, square_camera
+from depthpose.depth.sizes import focal_size, resize_image
+from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
@@ -303,22 +297,11 @@ class FakestereoNet:
     def _match_many(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
     ) -> list[Match]:
-        """Match at the focal length that the matcher's weights want, and come back."""
         assert self.matcher is not None, "checked before"
-        height, width = left.shape[2:]
-        work_px = work_focal_px(self.matcher)
-        size = (height, width)
-        if work_px is not None and camera is not None:
-            size = focal_size(camera, work_px)
-        pairs = [
-            (resize_image(one, *size), resize_image(other, *size))
-            for one, other in zip(left, right, strict=True)
-        ]
-        if isinstance(self.matcher, PSMNetMatcher) and len(pairs) > 1:
-            found = self.matcher.match_many(pairs)
-        else:
-            found = [self.matcher.match(*pair) for pair in pairs]
-        return [resized_match(match, height, width) for match in found]
+        pairs = list(zip(left, right, strict=True))
+        if isinstance(self.matcher, CameraMatcher):
+            return self.matcher.match_many(pairs, camera)
+        return [self.matcher.match(*pair) for pair in pairs]
 
     def _usable_alone(self, image: StereoInput) -> tuple[Synthesiser, Camera]:
         if self.synthesiser is None:

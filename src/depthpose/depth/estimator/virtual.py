@@ -1,24 +1,17 @@
 """To the rig that a generator imitates, or a matcher was trained at, and back."""
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
-from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth, resize_disparity
+from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
+from depthpose.depth.sizes import resize_image, resized_map, resized_match
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 SKY_M = 10_000.0
 """What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
-
-
-def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
-    """Rows and columns at which the camera's image has ``focal_px``, with square pixels."""
-    rows = round(camera.height * focal_px / float(camera.K[1, 1]))
-    columns = round(camera.width * focal_px / float(camera.K[0, 0]))
-    return max(rows, 1), max(columns, 1)
 
 
 def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
@@ -29,17 +22,6 @@ def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
         dtype=torch.float64,
     )
     return Camera(width=columns, height=rows, K=K)
-
-
-def resize_image(
-    image: Float[Tensor, "3 _ _"], height: int, width: int
-) -> Float[Tensor, "3 {height} {width}"]:
-    """Resize bilinearly, averaging where it shrinks."""
-    if image.shape[1:] == (height, width):
-        return image
-    shrinks = height < image.shape[1] or width < image.shape[2]
-    resized = F.interpolate(image[None], (height, width), mode="bilinear", antialias=shrinks)
-    return resized[0].clamp(0, 1)
 
 
 def from_virtual(
@@ -58,7 +40,7 @@ def from_virtual(
     depth_m = depth_from_disparity(seen.disparity_px, imitated)
     disparity_px = seen.disparity_px
     if is_sky is not None:
-        share = _resized_map(is_sky.float(), height, width)
+        share = resized_map(is_sky.float(), height, width)
         is_sky = share > 0.5
         depth_m = torch.where(is_sky, SKY_M, depth_m)
         sky_px = float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M
@@ -86,20 +68,3 @@ def join_matches(one: Match, other: Match) -> Match:
     logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
     log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
     return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
-
-
-def resized_match(match: Match, height: int, width: int) -> Match:
-    """Bring a match to another size of its image."""
-    sure = match.confidence
-    return Match(
-        disparity_px=resize_disparity(match.disparity_px, height, width),
-        confidence=None if sure is None else _resized_map(sure, height, width),
-    )
-
-
-def _resized_map(
-    values: Float[Tensor, "_ _"], height: int, width: int
-) -> Float[Tensor, "{height} {width}"]:
-    if values.shape == (height, width):
-        return values
-    return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]

@@ -1,7 +1,7 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
 from depthpose.depth.stereo.inference import PSMNetInference
-from depthpose.depth.stereo.matcher import CallableMatcher, Matcher, check_pair
+from depthpose.depth.stereo.matcher import CallableMatcher, CameraMatcher, Matcher, check_pair
 from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import (
@@ -16,6 +16,7 @@ from depthpose.depth.stereo.weights import import_psmnet
 
 __all__ = [
     "CallableMatcher",
+    "CameraMatcher",
     "Footprint",
     "Matcher",
     "PSMNet",

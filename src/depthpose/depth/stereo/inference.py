@@ -58,10 +58,21 @@ class PSMNetInference:
 
     @torch.no_grad()
     def match(
-        self, left: Views, right: Views, steps: Steps, *, with_confidence: bool = False
+        self,
+        left: Views,
+        right: Views,
+        steps: Steps,
+        *,
+        max_disparity_px: int | None = None,
+        with_confidence: bool = False,
     ) -> list[Match]:
-        """Match normalised pairs of one size whose sides suit the network."""
-        size = Size(self.config.max_disparity_px, *left.shape[2:])
+        """Match normalised pairs of one size whose sides suit the network.
+
+        ``max_disparity_px`` takes the place of the network's own: it looks over disparities with
+        the same filters everywhere, so it can look farther than it did in training.
+        """
+        reach_px = max_disparity_px or self.config.max_disparity_px
+        size = Size(reach_px, *left.shape[2:])
         found = [
             expected_disparity(
                 cost,
@@ -70,20 +81,22 @@ class PSMNetInference:
                 chunk_bytes=steps.chunk_bytes,
                 with_confidence=with_confidence,
             )
-            for cost in self.cost(left, right, steps)
+            for cost in self.cost(left, right, steps, reach_px)
         ]
         return [Match(disparity_px=d, confidence=c) for d, c in found]
 
-    def cost(self, left: Views, right: Views, steps: Steps) -> Float[Tensor, "b h4 w4 d4"]:
+    def cost(
+        self, left: Views, right: Views, steps: Steps, max_disparity_px: int | None = None
+    ) -> Float[Tensor, "b h4 w4 d4"]:
         """Answer the cost after the last hourglass."""
-        cost0 = whole(self._cost0(self._look(left, right), steps))
+        bins = (max_disparity_px or self.config.max_disparity_px) // 4
+        cost0 = whole(self._cost0(self._look(left, right, bins), steps))
         pass_ = _Pass(self, cost0, steps)
         for index in range(3):
             pass_.run(index)
         return pass_.finish()
 
-    def _look(self, left: Views, right: Views) -> list[LookedPair]:
-        bins = self.config.max_disparity_px // 4
+    def _look(self, left: Views, right: Views, bins: int) -> list[LookedPair]:
         both = zip(self._describe(left), self._describe(right), strict=True)
         return [self.first.look(one[None], other[None], bins) for one, other in both]
 

@@ -1,6 +1,6 @@
 """What a stereo matcher is, what it takes, and the tenant that wraps a function of the user's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -8,13 +8,18 @@ import torch
 from torch import Tensor
 
 from depthpose.core.arrays import check_image
+from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.types import Match
 
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Anything that turns a rectified pair into the disparity of its left image."""
+    """Anything that turns a rectified pair into the disparity of its left image.
+
+    A matcher may be a :class:`CameraMatcher` too, which is given several pairs at once and what
+    camera took them.
+    """
 
     def match(self, left: Tensor, right: Tensor) -> Match:
         """Match one pair.
@@ -26,6 +31,29 @@ class Matcher(Protocol):
         Raises:
             InputError: the images are no such pair, or this matcher cannot take them.
         """
+        ...
+
+
+@runtime_checkable
+class CameraMatcher(Matcher, Protocol):
+    """A matcher that chooses at which size it looks at pairs, and takes several at once."""
+
+    def match_many(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
+    ) -> list[Match]:
+        """Match pairs of one camera.
+
+        Args:
+            pairs: left and right images, as for ``match``.
+            camera: of the left images; None: it is not known.
+
+        Raises:
+            InputError: as for ``match``.
+        """
+        ...
+
+    def work_size(self, camera: Camera) -> tuple[int, int]:
+        """Rows and columns at which it looks at the images of a camera [px]."""
         ...
 
 

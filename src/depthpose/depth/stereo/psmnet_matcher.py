@@ -1,17 +1,22 @@
 """PSMNet as a matcher: images of any size in, disparity and confidence out."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
+from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.disparity import left_right_difference_px
+from depthpose.depth.sizes import focal_size, resize_image, resized_match
 from depthpose.depth.stereo.inference import PSMNetInference
 from depthpose.depth.stereo.matcher import check_pair
 from depthpose.depth.stereo.plan import Footprint
@@ -24,6 +29,12 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 Views = Float[Tensor, "b 3 h w"]
+
+_FINE_PIXELS = 280_000
+"""Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
+
+_MOST_REACH = 1.5
+"""Times the disparities of training that a fine match looks through at most."""
 
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
@@ -58,24 +69,65 @@ class PSMNetMatcher:
         Raises:
             InputError: unusable images, or a memory bound that is too small for them.
         """
-        return self._match(left, right, with_tiles=self.config.tile_px is not None)
+        return self.match_many([(left, right)])[0]
 
     @torch.no_grad()
-    def match_many(self, pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Match]:
+    def match_many(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
+    ) -> list[Match]:
         """Match pairs; those of one size together, unless memory is bounded or there are tiles.
 
-        A processor is busy with one pair; it is a GPU that gains.
+        Pairs of a known camera are matched at the size of :meth:`work_size`. A processor is busy
+        with one pair; it is a GPU that gains from several.
 
         Raises:
             InputError: as :meth:`match`.
         """
-        is_alone = self.config.tile_px is not None or self.config.max_memory_bytes is not None
-        if is_alone or len({left.shape for left, _ in pairs}) > 1:
-            return [self.match(left, right) for left, right in pairs]
         for left, right in pairs:
             check_pair(left, right)
-        views = [self._normalised(torch.stack(list(of))) for of in zip(*pairs, strict=True)]
-        return self._match_both_ways(views[0], views[1], pairs[0][0].device)
+        if camera is None or self.network_config.work_focal_px is None:
+            return self._match_alike(pairs, self.network_config)
+        size = self.work_size(camera)
+        network = self._reaching(self._work_focal_px(camera))
+        seen = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
+        found = self._match_alike(seen, network)
+        sizes = [left.shape[1:] for left, _ in pairs]
+        return [resized_match(match, *own) for match, own in zip(found, sizes, strict=True)]
+
+    def work_size(self, camera: Camera) -> tuple[int, int]:
+        """Rows and columns at which images of a camera are matched [px]."""
+        if self.network_config.work_focal_px is None:
+            return camera.height, camera.width
+        return focal_size(camera, self._work_focal_px(camera))
+
+    def _work_focal_px(self, camera: Camera) -> float:
+        """Focal length at which images of a camera are matched [px]."""
+        trained_px = self.network_config.work_focal_px
+        assert trained_px is not None
+        if self.config.speed == "quick":
+            return trained_px
+        share = math.sqrt(_FINE_PIXELS / (camera.height * camera.width))
+        return max(trained_px, float(camera.K[0, 0]) * min(share, 1.0))
+
+    def _reaching(self, focal_px: float) -> PSMNetConfig:
+        """Give the network with the disparities that a larger size asks for."""
+        trained = self.network_config
+        assert trained.work_focal_px is not None
+        larger = min(focal_px / trained.work_focal_px, _MOST_REACH)
+        reach_px = round(trained.max_disparity_px * larger, 3)
+        return replace(trained, max_disparity_px=16 * math.ceil(reach_px / 16))
+
+    def _match_alike(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], network: PSMNetConfig
+    ) -> list[Match]:
+        with_tiles = self.config.tile_px is not None
+        is_alone = with_tiles or self.config.max_memory_bytes is not None
+        if is_alone or len({left.shape for left, _ in pairs}) > 1:
+            groups = [[pair] for pair in pairs]
+        else:
+            groups = [list(pairs)]
+        found = [self._match(group, network, with_tiles=with_tiles) for group in groups]
+        return list(chain(*found))
 
     @torch.no_grad()
     def match_whole(self, left: Tensor, right: Tensor) -> Match:
@@ -84,20 +136,24 @@ class PSMNetMatcher:
         Raises:
             InputError: as :meth:`match`.
         """
-        return self._match(left, right, with_tiles=False)
-
-    def _match(self, left: Tensor, right: Tensor, *, with_tiles: bool) -> Match:
         check_pair(left, right)
-        pair = [self._normalised(image[None]) for image in (left, right)]
-        return self._match_both_ways(pair[0], pair[1], left.device, with_tiles=with_tiles)[0]
+        return self._match([(left, right)], self.network_config, with_tiles=False)[0]
+
+    def _match(
+        self, pairs: list[tuple[Tensor, Tensor]], network: PSMNetConfig, *, with_tiles: bool
+    ) -> list[Match]:
+        """Match pairs of one size together."""
+        views = [self._normalised(torch.stack(list(of))) for of in zip(*pairs, strict=True)]
+        way = self._match_tiled if with_tiles else self._match_padded
+        found = self._match_both_ways(partial(way, network=network), views[0], views[1])
+        return [_moved(match, pairs[0][0].device) for match in found]
 
     def _normalised(self, views: Views) -> Views:
         return normalise(views.to(self.device, torch.float32))
 
     def _match_both_ways(
-        self, left: Views, right: Views, device: torch.device, *, with_tiles: bool = False
+        self, one_way: Callable[[Views, Views], list[Match]], left: Views, right: Views
     ) -> list[Match]:
-        one_way = self._match_tiled if with_tiles else self._match_padded
         found = one_way(left, right)
         if self.config.with_left_right_check:
             mirrored = one_way(right.flip(-1), left.flip(-1))
@@ -105,32 +161,37 @@ class PSMNetMatcher:
                 lower_where_disagreeing(match, other.disparity_px.flip(-1))
                 for match, other in zip(found, mirrored, strict=True)
             ]
-        return [_moved(match, device) for match in found]
+        return found
 
-    def _match_tiled(self, left: Views, right: Views) -> list[Match]:
+    def _match_tiled(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
         assert self.config.tile_px is not None
-        reach = self.network_config.max_disparity_px
+        reach = network.max_disparity_px
         tiling = Tiling(*self.config.tile_px, self.config.tile_overlap_px, reach)
 
         def match_tile(one: Tensor, other: Tensor) -> Match:
-            return self._match_padded(one[None], other[None])[0]
+            return self._match_padded(one[None], other[None], network)[0]
 
         both = zip(left, right, strict=True)
         return [match_tiles(match_tile, one, other, tiling) for one, other in both]
 
-    def _match_padded(self, left: Views, right: Views) -> list[Match]:
+    def _match_padded(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
         """Match normalised pairs of any size: pad, run, crop back."""
         h, w = left.shape[-2:]
-        least = self.network_config.min_side_px
+        least = network.min_side_px
         padded = pad_top_right(left, least), pad_top_right(right, least)
         footprint = Footprint(
-            config=self.network_config,
+            config=network,
             height=padded[0].shape[-2],
             width=padded[0].shape[-1],
             dtype=DTYPES[self.config.precision],
         )
         steps = footprint.plan(self.config.max_memory_bytes)
-        found = self._inference.match(*padded, steps, with_confidence=self.config.with_confidence)
+        found = self._inference.match(
+            *padded,
+            steps,
+            max_disparity_px=network.max_disparity_px,
+            with_confidence=self.config.with_confidence,
+        )
         return [_cropped(match, h, w) for match in found]
 
 

@@ -119,7 +119,7 @@ def _fence(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m:
     up = np.array([0, size_m / 2, 0])
     surface = _surface(rng, size_m)
     count = int(rng.integers(4, 20))
-    radius = np.linalg.norm(along) / count * rng.uniform(0.05, 0.3)
+    radius = float(np.linalg.norm(along)) / count * rng.uniform(0.05, 0.3)
     for share in np.linspace(-0.5, 0.5, count):
         b.tube(centre + share * along - up, centre + share * along + up, (radius, radius), surface)
     for height in (-0.8, 0.8):
