@@ -204,7 +204,10 @@ class FakestereoNet:
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)
         return DepthEstimate(
-            depth_m=depth_m, disparity_px=match.disparity_px, confidence=match.confidence
+            depth_m=depth_m,
+            disparity_px=match.disparity_px,
+            confidence=match.confidence,
+            seen=pair,
         )
 
     @torch.inference_mode()
