@@ -92,7 +92,7 @@ def write_estimate_cloud(
 
 
 def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
-    """Give :meth:`DepthEstimate.cloud` of what was estimated from this input.
+    """Give ``DepthEstimate.cloud`` of what was estimated from this input.
 
     Raises:
         InputError: there are no metres, because there was no camera, or no baseline.
