@@ -60,6 +60,10 @@ COMMANDS = {
         "truth for pairs that have none, by a matcher, where both views agree",
     ),
     "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
+    "data export-depth": (
+        "exchanging:export_depth",
+        "predicted depth as COLMAP's and nerfstudio's files",
+    ),
     "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),

@@ -11,7 +11,7 @@ from depthpose.core.shipped import find_weights
 PATHS = frozenset({
     *("images", "left", "right", "camera", "cloud", "depth", "mask", "bop", "data", "held_out"),
     *("train", "evaluation", "path", "config", "cad", "csv", "predictions", "targets", "file"),
-    *("models", "kitti", "linemod"),
+    *("models", "kitti", "linemod", "results"),
 })  # fmt: skip
 """Arguments of commands that name files or folders that are read."""
 WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})

@@ -44,6 +44,18 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
         raise MissingExtraError("opencv-python-headless", "opencv", purpose) from error
 
 
+def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
+    """Import Open3D where it is used; its absence says which extra brings it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module("open3d")
+    except ImportError as error:
+        raise MissingExtraError("open3d", "open3d", purpose) from error
+
+
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
     """Refuse a word that is none of the known ones.
 

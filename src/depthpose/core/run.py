@@ -177,6 +177,14 @@ def claim_names(
         write_json(record, known | wanted)
 
 
+def read_sources(folder: Path) -> dict[str, Path]:
+    """Give the file that each result of ``folder`` was made from, by the name of the result."""
+    record = folder / _SOURCES
+    known = read_json(record) if record.exists() else {}
+    files = known.items() if isinstance(known, dict) else ()
+    return {name: Path(path) for name, path in files if isinstance(path, str)}
+
+
 def refuse_to_replace(path: Path) -> None:
     """Refuse to write one file over another that is there already.
 

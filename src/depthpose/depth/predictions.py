@@ -1,14 +1,14 @@
 """Estimates as files: what they are called, writing them all or nothing, reading them back."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.core.camera import Camera, StereoRig, back_project
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -92,17 +92,12 @@ def write_estimate_cloud(
 
 
 def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
-    """Give the coloured points nearer than ``far_m``, in the left camera's frame.
+    """Give ``DepthEstimate.cloud`` of what was estimated from this input.
 
     Raises:
         InputError: there are no metres, because there was no camera, or no baseline.
     """
-    if estimate.depth_m is None or pair.camera is None:
-        raise InputError(f"{pair.name}: a cloud needs metres: give a camera with a baseline.")
-    points_m = back_project(estimate.depth_m, pair.camera.K).reshape(-1, 3)
-    is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
-    color = pair.left.permute(1, 2, 0).reshape(-1, 3)
-    return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
+    return replace(estimate, seen=pair).cloud(far_m)
 
 
 def is_finished(folder: Path, name: str) -> bool:

@@ -1,11 +1,15 @@
 """What flows through the depth room: input apart from truth, and the estimate."""
 
 from dataclasses import dataclass
+from typing import Any
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.core.camera import Camera
+from depthpose.core.camera import Camera, back_project
+from depthpose.core.errors import InputError
+from depthpose.core.files import Cloud
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,6 +87,8 @@ class DepthEstimate:
             know such images. None for pairs, and where the generator has no confidence.
         warning: what speaks against the whole of it, such as an image unlike those that the
             weights know; else empty.
+        seen: what it was estimated from, for its colours and camera; None where files hold the
+            estimate alone.
     """
 
     depth_m: Float[Tensor, "h w"] | None
@@ -92,6 +98,33 @@ class DepthEstimate:
     is_sky: Bool[Tensor, "h w"] | None = None
     familiarity: float | None = None
     warning: str = ""
+    seen: StereoInput | None = None
+
+    def cloud(self, far_m: float = 80.0) -> Cloud:
+        """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.
+
+        Raises:
+            InputError: there are no metres, or what was seen is not known.
+        """
+        if self.seen is None:
+            raise InputError("this estimate came without its image; estimate again, or set seen=")
+        if self.depth_m is None or self.seen.camera is None:
+            raise InputError(
+                f"{self.seen.name}: a cloud needs metres: give a camera with a baseline."
+            )
+        points_m = back_project(self.depth_m, self.seen.camera.K).reshape(-1, 3)
+        is_kept = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
+        color = self.seen.left.permute(1, 2, 0).reshape(-1, 3)
+        return Cloud(points=points_m[is_kept].float(), color=color[is_kept])
+
+    def to_open3d(self, far_m: float = 80.0) -> Any:  # noqa: ANN401  Open3D carries no types
+        """Give :meth:`cloud` as ``open3d.geometry.PointCloud`` (extra ``open3d``).
+
+        Raises:
+            InputError: as :meth:`cloud`.
+            MissingExtraError: Open3D is not installed.
+        """
+        return self.cloud(far_m).to_open3d()
 
     def __repr__(self) -> str:
         """Say it in one line: size, metres, certainty."""

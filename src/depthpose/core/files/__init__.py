@@ -8,6 +8,8 @@ from depthpose.core.files.cloud import Cloud as Cloud
 from depthpose.core.files.cloud import read_cloud as read_cloud
 from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
+from depthpose.core.files.colmap import read_colmap_map as read_colmap_map
+from depthpose.core.files.colmap import write_colmap_map as write_colmap_map
 from depthpose.core.files.depth_png import read_depth_png as read_depth_png
 from depthpose.core.files.depth_png import read_disparity_png as read_disparity_png
 from depthpose.core.files.depth_png import write_depth_png as write_depth_png

@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, import_open3d
 from depthpose.core.files.disk import AnyPath, read_bytes, refused_suffix, write_bytes
 from depthpose.core.files.maps import read_npy, to_float32
 from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
@@ -35,6 +36,19 @@ class Cloud:
 
     points: Float32[Tensor, "n 3"]
     color: Float32[Tensor, "n 3"] | None = None
+
+    def to_open3d(self) -> Any:  # noqa: ANN401  Open3D's classes carry no types
+        """Give the same points, and colours where there are, as ``open3d.geometry.PointCloud``.
+
+        Raises:
+            MissingExtraError: Open3D is not installed.
+        """
+        open3d = import_open3d("a cloud of Open3D")
+        cloud = open3d.geometry.PointCloud()
+        cloud.points = open3d.utility.Vector3dVector(self.points.double().cpu().numpy())
+        if self.color is not None:
+            cloud.colors = open3d.utility.Vector3dVector(self.color.double().cpu().numpy())
+        return cloud
 
 
 def read_cloud(path: AnyPath) -> Cloud:

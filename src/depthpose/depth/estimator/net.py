@@ -19,7 +19,7 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator.inputs import (
@@ -34,12 +34,15 @@ from depthpose.depth.estimator.matchers import choose_matcher, set_answer
 from depthpose.depth.estimator.virtual import from_virtual, join_matches, square_camera
 from depthpose.depth.sizes import focal_size, resize_image
 from depthpose.depth.stereo import CameraMatcher, Matcher
-from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser
+from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser, openvino_generator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
 
 DEFAULT = "default"
 """Name of the weights that are taken where none are named."""
+
+ENGINES = ("torch", "openvino")
+"""What computes a generator that selects."""
 
 
 class FakestereoNet:
@@ -99,6 +102,7 @@ class FakestereoNet:
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
         with_unlike: bool = False,
+        engine: str = "torch",
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
@@ -116,11 +120,16 @@ class FakestereoNet:
                 (:class:`~depthpose.depth.config.SelectionConfig`).
             with_unlike: answer images that are unlike what the weights know too, with a
                 ``warning`` in the estimate, in place of refusing them.
+            engine: what computes a generator that selects on the processor: torch, or openvino
+                (extra ``openvino``), half the network's time after some seconds, in ``config``'s
+                precision: a quarter in bf16.
 
         Raises:
-            InputError: no such weights, no matcher in what was given, or an ``answer`` that these
-                weights cannot give.
+            InputError: no such weights, no matcher in what was given, an ``answer`` that these
+                weights cannot give, or an ``engine`` that cannot compute them.
+            MissingExtraError: OpenVINO is not installed.
         """
+        refuse_unknown("engine", engine, ENGINES)
         if weights is None and (matcher is None or matcher == "psmnet"):
             weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
@@ -136,8 +145,13 @@ class FakestereoNet:
         chosen = choose_matcher(weights, found, matcher, own, config)
         said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
         if found is None or found.generator is None:
+            if engine != "torch":
+                raise InputError(f"engine is {engine!r}, and there is no generator; leave it away")
             return cls(chosen, terms=terms, weights=said)
-        synthesiser = make_synthesiser(found.generator, run.device)
+        generator = found.generator
+        if engine == "openvino":
+            generator = openvino_generator(generator, run.device, run.precision)
+        synthesiser = make_synthesiser(generator, run.device)
         return cls(chosen, synthesiser, terms=terms, weights=said, with_unlike=with_unlike)
 
     from_pretrained = load
@@ -198,7 +212,10 @@ class FakestereoNet:
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)
         return DepthEstimate(
-            depth_m=depth_m, disparity_px=match.disparity_px, confidence=match.confidence
+            depth_m=depth_m,
+            disparity_px=match.disparity_px,
+            confidence=match.confidence,
+            seen=pair,
         )
 
     @torch.inference_mode()

@@ -53,6 +53,7 @@ def from_virtual(
         confidence=seen.confidence,
         right=resize_image(right, height, width),
         is_sky=is_sky,
+        seen=image,
     )
 
 

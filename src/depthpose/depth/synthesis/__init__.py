@@ -6,6 +6,7 @@ from depthpose.depth.synthesis.discriminators import (
     make_discriminator,
 )
 from depthpose.depth.synthesis.generator import UNetGenerator
+from depthpose.depth.synthesis.openvino import openvino_generator
 from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
     Drawn,
@@ -28,4 +29,5 @@ __all__ = [
     "UNetGenerator",
     "make_discriminator",
     "make_synthesiser",
+    "openvino_generator",
 ]

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import MissingExtraError
+from depthpose.core.errors import import_open3d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines.config import FpfhConfig
 from depthpose.pose.cloud import cloud_from_depth
@@ -34,7 +33,7 @@ class FpfhRegistration:
 
     def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
         self.model, self.config = model, config or FpfhConfig()
-        self._open3d = _import_open3d()
+        self._open3d = import_open3d("registration by FPFH")
         points_m, normals = sample_surface(model, self.config.model_points)
         cloud = self._cloud(points_m)
         cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
@@ -148,10 +147,3 @@ def _inverse_of(model_from_camera: np.ndarray, like: Tensor) -> Rigid:
     T = torch.from_numpy(np.array(model_from_camera))
     pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
     return Rigid(pose.R.to(like), pose.t_m.to(like))
-
-
-def _import_open3d() -> Any:  # noqa: ANN401
-    try:
-        return import_module("open3d")
-    except ImportError as error:
-        raise MissingExtraError("open3d", "open3d", "registration by FPFH") from error

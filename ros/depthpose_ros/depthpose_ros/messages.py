@@ -1,0 +1,187 @@
+"""Messages as plain dataclasses, and what is in them as arrays: nothing here needs ROS.
+
+The fields are those of ``std_msgs``, ``sensor_msgs`` and ``geometry_msgs``, so that a message of
+rclpy is read as it is, and :mod:`depthpose_ros.nodes` copies an answer field by field.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.rigid import Rigid
+
+
+@dataclass
+class Stamp:
+    """``builtin_interfaces/Time``."""
+
+    sec: int = 0
+    nanosec: int = 0
+
+
+@dataclass
+class Header:
+    """``std_msgs/Header``."""
+
+    stamp: Stamp = field(default_factory=Stamp)
+    frame_id: str = ""
+
+
+@dataclass
+class Image:
+    """``sensor_msgs/Image``."""
+
+    header: Header
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: int
+    step: int
+    data: bytes
+
+
+@dataclass
+class Pose:
+    """``geometry_msgs/PoseStamped``, flat: metres, and a quaternion."""
+
+    header: Header
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+
+
+_PICTURES = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
+_GREYS = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
+DEPTHS = {"32FC1": np.float32, "16UC1": np.uint16}
+"""Depth images: metres, and millimetres (REP 118)."""
+_MM = 0.001
+
+
+def picture_of(message: Any) -> np.ndarray:  # noqa: ANN401  ROS's classes carry no types
+    """Give a colour or grey picture as RGB (H, W, 3), or grey (H, W), 8 bit or floats in [0, 1].
+
+    Raises:
+        InputError: another encoding (Bayer images are to be debayered first), or too few bytes.
+    """
+    refuse_unknown("encoding of an image", message.encoding, [*_PICTURES, *_GREYS])
+    if message.encoding in _PICTURES:
+        channels = 4 if "a" in message.encoding else 3
+        values = _rows(message, np.uint8, channels)
+        return np.ascontiguousarray(values[..., _PICTURES[message.encoding]])
+    grey = _rows(message, _GREYS[message.encoding], 1)[..., 0]
+    return grey if grey.dtype == np.uint8 else (grey / 65535).astype(np.float32)
+
+
+def depth_of(message: Any) -> np.ndarray:  # noqa: ANN401
+    """Give a depth image in metres (H, W), NaN where nothing is known.
+
+    Raises:
+        InputError: another encoding than 32FC1 and 16UC1, or too few bytes.
+    """
+    refuse_unknown("encoding of a depth image", message.encoding, DEPTHS)
+    depth = _rows(message, DEPTHS[message.encoding], 1)[..., 0].astype(np.float32)
+    if message.encoding == "16UC1":
+        depth *= np.float32(_MM)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+
+
+def mask_of(message: Any) -> np.ndarray:  # noqa: ANN401
+    """Give a mask (H, W), true where the image is not 0.
+
+    Raises:
+        InputError: another encoding than mono8 and 8UC1, or too few bytes.
+    """
+    refuse_unknown("encoding of a mask", message.encoding, ["mono8", "8UC1"])
+    return _rows(message, np.uint8, 1)[..., 0] > 0
+
+
+def image_from_depth(header: Header, depth_m: torch.Tensor, encoding: str) -> Image:
+    """Make a depth image; 16UC1 holds 65.535 m at most, what is farther is unknown there.
+
+    Args:
+        header: of the image that it was made from: its stamp and frame.
+        depth_m: (H, W), NaN where nothing is known.
+        encoding: 32FC1 or 16UC1.
+    """
+    refuse_unknown("encoding", encoding, DEPTHS)
+    values = depth_m.cpu().numpy().astype("<f4")
+    if encoding == "16UC1":
+        mm = np.rint(np.nan_to_num(values.astype(np.float64) / _MM))
+        values = np.where((mm >= 1) & (mm <= 65535), mm, 0).astype("<u2")
+    height, width = values.shape
+    step = width * values.itemsize
+    return Image(header, height, width, encoding, 0, step, values.tobytes())
+
+
+def camera_of(info: Any) -> Camera:  # noqa: ANN401
+    """Give the camera of rectified images: P of ``sensor_msgs/CameraInfo``, or K where P is empty.
+
+    Raises:
+        InputError: no calibration, or K alone with distortion.
+    """
+    P, K = (np.array(values, np.float64).reshape(3, -1) for values in (info.p, info.k))
+    if P[0, 0] > 0:
+        K = P[:, :3]
+    elif any(abs(k) > 0 for k in info.d):
+        raise InputError(
+            "camera_info has distortion and no P: calibrate, and give rectified images (image_proc)"
+        )
+    if not K[0, 0] > 0:
+        raise InputError("camera_info holds no K and no P: the camera is not calibrated")
+    return Camera(width=info.width, height=info.height, K=torch.from_numpy(K.copy()))
+
+
+def rig_of(left: Any, right: Any) -> StereoRig:  # noqa: ANN401
+    """Give the rectified rig; the right camera's P holds -fx times the baseline.
+
+    Raises:
+        InputError: as :func:`camera_of`, or no baseline.
+    """
+    camera = camera_of(left)
+    P, Q = (np.array(info.p, np.float64).reshape(3, 4) for info in (left, right))
+    if not Q[0, 0] > 0 or not P[0, 3] / max(P[0, 0], 1e-9) > Q[0, 3] / Q[0, 0]:
+        raise InputError(
+            "the right camera_info has no -fx * baseline in P[3]: is it of the left camera, or is "
+            "the pair not calibrated?"
+        )
+    return StereoRig(
+        width=camera.width,
+        height=camera.height,
+        K=camera.K,
+        baseline_m=float(P[0, 3] / P[0, 0] - Q[0, 3] / Q[0, 0]),
+        cx_right_minus_left_px=float(Q[0, 2] - P[0, 2]),
+    )
+
+
+def pose_from_rigid(header: Header, pose: Rigid) -> Pose:
+    """Make a pose of the object in the frame of the depth image."""
+    x, y, z = (float(v) for v in pose.t_m)
+    quaternion = Rotation.from_matrix(pose.R.double().cpu().numpy()).as_quat()
+    qx, qy, qz, qw = (float(v) for v in quaternion)
+    return Pose(header, (x, y, z), (qx, qy, qz, qw))
+
+
+def copied_header(message: Any) -> Header:  # noqa: ANN401
+    """Take stamp and frame over, whatever class they are of."""
+    stamp = message.header.stamp
+    return Header(Stamp(stamp.sec, stamp.nanosec), message.header.frame_id)
+
+
+def _rows(message: Any, dtype: type, channels: int) -> np.ndarray:  # noqa: ANN401
+    """Give the pixels (H, W, channels); rows may be longer than their pixels (``step``)."""
+    kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = message.height, message.width, message.step
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    used = width * channels * kind.itemsize
+    if height * width == 0 or step < used or len(data) < height * step:
+        raise InputError(
+            f"an image of {width}x{height} {message.encoding} with rows of {step} bytes needs "
+            f"{height * max(step, used)} bytes, and there are {len(data)}"
+        )
+    rows = data[: height * step].reshape(height, step)[:, :used]
+    values = np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
+    return values.astype(dtype)

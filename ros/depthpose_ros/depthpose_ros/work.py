@@ -1,0 +1,136 @@
+"""What the nodes do: messages in, messages out, the latest first. Nothing here needs ROS."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from depthpose import FakestereoNet, GeoPoseNet
+from depthpose.core.errors import InputError
+from depthpose_ros.messages import (
+    Image,
+    Pose,
+    camera_of,
+    copied_header,
+    depth_of,
+    image_from_depth,
+    mask_of,
+    picture_of,
+    pose_from_rigid,
+    rig_of,
+)
+
+
+@dataclass
+class DepthFromImage:
+    """One rectified image and its camera to a depth image."""
+
+    net: FakestereoNet
+    encoding: str = "32FC1"
+
+    def __call__(self, image: Any, info: Any) -> Image:  # noqa: ANN401
+        """Estimate; stamp and frame are the image's.
+
+        Raises:
+            InputError: what the messages lack, or an image unlike those that the weights know.
+        """
+        found = self.net.estimate(picture_of(image), camera_of(info))
+        assert found.depth_m is not None, "one image has a camera, and so metres"
+        return image_from_depth(copied_header(image), found.depth_m, self.encoding)
+
+
+@dataclass
+class DepthFromPair:
+    """A rectified pair and both cameras to a depth image of the left view."""
+
+    net: FakestereoNet
+    encoding: str = "32FC1"
+
+    def __call__(self, left: Any, right: Any, left_info: Any, right_info: Any) -> Image:  # noqa: ANN401
+        """Match; stamp and frame are the left image's.
+
+        Raises:
+            InputError: what the messages lack, or a pair that is swapped or not rectified.
+        """
+        rig = rig_of(left_info, right_info)
+        found = self.net.estimate(picture_of(left), rig, right=picture_of(right))
+        assert found.depth_m is not None, "a rig gives metres"
+        return image_from_depth(copied_header(left), found.depth_m, self.encoding)
+
+
+@dataclass
+class Poses:
+    """A depth image, with a mask or without, to poses of known objects.
+
+    Attributes:
+        net: knows the objects.
+        object: which one; None: the only one that the weights know, or all where no mask says.
+    """
+
+    net: GeoPoseNet
+    object: str | None = None
+
+    def __call__(self, depth: Any, info: Any, mask: Any = None) -> list[tuple[str, Pose]]:  # noqa: ANN401
+        """Give name and pose of what was found, the surest first; stamp and frame are the depth's.
+
+        Raises:
+            InputError: what the messages lack; with a mask, also why its object has no pose.
+        """
+        depth_m, camera = depth_of(depth), camera_of(info)
+        if mask is None:
+            wanted = None if self.object is None else [self.object]
+            found = self.net.find(depth_m, camera, wanted)
+        else:
+            found = [
+                self.net.estimate(
+                    depth=depth_m, mask=mask_of(mask), camera=camera, object=self.object
+                )
+            ]
+            if not found[0].is_ok:
+                raise InputError(f"{found[0].object}: no pose: {found[0].reason}")
+        header = copied_header(depth)
+        poses = [(one.object, one.camera_from_model) for one in found]
+        return [(name, pose_from_rigid(header, pose)) for name, pose in poses if pose is not None]
+
+
+class Latest:
+    """Works on what came last; what comes while it works takes the place of what waits.
+
+    A node that is slower than its camera then answers with the newest frame, not with an old one.
+
+    Args:
+        work: called in a thread of its own, with what was given to :meth:`put`.
+    """
+
+    def __init__(self, work: Callable[..., None]) -> None:
+        self._work = work
+        self._waiting: tuple[Any, ...] | None = None
+        self._is_closed = False
+        self._changed = threading.Condition()
+        self.dropped = 0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def put(self, *given: Any) -> None:  # noqa: ANN401
+        """Hand over the newest messages, and return at once."""
+        with self._changed:
+            self.dropped += self._waiting is not None
+            self._waiting = given
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Finish what is being worked on, and end."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_closed or self._waiting is not None)
+                if self._is_closed:
+                    return
+                given, self._waiting = self._waiting, None
+            assert given is not None
+            self._work(*given)

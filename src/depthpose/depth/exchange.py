@@ -1,0 +1,153 @@
+"""Predicted depth as other tools keep it: COLMAP's dense workspace, nerfstudio's data sets."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    read_json,
+    read_map,
+    write_colmap_map,
+    write_depth_png,
+    write_json,
+    write_map,
+)
+from depthpose.core.run import read_sources
+
+Kind = Literal["png", "npy"]
+"""Files of nerfstudio's depth: 16-bit PNG, or float32."""
+
+NERFSTUDIO_UNIT = 0.001
+"""What nerfstudio multiplies depth files of either kind by, unless told otherwise."""
+TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
+_DEPTH = ".depth_m.npy"
+_PNG_MOST = 65535
+
+
+def predicted_names(results: Path) -> list[str]:
+    """List the frames of a folder of ``depth predict`` or ``depth match`` that have metres.
+
+    Raises:
+        InputError: there is none.
+    """
+    names = sorted(path.name.removesuffix(_DEPTH) for path in results.glob(f"*{_DEPTH}"))
+    if not names:
+        raise InputError(
+            f"{results}: no NAME{_DEPTH} in it; give a folder that 'depth predict' or 'depth "
+            "match' wrote, with a camera"
+        )
+    return names
+
+
+def colmap_files(results: Path, images: Path | None = None) -> dict[str, str]:
+    """Say where in COLMAP's workspace the depth of each frame belongs.
+
+    COLMAP calls a map by its image, suffix and all: ``stereo/depth_maps/a.jpg.geometric.bin``.
+
+    Args:
+        results: folder of predictions.
+        images: folder that COLMAP's names of images count from; by default that of each image.
+
+    Raises:
+        InputError: no predictions, or an image that lies elsewhere.
+    """
+    sources = read_sources(results)
+    files = {}
+    for name in predicted_names(results):
+        image = sources.get(name, Path(f"{name}.png"))
+        if images is None:
+            inside = Path(image.name)
+        elif image.is_relative_to(images.resolve()):
+            inside = image.relative_to(images.resolve())
+        else:
+            raise InputError(f"{image}: does not lie in --images {images}; name their folder")
+        files[name] = f"stereo/depth_maps/{inside.as_posix()}.geometric.bin"
+    return files
+
+
+def write_colmap(results: Path, out: Path, files: Mapping[str, str], scale: float) -> Iterator[str]:
+    """Write the depth of each frame for COLMAP, and yield its name.
+
+    Args:
+        results: folder of predictions.
+        out: COLMAP's dense workspace.
+        files: of :func:`colmap_files`.
+        scale: units of the reconstruction a metre.
+    """
+    for name, file in files.items():
+        write_colmap_map(out / file, _depth_m(results, name) * scale)
+        yield name
+
+
+def nerfstudio_files(results: Path, kind: Kind) -> dict[str, str]:
+    """Say what the depth of each frame is called in a data set of nerfstudio.
+
+    Raises:
+        InputError: no predictions.
+    """
+    return {name: f"depths/{name}.{kind}" for name in predicted_names(results)}
+
+
+def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | None:
+    """Give ``transforms.json`` of a data set with the depth of each frame; None where it has none.
+
+    Raises:
+        InputError: it lists no frames, or one without a prediction: nerfstudio takes depth for
+            all frames or for none.
+    """
+    path = out / TRANSFORMS
+    if not path.exists():
+        return None
+    content = read_json(path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    is_list = isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
+    if not isinstance(content, dict) or not is_list:
+        raise InputError(f"{path}: has no list of 'frames'; give one that ns-process-data wrote")
+    told = [{**frame, "depth_file_path": _depth_of(path, frame, files)} for frame in frames or ()]
+    return {**content, "frames": told, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
+
+
+def _depth_of(path: Path, frame: Mapping[str, Any], files: Mapping[str, str]) -> str:
+    name = Path(str(frame.get("file_path", ""))).stem
+    if name not in files:
+        raise InputError(
+            f"{path}: frame {name!r} has no prediction, and nerfstudio takes depth for all frames "
+            f"or for none; predict it too. There are {', '.join(list(files)[:3])}, ..."
+        )
+    return files[name]
+
+
+def write_nerfstudio(
+    results: Path, out: Path, files: Mapping[str, str], scale: float
+) -> Iterator[int]:
+    """Write the depth of each frame in thousandths, and yield how many pixels did not fit.
+
+    Args:
+        results: folder of predictions.
+        out: the data set's folder.
+        files: of :func:`nerfstudio_files`; a PNG holds 65.535 units at most.
+        scale: units of the camera poses a metre.
+    """
+    for name, file in files.items():
+        depth = _depth_m(results, name) * scale
+        if file.endswith(".png"):
+            write_depth_png(out / file, depth, NERFSTUDIO_UNIT)
+            yield int((depth > _PNG_MOST * NERFSTUDIO_UNIT).sum())
+        else:
+            write_map(out / file, depth.nan_to_num(0.0) / NERFSTUDIO_UNIT)
+            yield 0
+
+
+def write_transforms(out: Path, content: Mapping[str, Any]) -> None:
+    """Write what :func:`nerfstudio_frames` gave beside the file that it came from."""
+    write_json(out / TRANSFORMS_DEPTH, content)
+
+
+def _depth_m(results: Path, name: str) -> Float[Tensor, "h w"]:
+    depth_m = read_map(results / f"{name}{_DEPTH}")
+    return torch.where(depth_m > 0, depth_m, torch.nan)

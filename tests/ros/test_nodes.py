@@ -1,0 +1,257 @@
+"""The nodes on recorded messages: a bag of ROS 2, written and read by rosbags, without rclpy.
+
+What is around the networks in ``nodes.py`` runs on a test double of rclpy (``rclpy_double``).
+"""
+
+import importlib
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from tests.ros import rclpy_double
+
+from depthpose import FakestereoNet, GeoPoseNet
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.streets import Streets
+from depthpose.depth.types import StereoSample
+from depthpose_ros.messages import depth_of
+from depthpose_ros.work import DepthFromImage, DepthFromPair, Poses
+
+ROS = Path(__file__).parents[2] / "ros" / "depthpose_ros"
+FRAME_ID, STAMP = "left_camera_optical", (1700000000, 123456789)
+
+
+@pytest.fixture(scope="module")
+def street() -> StereoSample:
+    return Streets(StreetsConfig(seed=771, scale=0.5, jpeg_share=0.0))[0]
+
+
+def ros2() -> Any:  # noqa: ANN401
+    """Message classes of ROS 2, with the bytes that they have on the wire."""
+    types = pytest.importorskip("rosbags.typesys")
+    return types.get_typestore(types.Stores.ROS2_JAZZY)
+
+
+def rig_of_street(street: StereoSample) -> StereoRig:
+    rig = street.input.camera
+    assert isinstance(rig, StereoRig)
+    return rig
+
+
+@pytest.fixture(scope="module")
+def recorded(street: StereoSample, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The messages of a pair, out of a real bag: serialised, written, read and parsed again."""
+    bags, store = pytest.importorskip("rosbags.rosbag2"), ros2()
+    kinds = store.types
+    stamp = kinds["builtin_interfaces/msg/Time"](*STAMP)
+    header = kinds["std_msgs/msg/Header"](stamp, FRAME_ID)
+    rig = rig_of_street(street)
+    roi = kinds["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    messages = {}
+    for side, view, tx in (
+        ("left", street.input.left, 0.0),
+        ("right", street.input.right, -float(rig.K[0, 0]) * rig.baseline_m),
+    ):
+        assert view is not None
+        pixels = (view * 255).round().byte().permute(1, 2, 0).flip(2).numpy()
+        height, width, _ = pixels.shape
+        messages[f"/{side}/image_rect"] = kinds["sensor_msgs/msg/Image"](
+            header, height, width, "bgr8", 0, 3 * width, np.ascontiguousarray(pixels).ravel()
+        )
+        P = np.c_[rig.K.numpy(), [tx, 0, 0]]
+        messages[f"/{side}/camera_info"] = kinds["sensor_msgs/msg/CameraInfo"](
+            header, height, width, "plumb_bob", np.zeros(5), rig.K.numpy().ravel(),
+            np.eye(3).ravel(), P.ravel(), 0, 0, roi,
+        )  # fmt: skip
+    bag = tmp_path_factory.mktemp("bag") / "pair"
+    with bags.Writer(bag, version=9) as writer:
+        for topic, message in messages.items():
+            there = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            writer.write(there, STAMP[0], store.serialize_cdr(message, message.__msgtype__))
+    with bags.Reader(bag) as reader:
+        return {
+            one.topic: store.deserialize_cdr(data, one.msgtype)
+            for one, _, data in reader.messages()
+        }
+
+
+def pictures(street: StereoSample) -> list[torch.Tensor]:
+    assert street.input.right is not None
+    return [(v * 255).round().byte() for v in (street.input.left, street.input.right)]
+
+
+def test_recorded_pairs_give_the_depth_of_the_estimator(
+    street: StereoSample, recorded: dict[str, Any]
+) -> None:
+    net, (left, right) = FakestereoNet.load(matcher="sgbm"), pictures(street)
+    topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
+    made = DepthFromPair(net)(*(recorded[topic] for topic in topics))
+    assert (made.header.stamp.sec, made.header.stamp.nanosec) == STAMP
+    assert (made.header.frame_id, made.encoding) == (FRAME_ID, "32FC1")
+    expected = net.estimate(left, rig_of_street(street), right=right).depth_m
+    assert expected is not None
+    assert np.allclose(depth_of(made), expected.numpy(), rtol=1e-4, equal_nan=True)
+
+
+def test_recorded_images_give_the_depth_of_the_estimator(
+    street: StereoSample, recorded: dict[str, Any]
+) -> None:
+    net = FakestereoNet.load("default", with_unlike=True)
+    rig = rig_of_street(street)
+    given = (recorded["/left/image_rect"], recorded["/left/camera_info"])
+    made = DepthFromImage(net, "16UC1")(*given)
+    camera = Camera(width=rig.width, height=rig.height, K=rig.K)
+    expected = net.estimate(pictures(street)[0], camera).depth_m
+    assert expected is not None
+    is_near = expected.numpy() < 65
+    assert np.allclose(depth_of(made)[is_near], expected.numpy()[is_near], atol=2e-3)
+    assert np.isnan(depth_of(made)[expected.isnan().numpy()]).all()
+
+
+def test_the_answer_is_a_message_of_ros(street: StereoSample, recorded: dict[str, Any]) -> None:
+    store = ros2()
+    topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
+    plain = DepthFromPair(FakestereoNet.load(matcher="sgbm"))(*(recorded[t] for t in topics))
+    kinds = store.types
+    header = kinds["std_msgs/msg/Header"](
+        kinds["builtin_interfaces/msg/Time"](plain.header.stamp.sec, plain.header.stamp.nanosec),
+        plain.header.frame_id,
+    )
+    rest = (plain.height, plain.width, plain.encoding, plain.is_bigendian, plain.step)
+    image = kinds["sensor_msgs/msg/Image"](header, *rest, np.frombuffer(plain.data, np.uint8))
+    data = store.serialize_cdr(image, "sensor_msgs/msg/Image")
+    back = store.deserialize_cdr(data, "sensor_msgs/msg/Image")
+    assert np.array_equal(depth_of(back), depth_of(plain), equal_nan=True)
+
+
+class KnowsPose:
+    """Poses a cup wherever it is asked."""
+
+    objects = ("cup",)
+    pose = Rigid(torch.eye(3), torch.tensor([0.1, 0.2, 0.7]))
+
+    def find(self, depth_m: np.ndarray, camera: Camera, objects: object) -> list[Any]:  # noqa: ARG002
+        self.asked = (depth_m.shape, objects)
+        return [SimpleNamespace(object="cup", camera_from_model=self.pose)]
+
+    def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401
+        is_ok = bool(mask.any())
+        return SimpleNamespace(
+            object=object, camera_from_model=self.pose, is_ok=is_ok, reason="the mask is empty"
+        )
+
+
+def depth_messages(street: StereoSample, recorded: dict[str, Any]) -> tuple[Any, Any]:
+    topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
+    depth = DepthFromPair(FakestereoNet.load(matcher="sgbm"))(*(recorded[t] for t in topics))
+    return depth, recorded["/left/camera_info"]
+
+
+def test_poses_bear_the_depths_stamp_and_a_refusal_says_why(
+    street: StereoSample, recorded: dict[str, Any]
+) -> None:
+    depth, info = depth_messages(street, recorded)
+    net: Any = KnowsPose()
+    ((name, pose),) = Poses(net)(depth, info)
+    assert (name, pose.header) == ("cup", depth.header)
+    assert pose.position == pytest.approx((0.1, 0.2, 0.7))
+    assert pose.orientation == pytest.approx((0, 0, 0, 1))
+    pixels = np.zeros((depth.height, depth.width), np.uint8)
+    mask = SimpleNamespace(
+        header=depth.header, height=depth.height, width=depth.width, encoding="mono8",
+        is_bigendian=0, step=depth.width, data=pixels,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="cup: no pose: the mask is empty"):
+        Poses(net, "cup")(depth, info, mask)
+    pixels[0, 0] = 1
+    assert Poses(net, "cup")(depth, info, mask)[0][0] == "cup"
+
+
+def test_parts_are_posed_from_messages(after_demo: Path) -> None:
+    from depthpose.core.camera import read_camera
+    from depthpose.core.files import read_depth_png, read_image
+    from depthpose_ros.messages import Header, Image, image_from_depth
+
+    part = after_demo / "out/demo/part"
+    camera = read_camera(part / "camera.json", None)
+    assert camera.depth_unit_m is not None
+    depth_m = read_depth_png(part / "depth.png", camera.depth_unit_m)
+    info = SimpleNamespace(
+        width=camera.width, height=camera.height, k=camera.K.numpy().ravel(),
+        p=np.c_[camera.K.numpy(), np.zeros(3)].ravel(), d=[],
+    )  # fmt: skip
+    pixels = (read_image(part / "mask.png")[0] > 0).numpy().astype(np.uint8)
+    height, width = pixels.shape
+    mask = Image(Header(), height, width, "mono8", 0, width, pixels.tobytes())
+    net = GeoPoseNet.load("parts")
+    ((name, pose),) = Poses(net, "flange")(image_from_depth(Header(), depth_m, "32FC1"), info, mask)
+    expected = net.estimate(depth=depth_m, mask=pixels, camera=camera, object="flange")
+    assert expected.camera_from_model is not None
+    assert name == "flange"
+    assert pose.position == pytest.approx(expected.camera_from_model.t_m.tolist(), abs=1e-4)
+
+
+# nodes.py, on the double
+
+
+def made_node(monkeypatch: pytest.MonkeyPatch, name: str, **parameters: object) -> Any:  # noqa: ANN401
+    rclpy_double.install(monkeypatch, **parameters)
+    return getattr(importlib.import_module("depthpose_ros.nodes"), name)()
+
+
+def wait_until(is_so: Any) -> None:  # noqa: ANN401
+    deadline = time.monotonic() + 60
+    while not is_so() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert is_so()
+
+
+def test_the_node_of_a_pair_publishes_depth_and_warns_of_what_it_cannot_use(
+    recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = made_node(monkeypatch, "DepthPairNode", weights="sgbm", encoding="16UC1")
+    topics = [one.topic for one in node._heard.heard]
+    assert {one.qos.depth for one in node._heard.heard} == {1}
+    assert {one.qos.reliability for one in node._heard.heard} == {"best effort"}
+    given = [recorded[f"/{topic}"] for topic in topics]
+    node._heard.callback(*given)
+    sent = node.publishers_made["~/depth"].sent
+    wait_until(lambda: sent)
+    assert (sent[0].encoding, sent[0].header.frame_id) == ("16UC1", FRAME_ID)
+    assert (sent[0].header.stamp.sec, sent[0].header.stamp.nanosec) == STAMP
+    node._heard.callback(given[0], given[1], given[2], given[2])
+    wait_until(lambda: node.warnings)
+    assert "no -fx * baseline" in node.warnings[0]
+    node.destroy_node()
+
+
+def test_every_parameter_of_the_file_is_one_that_the_node_declares(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    files = yaml.safe_load((ROS / "config" / "depthpose.yaml").read_text())
+    nodes = {"depth_image": "DepthImageNode", "depth_pair": "DepthPairNode", "poses": "PosesNode"}
+    assert {name.rpartition("/")[2] for name in files} == set(nodes)
+    for name, content in files.items():
+        node = made_node(monkeypatch, nodes[name.rpartition("/")[2]])
+        assert node.parameters == content["ros__parameters"]
+        node.destroy_node()
+
+
+def test_what_colcon_needs_is_there_and_says_one_version() -> None:
+    setup, package = (ROS / "setup.py").read_text(), (ROS / "package.xml").read_text()
+    assert (ROS / "resource" / "depthpose_ros").is_file()
+    assert "<version>0.1.0</version>" in package
+    assert 'version="0.1.0"' in setup
+    for launch in (ROS / "launch").iterdir():
+        name = launch.name.removesuffix(".launch.py")
+        assert f'executable="{name}"' in launch.read_text()
+        assert f"{name} = {{NAME}}.nodes:{name}" in setup
+        compile(launch.read_text(), str(launch), "exec")
