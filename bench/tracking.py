@@ -203,7 +203,7 @@ def main() -> None:
             rows.append(followed(net, model, frames))
             print(rows[-1], flush=True)
             if words.anew:
-                others.append(anew(net, model, frames[:: words.anew]))
+                others.append(anew(net, model, frames[words.anew // 2 :: words.anew]))
         print(f"{name}, followed\n{markdown_table(rows)}")
         if others:
             print(f"{name}, every {words.anew} frames anew\n{markdown_table(others)}")
