@@ -43,6 +43,7 @@ def test_a_quick_tutorial_runs(name: str, folder: Path, capfd: pytest.CaptureFix
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::depthpose.core.devices.PrecisionNotice")
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_a_tutorial_runs_whole(page: Path, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert walk(page, folder, {"slow", "long"}, capfd)

@@ -25,6 +25,7 @@ COMMANDS = {
     "doctor": ("doctor:doctor", "what is installed, and a try of each room; or what files are"),
     "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose track": ("pose_tracking:track", "follow an object through depth images or clouds"),
     "pose train": ("pose_training:train", "your CAD file, or a config, to a network that poses it"),
     "pose calibrate": (
         "pose_training:calibrate",

@@ -7,14 +7,16 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli import pose_predicting as posing
+from depthpose.cli.pose_inputs import Unreadable
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_page import write_pose_page
 from depthpose.core.errors import InputError
 from depthpose.core.files import list_images
 from depthpose.core.run import find_shard, refuse_among_inputs
 from depthpose.pose.config import Unit
-from depthpose.pose.estimator.find import explained_mask
+from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import view_input
+from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Prediction, write_predictions
 from depthpose.pose.types import PoseEstimate, ViewInput
 
@@ -48,9 +50,11 @@ def find_all(
     jobs: list[Job[Any]] = []
     for path in tqdm(depths, disable=None, unit=" images"):
         view = view_input(path, None, camera, objects[0], path.stem, unit)
-        for estimate in method.find(view, objects) or [_nothing(view, objects)]:
+        for estimate in method.find(view, objects) or [
+            nothing_found(view.name, ", ".join(objects))
+        ]:
             predictions.append(Prediction(estimate=estimate))
-            jobs.append(_job(view, estimate, method))
+            jobs.append(explained_job(Job(name=path.stem, read=lambda v=view: v), estimate, method))
     posing.claim(out, settings, jobs, depth)
     write_predictions(out, predictions)
     shown = [k for k, p in enumerate(predictions) if p.estimate.is_ok]
@@ -60,24 +64,15 @@ def find_all(
     return posing.say_result(predictions, out)
 
 
-def _nothing(view: ViewInput, objects: tuple[str, ...]) -> PoseEstimate:
-    return PoseEstimate(
-        name=view.name,
-        object=", ".join(objects),
-        status="doubtful",
-        reason="nothing beside the planes of the image is surely one of the objects; give a mask, "
-        "or look from nearer by",
-    )
-
-
-def _job(view: ViewInput, estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
-    """Take what was found as if a mask had shown it."""
+def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
+    """Take what was found in a whole depth image as if a mask had shown it."""
     model = next((m for m in method.models if m.name == estimate.object), None)
 
-    def read() -> ViewInput:
-        if model is None or estimate.camera_from_model is None:
+    def read() -> AnyInput | Unreadable:
+        view, pose = job.read(), estimate.camera_from_model
+        if model is None or pose is None or not isinstance(view, ViewInput):
             return view
-        mask = explained_mask(view, estimate.camera_from_model, model)
+        mask = explained_mask(view, pose, model)
         return replace(view, name=estimate.name, mask=mask, object=model.name)
 
-    return Job(name=estimate.name, read=read)
+    return replace(job, name=estimate.name, read=read)

@@ -16,7 +16,7 @@ from depthpose.pose.bop import BopDataset
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.predictions import Job
+from depthpose.pose.predictions import Job, Place
 
 CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
 
@@ -93,6 +93,23 @@ def view_jobs(
     ]
 
 
+def frame_jobs(
+    depth: Path, camera: Path, object: str, unit: Unit | None, out: Path
+) -> list[Job[Any]]:
+    """Take whole depth images, without masks.
+
+    Raises:
+        InputError: there is none, two have one name, or the folder is ``out`` too.
+    """
+    depths = list_images(depth)
+    refuse_among_inputs(out, [depth], depths)
+    _refuse_one_name(depths)
+    return [
+        input_job(p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit))
+        for p in depths
+    ]
+
+
 def _list_masks(mask: Path) -> list[Path]:
     """List mask pictures, or files of run lengths where there are such."""
     runs = sorted(mask.glob("*.json")) if mask.is_dir() else []
@@ -131,9 +148,14 @@ def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[
     return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
 
 
-def input_job(name: str, object: str, read: Any) -> Job[Any]:  # noqa: ANN401  any reader
+def input_job(
+    name: str,
+    object: str,
+    read: Any,  # noqa: ANN401  any reader
+    place: Place | None = None,
+) -> Job[Any]:
     """Take one input; one that cannot be read stops no other."""
-    return _safe(Job(name=name, read=read), object)
+    return _safe(Job(name=name, read=read, place=place), object)
 
 
 def _safe(job: Job[Any], object: str) -> Job[Any]:

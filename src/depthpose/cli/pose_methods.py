@@ -1,6 +1,6 @@
 """Methods of the pose room by their words, and what they predict of a data set."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.bop import BopDataset
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import (
     predict,
     read_predictions,
@@ -39,6 +40,7 @@ class PoseMethod:
     Attributes:
         takes_clouds: whether it can do without a depth image.
         find: gives the poses of named objects in a view without a mask; None: it cannot.
+        track: follows a named object through frames; None: it cannot.
     """
 
     name: str
@@ -47,6 +49,7 @@ class PoseMethod:
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
+    track: Callable[[Iterable[AnyInput], str], Iterator[PoseEstimate]] | None = None
 
 
 def pose_methods(
@@ -103,6 +106,7 @@ def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
         models=found.models,
         settings={**facts, "estimate": config_to_dict(config)},
         find=None if isinstance(net, DepthImageRegressor) else net.find_in,
+        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
     )
 
 

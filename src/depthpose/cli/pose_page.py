@@ -121,10 +121,12 @@ def _results(predictions: Sequence[Prediction], shown: int) -> Section:
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
     pose = estimate.camera_from_model
     x_m, y_m, z_m = (None, None, None) if pose is None else pose.t_m.double().tolist()
+    tracking = {} if estimate.tracking is None else {"tracking": estimate.tracking}
     return {
         "input": estimate.name,
         "object": estimate.object,
         "status": estimate.status,
+        **tracking,
         "x_m": x_m,
         "y_m": y_m,
         "z_m": z_m,

@@ -140,7 +140,8 @@ def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
         quaternion = Rotation.from_matrix(pose.R.double().numpy()).as_quat()
         row |= {"x, y, z [m]": numbers_text(pose.t_m.tolist())}
         row |= {"qx, qy, qz, qw": numbers_text(quaternion.tolist())}
-    return row | {"risk": None if estimate.risk is None else f"{estimate.risk:.3f}"}
+    row |= {"risk": None if estimate.risk is None else f"{estimate.risk:.3f}"}
+    return row if estimate.tracking is None else row | {"tracking": estimate.tracking}
 
 
 def write_files(
@@ -228,12 +229,13 @@ def _safely(method: PoseMethod) -> EstimateMany:
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
         found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
-        return [_unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
+        return [unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
 
     return estimate_many
 
 
-def _unread(given: Unreadable) -> PoseEstimate:
+def unread(given: Unreadable) -> PoseEstimate:
+    """Give the estimate of an input that could not be read."""
     return PoseEstimate(
         name=given.name,
         object=given.object,

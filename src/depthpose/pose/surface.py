@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import sample_surface
@@ -137,6 +138,52 @@ def look_along_rays(
     unseen = (is_posed & ~is_seen).sum(1) / total.clamp(min=1)
     front = hidden.double().mean(1)
     return torch.where(total > 0, front, 1.0), torch.where(total > 0, unseen.double(), 1.0)
+
+
+def compare_depths(
+    scene_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
+) -> tuple[float, float, float]:
+    """Compare the posed surface with all that a camera at the origin saw in its direction.
+
+    Rays are gathered in cells as :func:`look_along_rays` does; of each cell the nearest point of
+    the surface is compared with the nearest that was seen. The camera saw through it where it saw
+    nothing near in the cells about it either.
+
+    Args:
+        scene_m: what was seen before, beside and behind the object too, in the camera frame.
+        pose: ``camera_from_model``.
+        surface: of the model.
+
+    Returns:
+        Of the cells of the posed surface the shares in which the camera saw it, saw through it, and
+        saw something before it. They add up to less than one where cells have no reading.
+    """
+    posed_m = pose.apply(surface.points_m)
+    posed_m, scene_m = posed_m[posed_m[:, 2] > 0], scene_m[scene_m[:, 2] > 0]
+    if len(posed_m) == 0 or len(scene_m) == 0:
+        return 0.0, 0.0, 0.0
+    scale = float(posed_m[:, 2].median()) / (_CELL * surface.diameter_m)
+    rays = [(points_m[:, :2] / points_m[:, 2:] * scale).floor() for points_m in (posed_m, scene_m)]
+    low, high = rays[0].amin(0), rays[0].amax(0)
+    width = int((high - low)[0]) + 1
+    cells = width * (int((high - low)[1]) + 1)
+    nearest_m = []
+    for points_m, ray in zip((posed_m, scene_m), rays, strict=True):
+        inside = ((ray >= low) & (ray <= high)).all(-1)
+        column, row = (ray[inside] - low).long().unbind(-1)
+        empty_m = torch.full((cells,), torch.inf, dtype=torch.float64)
+        nearest_m.append(empty_m.scatter_reduce_(0, row * width + column, points_m[inside, 2],
+                                                 "amin"))  # fmt: skip
+    posed, seen = nearest_m
+    # Of a cell at the silhouette a sliver may be the object's, which no ray met: its neighbours do.
+    around = -max_pool2d(-seen.reshape(1, -1, width), 3, 1, 1).flatten()
+    limit_m = NEAR * surface.diameter_m
+    is_posed, is_read = posed.isfinite(), seen.isfinite()
+    through = is_posed & is_read & (around > posed + limit_m)
+    before = is_posed & is_read & (seen < posed - limit_m)
+    agrees = is_posed & is_read & ~through & ~before
+    total = int(is_posed.sum())
+    return int(agrees.sum()) / total, int(through.sum()) / total, int(before.sum()) / total
 
 
 def _boxes_about(points_m: Float64[Tensor, "m 3"], diameter_m: float, tree: KDTree) -> Boxes:

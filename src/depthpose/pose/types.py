@@ -23,6 +23,10 @@ Status = Literal[
 """An answer, or why there is none. Unreadable: no input came; it is tried again by the next run.
 Doubtful: nothing plainly wrong, but the risk is too great."""
 
+Tracking = Literal["tracked", "found", "lost"]
+"""How an estimate of a sequence came about: followed from the frame before, looked for anew, or
+neither."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudInput:
@@ -265,6 +269,7 @@ class PoseEstimate:
         alternatives: other poses that fit, the likeliest first.
         signals: what the risk is made of, by name; kept for refusals too.
         seconds: time of each stage.
+        tracking: how it came about, in a sequence; None elsewhere.
     """
 
     name: str
@@ -282,6 +287,7 @@ class PoseEstimate:
     alternatives: tuple[Alternative, ...] = ()
     signals: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    tracking: Tracking | None = None
 
     def __post_init__(self) -> None:
         # No default may look like success: an answer has a pose, a refusal has a reason.

@@ -44,6 +44,10 @@ class RefusalConfig:
     share of what it moves the object's points; one that only slides it along itself (a plane, a
     ball) is not observable."""
 
+    max_scale_error: float = 0.03
+    """The scale of the model that fits the cloud best may differ from 1 by so much, beside two of
+    its standard deviations; 1: it is not measured. Without ICP it is not."""
+
     @property
     def is_calibrated(self) -> bool:
         """Whether a risk is known, or is about to be learnt from all answers."""
@@ -55,6 +59,11 @@ class RefusalConfig:
             raise InputError(
                 f"max_risk is {self.max_risk}, but a risk lies between 0 and 1; 0.5 refuses "
                 "what is more likely wrong than right"
+            )
+        if not 0 < self.max_scale_error <= 1:
+            raise InputError(
+                f"max_scale_error is {self.max_scale_error}, but it is a share above 0 up to 1 "
+                "(any size is taken); take 0.03"
             )
         if not 0 <= self.min_hold < 1:
             raise InputError(

@@ -116,6 +116,18 @@ def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
     return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
 
 
+def nothing_found(name: str, object: str, spent_s: float = 0.0) -> PoseEstimate:
+    """Say that a depth image shows no object, or none of several, surely."""
+    return PoseEstimate(
+        name=name,
+        object=object,
+        status="doubtful",
+        reason=f"nothing beside the planes of the image is surely {object}; give a mask, or look "
+        "from nearer by",
+        seconds={"check": spent_s},
+    )
+
+
 def _pairs(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     """Join regions that may be two parts of one object, something before it or a thin place."""
     joined: list[Tensor] = []

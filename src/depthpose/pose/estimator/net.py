@@ -1,7 +1,7 @@
 """GeoPoseNet: clouds and depth images of known objects to poses."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +13,12 @@ from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.alternatives import Copies, find_copies
 from depthpose.pose.estimator.batches import batches, network_directions
-from depthpose.pose.estimator.find import Known, find_objects
+from depthpose.pose.estimator.find import Known, find_objects, nothing_found
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
@@ -27,8 +28,9 @@ from depthpose.pose.estimator.given import (
 )
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.estimator.track import Followed, track
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.types import PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _NAME = "input"
@@ -204,6 +206,70 @@ class GeoPoseNet:
             estimate_many=self.estimate_many,
         )
         return find_objects(view, known)
+
+    def track(
+        self,
+        frames: Iterable[AnyArray],
+        camera: AnyCamera | None = None,
+        object: str | None = None,
+        first: Rigid | None = None,
+        unit: Unit | None = None,
+    ) -> Iterator[PoseEstimate]:
+        """Follow one object through a sequence, each frame from the pose of the one before by ICP.
+
+        Where the camera saw through the posed surface, or little of it, or what is seen holds no
+        pose, the object is looked for anew in the frame; where it is not found either it is lost,
+        and looked for in the next.
+
+        Args:
+            frames: depth images as for :meth:`estimate`, in their order; without a camera clouds in
+                the camera frame, of the object alone or of what is about it too. They are taken one
+                by one, as their estimates are asked for.
+            camera: of the depth images.
+            object: which one; None where the weights know one alone.
+            first: the pose in the first frame, as far as it is known; None: it is looked for.
+            unit: as for :meth:`estimate`.
+
+        Yields:
+            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        which = self._object(object)
+
+        def given(frame: AnyArray, number: int) -> AnyInput:
+            name = f"{_NAME}_{number}"
+            if camera is None:
+                return cloud_input(frame, unit or "m", which, name)
+            return view_input(frame, None, camera, which, name, unit)
+
+        inputs = (given(frame, number) for number, frame in enumerate(frames))
+        return self.track_in(inputs, which, first)
+
+    def track_in(
+        self, frames: Iterable[AnyInput], object: str, first: Rigid | None = None
+    ) -> Iterator[PoseEstimate]:
+        """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked."""
+        number = self._number(object)
+        followed = Followed(
+            model=self.weights.models[number],
+            surface=self._surface(number),
+            refusal=self.weights.refusal,
+            icp=self.config.icp,
+            look=lambda given: self._look(given, object),
+        )
+        return track(frames, followed, first)
+
+    def _look(self, given: AnyInput, object: str) -> PoseEstimate:
+        """Find the object in a frame of which nothing else is known."""
+        if isinstance(given, CloudInput):
+            return self.estimate_many([given])[0]
+        began = time.perf_counter()
+        found = self.find_in(given, [object])
+        if found:
+            return found[0]
+        return nothing_found(given.name, object, time.perf_counter() - began)
 
     @torch.inference_mode()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:

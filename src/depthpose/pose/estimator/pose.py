@@ -27,6 +27,7 @@ from depthpose.pose.estimator.evidence import (
 from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
 from depthpose.pose.estimator.refusal import reason_of, risk_of
+from depthpose.pose.estimator.scale import Scale, scale_of
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
@@ -98,6 +99,10 @@ def pose_from_directions(
     free = free_motions(model.symmetries.continuous, found.pose)
     answer = _answer(model, vote, found, free)
     reason = _doubt(voted.cloud, found, surface, refusal, free)
+    if reason is None and config.with_icp and refusal.max_scale_error < 1:
+        scale = scale_of(voted.cloud.cloud_m, found.pose, surface)
+        answer.signals["scale"] = scale.times
+        reason = _other_size(scale, refusal)
     clock.note("check")
     risk = risk_of(found.signals, refusal)
     if reason is not None:
@@ -246,6 +251,17 @@ def _doubt(
         reason=f"the seen part of the object may {what} along itself: that moves its surface "
         f"across itself by {hold:.1%} of the motion alone, and no declared symmetry allows it. "
         "Declare the symmetry, or look from a side that shows more",
+    )
+
+
+def _other_size(scale: Scale, config: RefusalConfig) -> Refusal | None:
+    if scale.error <= config.max_scale_error:
+        return None
+    return Refusal(
+        status="doubtful",
+        reason=f"the cloud fits the object best at {scale.times:.2f} times its size (standard "
+        f"deviation {scale.sigma:.2f}), and {config.max_scale_error:.0%} are allowed: a copy of "
+        "another size, another object, or a wrong unit or camera",
     )
 
 

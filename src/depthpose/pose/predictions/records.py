@@ -14,7 +14,7 @@ from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.bop import Instance
 from depthpose.pose.bop.parse import integer, number, read_rows
-from depthpose.pose.types import Alternative, PoseEstimate, Status
+from depthpose.pose.types import Alternative, PoseEstimate, Status, Tracking
 
 POSES = "poses.json"
 PICTURE, CLOUD = "pose.png", "pose.ply"
@@ -123,6 +123,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         }
         for other in estimate.alternatives
     ]
+    if estimate.tracking is not None:
+        row["tracking"] = estimate.tracking
     return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
 
 
@@ -167,6 +169,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         alternatives=_alternatives(row.get("alternatives", []), source),
         signals=_named(row, "signals", source),
         seconds=_named(row, "seconds", source),
+        tracking=_tracking(row.get("tracking"), source),
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
@@ -178,6 +181,12 @@ def _status(entry: object, source: str) -> Status:
     if entry not in known:
         raise InputError(f"{source}: status {entry!r}: {nearest_name(str(entry), known)}")
     return cast("Status", entry)
+
+
+def _tracking(entry: object, source: str) -> Tracking | None:
+    if entry is not None and entry not in get_args(Tracking):
+        raise InputError(f"{source}: tracking is {entry!r}; write one of {get_args(Tracking)}")
+    return cast("Tracking | None", entry)
 
 
 def _pose(entry: object, source: str) -> Rigid | None:

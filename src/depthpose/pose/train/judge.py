@@ -18,6 +18,8 @@ from depthpose.pose.weights import PoseWeights
 _CALIBRATION_SEED = 0xCA11B
 _FIRST = 50
 _TOGETHER = 32
+_KEPT = ("min_hold", "max_scale_error", "candidate_slopes")
+"""Of a refusal: not chosen by calibration."""
 
 Table = Mapping[str, Mapping[str, float | None]]
 """By occlusion in percent: shares of right, wrong and refused, and the median error of the answers
@@ -32,9 +34,8 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     """
     if config.number == 0:
         return weights
-    min_hold = weights.refusal.min_hold
-    slopes = weights.refusal.candidate_slopes
-    opened = RefusalConfig(max_risk=1.0, min_hold=min_hold, candidate_slopes=slopes)
+    kept = {name: getattr(weights.refusal, name) for name in _KEPT}
+    opened = RefusalConfig(max_risk=1.0, **kept)
     open_weights = dataclasses.replace(weights, refusal=opened)
     views = dataclasses.replace(
         made,
@@ -56,7 +57,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
         refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
     except InputError:
         return weights
-    refusal = dataclasses.replace(refusal, min_hold=min_hold, candidate_slopes=slopes)
+    refusal = dataclasses.replace(refusal, **kept)
     return dataclasses.replace(weights, refusal=refusal)
 
 

@@ -1,0 +1,127 @@
+"""What is not the named object, and is posed all the same: shares answered ``ok``.
+
+    python bench/pose_negatives.py --weights parts ycb linemod.safetensors --number 40
+
+Eight kinds of negatives, of each so many: another object of the weights (or a part of ours, where
+they know one alone), copies scaled by 0.8, 0.9, 1.1 and 1.2 (so many of each), mirrored ones,
+blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. Each is seen as
+held-out views are, half of them with up to a half hidden. Beside them the objects themselves, four
+times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of the diameter.
+``--save`` writes every signal as JSON; nothing is refused for its risk then.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.loop import ticket_generator
+from depthpose.core.report import markdown_table
+from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.objects import Objects
+from depthpose.pose.objects.negatives import SCALES, NegativeKind, negative_of
+from depthpose.pose.train.held_out import pose_error
+from depthpose.pose.types import CloudSample, ObjectModel
+from depthpose.pose.weights import PoseWeights
+
+SEED = 0x0DD
+ITSELF = "itself"
+Row = dict[str, Any]
+
+
+def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
+    """Show each of some models once."""
+    config = ObjectsConfig(
+        number=len(models), seed=seed, views=None, resolution=(1.0, 1.0), occluded_share=0.5,
+        occlusion=(0.0, 0.5),
+    )  # fmt: skip
+    objects = Objects(models, config)
+    return (objects[k] for k in range(len(models)))
+
+
+def things(weights: PoseWeights, kind: str, number: int) -> tuple[list[ObjectModel], list[int]]:
+    """Give what is shown, and which object it is asked for."""
+    generator = ticket_generator(sum(map(ord, kind)), SEED)
+    asked = [k % len(weights.models) for k in range(number)]
+    models = [weights.models[k] for k in asked]
+    if kind == ITSELF:
+        return models, asked
+    name, _, times = kind.partition(" by ")
+    scale = float(times) if times else None
+    found: Any = name
+    return [negative_of(m, found, weights.models, generator, scale) for m in models], asked
+
+
+def kinds() -> Iterator[str]:
+    """Name what is shown."""
+    for kind in get_args(NegativeKind):
+        if kind == "scaled":
+            yield from (f"scaled by {times}" for times in SCALES)
+        else:
+            yield kind
+
+
+def measure(net: GeoPoseNet, kind: str, number: int) -> list[Row]:
+    """Ask for every negative of a kind, or for the objects themselves."""
+    models, asked = things(net.weights, kind, number)
+    rows = []
+    for sample, which in zip(seen(models, SEED), asked, strict=True):
+        found = net.estimate_many([sample.input])[0]
+        error = pose_error(found, sample.truth, net.weights.models[which])
+        is_right = kind == ITSELF and error < 0.1
+        rows.append({
+            "kind": kind, "object": sample.input.object, "status": found.status,
+            "right": is_right, "risk": found.risk, "signals": found.signals,
+            "hidden": 1 - (sample.truth.visible_fraction or 0.0),
+        })  # fmt: skip
+    return rows
+
+
+def summary(rows: Sequence[Row]) -> Row:
+    """Count answers."""
+    ok = sum(row["status"] == "ok" for row in rows)
+    row: Row = {"kind": rows[0]["kind"], "number": len(rows), "answered": ok / len(rows)}
+    if rows[0]["kind"] == ITSELF:
+        row["right"] = sum(row["right"] for row in rows) / len(rows)
+    return row
+
+
+def main() -> None:
+    """Measure every set of weights."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--weights", nargs="+", default=["parts"])
+    parser.add_argument("--number", type=int, default=40)
+    parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
+    parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
+    words = parser.parse_args()
+    torch.set_num_threads(1)
+    for name in words.weights:
+        net = GeoPoseNet.load(find_weights(name))
+        if words.save:
+            opened = dataclasses.replace(net.weights.refusal, max_risk=1.0)
+            net.weights = dataclasses.replace(net.weights, refusal=opened)
+        began, rows = time.process_time(), []
+        for kind in words.kinds or [ITSELF, *kinds()]:
+            number = 4 * words.number if kind == ITSELF else words.number
+            rows.append(measure(net, kind, number))
+            print(summary(rows[-1]), flush=True)
+        every = [row for some in rows for row in some if row["kind"] != ITSELF]
+        table = [summary(some) for some in rows]
+        if every:
+            table.append({**summary(every), "kind": "all negatives"})
+        print(f"{name}, {time.process_time() - began:.0f} s\n{markdown_table(table)}")
+        if words.save:
+            words.save.mkdir(parents=True, exist_ok=True)
+            path = words.save / f"{Path(name).stem}.json"
+            path.write_text(json.dumps([row for some in rows for row in some]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""One object through a sequence of frames: ICP from the last pose, and a new look where it is lost.
+
+A frame costs ICP alone as long as what was seen agrees with the pose that comes out.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import IcpConfig, RefusalConfig
+from depthpose.pose.estimator.evidence import hold_of, surface_signals, without_motions
+from depthpose.pose.estimator.prepare import AnyInput, Refusal
+from depthpose.pose.refine import Refined, refine_best
+from depthpose.pose.surface import NEAR, Surface, compare_depths
+from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.voting import free_motions
+
+_MARGIN = 0.15
+"""Of the diameter: points so far from the surface at the last or the predicted pose may be the
+object's; between two frames it moves by less."""
+_MOST_POINTS = 10_000
+"""Of what a camera saw about the object, evenly taken."""
+_LEAST_POINTS = 60
+_THROUGH = 0.1
+"""Where the camera saw through more of the posed surface, the object is not there."""
+_SEEN = 0.35
+"""Where less of the posed surface was seen, it may be anywhere."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Followed:
+    """What is followed, and how it is looked for.
+
+    Attributes:
+        model: the object.
+        surface: of the model.
+        refusal: when a pose is not believed.
+        icp: of the first steps.
+        look: an estimate of the object in a frame about which nothing is known.
+    """
+
+    model: ObjectModel
+    surface: Surface
+    refusal: RefusalConfig
+    icp: IcpConfig
+    look: Callable[[AnyInput], PoseEstimate]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Last:
+    """The last pose, how it moved from the one before, and the estimate that all began with."""
+
+    pose: Rigid
+    moved: Rigid | None
+    origin: PoseEstimate | None
+
+
+def track(
+    frames: Iterable[AnyInput], known: Followed, first: Rigid | None = None
+) -> Iterator[PoseEstimate]:
+    """Estimate one object in frame after frame, each from the pose of the frame before.
+
+    Args:
+        frames: in their order, of the same camera. A cloud may be of the object alone or of all
+            about it; the mask of a view limits where is looked.
+        known: what is followed.
+        first: the pose in the first frame, as far as it is known; None: it is looked for.
+
+    Yields:
+        An estimate for each frame, whose ``tracking`` says how it came about. One that is lost has
+        no pose, and the reason.
+    """
+    last = None if first is None else _Last(pose=_doubled(first), moved=None, origin=None)
+    for given in frames:
+        estimate = _next(given, last, known)
+        if estimate.camera_from_model is None:
+            last = None
+        else:
+            pose = _doubled(estimate.camera_from_model)
+            if estimate.tracking == "found" or last is None:
+                last = _Last(pose=pose, moved=None, origin=estimate)
+            else:
+                last = replace(last, pose=pose, moved=_motion(last.pose, pose))
+        yield estimate
+
+
+def _next(given: AnyInput, last: _Last | None, known: Followed) -> PoseEstimate:
+    """Follow the object into a frame, or look for it there."""
+    seconds = {}
+    if last is not None:
+        began = time.perf_counter()
+        followed = _follow(given, last, known)
+        seconds = {"icp": time.perf_counter() - began}
+        if isinstance(followed, PoseEstimate):
+            return replace(followed, name=given.name, seconds=seconds)
+    found = known.look(given)
+    spent = {**found.seconds}
+    spent["icp"] = spent.get("icp", 0.0) + seconds.get("icp", 0.0)
+    doubt = _doubt_of(given, found.camera_from_model, known.surface)
+    if doubt is not None:
+        return PoseEstimate(
+            name=given.name, object=found.object, status=doubt.status, reason=doubt.reason,
+            signals=found.signals, risk=found.risk, seconds=spent, tracking="lost",
+        )  # fmt: skip
+    return replace(
+        found, name=given.name, seconds=spent, tracking="found" if found.is_ok else "lost"
+    )
+
+
+def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal | None:
+    """Compare a pose that was found with the frame, as one that was followed is."""
+    if pose is None:
+        return None
+    pose = _doubled(pose)
+    return _contradiction(compare_depths(_scene(given, _batch([pose]), surface), pose, surface))
+
+
+def _contradiction(shares: tuple[float, float, float]) -> Refusal | None:
+    """Say why a posed surface of which so much was seen, seen through and hidden is not there."""
+    agrees, through, before = shares
+    if through > _THROUGH:
+        return Refusal(
+            status="doubtful", reason=f"the camera saw through {through:.0%} of the posed surface"
+        )
+    if agrees >= _SEEN:
+        return None
+    return Refusal(
+        status="doubtful",
+        reason=f"{agrees:.0%} of the posed surface was seen, {before:.0%} is hidden, and "
+        f"{_SEEN:.0%} must be seen",
+    )
+
+
+def _follow(given: AnyInput, last: _Last, known: Followed) -> PoseEstimate | Refusal:
+    """Let the last pose and the predicted one slide, and judge the better."""
+    surface = known.surface
+    starts = _starts(last)
+    scene_m = _scene(given, starts, surface)
+    cloud_m = _near(scene_m, starts, surface, _MARGIN)
+    if len(cloud_m) < _LEAST_POINTS:
+        return Refusal(
+            status="too few points",
+            reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
+        )
+    refined = refine_best(cloud_m, starts, surface, replace(known.icp, starts=1)).refined
+    return _judged(refined, scene_m, known, last)
+
+
+def _judged(
+    refined: Refined, scene_m: Float64[Tensor, "n 3"], known: Followed, last: _Last
+) -> PoseEstimate | Refusal:
+    """Believe a pose that the scene agrees with, of which the surface holds it."""
+    surface, pose = known.surface, _doubled(refined.camera_from_model)
+    shares = compare_depths(scene_m, pose, surface)
+    if (contradiction := _contradiction(shares)) is not None:
+        return contradiction
+    own_m = _near(scene_m, _batch([pose]), surface, NEAR)
+    free = free_motions(known.model.symmetries.continuous, pose)
+    hold, _ = hold_of(own_m, pose, surface, free)
+    if hold < known.refusal.min_hold:
+        return Refusal(
+            status="not observable",
+            reason=f"what is seen of the object may slide along itself (hold {hold:.1%})",
+        )
+    _, through, before = shares
+    signals = {**surface_signals(own_m, pose, surface), "through": through, "before": before}
+    return _answer(refined, free, signals, known, last)
+
+
+def _answer(
+    refined: Refined,
+    free: Tensor,
+    signals: dict[str, float],
+    known: Followed,
+    last: _Last,
+) -> PoseEstimate:
+    """Give the pose; what else it may be stays what it was where the object was found."""
+    pose, origin = refined.camera_from_model, last.origin
+    return PoseEstimate(
+        name="",
+        object=known.model.name,
+        status="ok",
+        camera_from_model=Rigid(pose.R.float(), pose.t_m.float()),
+        covariance=without_motions(refined.covariance, free).float(),
+        free_motions=free.float(),
+        residual_m=float(refined.residual_m),
+        certainty=None if origin is None else origin.certainty,
+        alternatives=() if origin is None else _carried(origin, _doubled(pose)),
+        signals=signals,
+        tracking="tracked",
+    )
+
+
+def _carried(origin: PoseEstimate, pose: Rigid) -> tuple[Alternative, ...]:
+    """Move the alternatives of the first answer along with the object."""
+    assert origin.camera_from_model is not None
+    back = _doubled(origin.camera_from_model).inverse()
+
+    def moved(other: Alternative) -> Rigid:
+        there = pose @ (back @ _doubled(other.camera_from_model))
+        return Rigid(there.R.float(), there.t_m.float())
+
+    return tuple(replace(a, camera_from_model=moved(a)) for a in origin.alternatives)
+
+
+def _starts(last: _Last) -> Rigid:
+    """The pose that goes on as it moved last, and the last pose itself."""
+    every = [last.pose]
+    if last.moved is not None:
+        turned = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
+        every.insert(0, turned)
+    return _batch(every)
+
+
+def _motion(before: Rigid, after: Rigid) -> Rigid:
+    """The turn about the object's origin, and its shift."""
+    return Rigid(after.R @ before.R.mT, after.t_m - before.t_m)
+
+
+def _scene(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
+    """All points in the direction of the object at one of several poses, with a margin about it."""
+    middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
+    middle_m = middles_m.mean(0)
+    radius_m = (0.5 + 2 * _MARGIN) * surface.diameter_m
+    radius_m += float((middles_m - middle_m).norm(dim=-1).max())
+    if isinstance(given, ViewInput):
+        window = _window(given, middle_m, radius_m)
+        points_m = cloud_from_depth(window.depth_m, window.mask, window.K).double()
+        return take_evenly(points_m, _MOST_POINTS)
+    points_m = given.points_m.double()
+    points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
+    offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
+    near = offset.abs().amax(-1) < radius_m / (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
+    return take_evenly(points_m[near], _MOST_POINTS)
+
+
+def _window(view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float) -> ViewInput:
+    """Cut the square about a ball out of a view."""
+    z_m = float(middle_m[2])
+    K, near_m = view.K.double(), max(z_m - radius_m, 0.1 * z_m)
+    u, v = (K @ (middle_m / z_m))[:2].tolist()
+    reach = [float(K[k, k]) * radius_m / near_m for k in range(2)]
+    height, width = view.depth_m.shape
+    left, right = (min(max(round(u + s * reach[0]), 0), width) for s in (-1, 1))
+    top, bottom = (min(max(round(v + s * reach[1]), 0), height) for s in (-1, 1))
+    part = (slice(top, bottom), slice(left, right))
+    shifted = K.clone()
+    shifted[0, 2] -= left
+    shifted[1, 2] -= top
+    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=shifted)
+
+
+def _near(
+    points_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, limit: float
+) -> Float64[Tensor, "m 3"]:
+    """Keep the points within a limit, in diameters, of the surface at one of several poses."""
+    local_m = poses.inverse().apply(points_m.expand(len(poses.R), -1, -1))
+    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    return points_m[(gap_m < limit * surface.diameter_m).any(0)]
+
+
+def _batch(poses: Sequence[Rigid]) -> Rigid:
+    return Rigid(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
+
+
+def _doubled(pose: Rigid) -> Rigid:
+    return Rigid(pose.R.double(), pose.t_m.double())

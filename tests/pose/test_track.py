@@ -1,0 +1,193 @@
+"""One object through made frames: followed by ICP alone, lost where it is not, and found anew."""
+
+import math
+
+import pytest
+import torch
+from tests.pose.made_object import K, Oracle, bracket, pose_at, tiny_weights, view_of
+
+from depthpose.core.camera import Camera, back_project
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.pose.estimator.track import Followed, track
+from depthpose.pose.metrics import add_m
+from depthpose.pose.predictions import (
+    Prediction,
+    parse_prediction,
+    prediction_row,
+)
+from depthpose.pose.surface import compare_depths, prepare_surface
+from depthpose.pose.types import Alternative, PoseEstimate
+
+CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
+
+
+def moving(count: int, step_m: float = 0.008, step_deg: float = 2.0) -> list[Rigid]:
+    """A bracket that goes to the right and turns, frame after frame."""
+    pose, poses = pose_at(-0.08, 0.7, seed=3), []
+    axis = torch.nn.functional.normalize(torch.tensor([1.0, 2.0, 0.5]), dim=0)
+    turn = torch.linalg.matrix_exp(cross_matrix(math.radians(step_deg) * axis))
+    for _ in range(count):
+        poses.append(pose)
+        pose = Rigid(turn @ pose.R, pose.t_m + torch.tensor([step_m, 0, 0]))
+    return poses
+
+
+def frame(truth: Rigid | None, seed: int = 0) -> torch.Tensor:
+    """A depth image before a leaning wall; None: of the wall alone."""
+    v = torch.arange(240)[:, None].expand(240, 320)
+    depth_m = 1.25 - 0.0005 * v.float()
+    if truth is not None:
+        seen, mask = view_of(bracket(), truth)
+        depth_m = torch.where(mask, seen.float(), depth_m)
+    return depth_m + 0.0005 * torch.randn(240, 320, generator=torch.Generator().manual_seed(seed))
+
+
+def error_of(found: PoseEstimate, truth: Rigid) -> float:
+    assert found.camera_from_model is not None
+    return float(add_m(found.camera_from_model, truth, bracket().vertices_m))
+
+
+def oracle(poses: list[Rigid]) -> Oracle:
+    return Oracle(tiny_weights(bracket()), poses)
+
+
+def test_a_known_first_pose_is_followed_without_the_network() -> None:
+    poses = moving(8)
+    net = oracle(poses)
+    found = list(net.track([frame(p, k) for k, p in enumerate(poses)], CAMERA, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked"] * 8
+    assert [e.name for e in found] == [f"input_{k}" for k in range(8)]
+    assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.003
+    assert net.calls == []
+    assert found[0].covariance is not None
+
+
+def test_without_a_first_pose_it_is_found_and_then_followed() -> None:
+    poses = moving(3)
+    net = oracle(poses[:1])
+    found = list(net.track([frame(p) for p in poses], CAMERA))
+    assert [e.tracking for e in found] == ["found", "tracked", "tracked"]
+    assert error_of(found[2], poses[2]) < 0.003
+
+
+def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> None:
+    poses = moving(8)
+    frames = [frame(p, k) for k, p in enumerate(poses)]
+    frames[2] = frame(None)
+    frames[3] = frame(None)
+    frames[6] = torch.where(torch.arange(320) > 20, torch.tensor(0.4), frames[6])
+    net = oracle(poses)
+    found = list(net.track(frames, CAMERA, first=poses[0]))
+    kinds = ["tracked", "tracked", "lost", "lost", "found", "tracked", "lost", "found"]
+    assert [e.tracking for e in found] == kinds
+    assert all(e.reason for e in found if e.tracking == "lost")
+    assert max(error_of(found[k], poses[k]) for k in (0, 1, 4, 5, 7)) < 0.003
+
+
+def test_a_part_that_is_hidden_does_not_lose_it() -> None:
+    poses = moving(4)
+    frames = []
+    for k, pose in enumerate(poses):
+        depth_m = frame(pose, k)
+        middle = int((K @ pose.t_m.double() / pose.t_m[2])[0])
+        depth_m[:, middle - 12 : middle + 12] = 0.45
+        frames.append(depth_m)
+    found = list(oracle(poses).track(frames, CAMERA, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked"] * 4
+    assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.005
+
+
+def test_the_motion_goes_on_as_it_was() -> None:
+    """Speeding up step by step, it goes farther a frame than ICP alone would reach."""
+    poses = [moving(1)[0]]
+    for k in range(1, 7):
+        last, step = poses[-1], 0.01 * k
+        poses.append(Rigid(last.R, last.t_m + torch.tensor([0.4 * step, 0, step])))
+    frames = [frame(pose, k) for k, pose in enumerate(poses)]
+    net = oracle(poses)
+    followed = list(net.track(frames, CAMERA, first=poses[0]))
+    assert [e.tracking for e in followed] == ["tracked"] * 7
+    # Without the motion it is not reached, and looked for anew.
+    assert next(oracle(poses).track(frames[6:], CAMERA, first=poses[5])).tracking == "found"
+
+
+def test_a_cloud_of_the_scene_is_followed_too() -> None:
+    poses = moving(3)
+    clouds = [back_project(frame(p, k).double(), K).reshape(-1, 3) for k, p in enumerate(poses)]
+    found = list(oracle(poses).track(clouds, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked"] * 3
+    assert error_of(found[2], poses[2]) < 0.003
+
+
+def test_what_else_it_may_be_moves_along() -> None:
+    poses = moving(2)
+    half = Rigid(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))
+    other = Alternative(
+        camera_from_model=poses[0] @ half, probability=0.3, difference="turned by 180 degrees"
+    )
+    start = PoseEstimate(
+        name="a", object="bracket", status="ok", camera_from_model=poses[0], certainty=0.7,
+        alternatives=(other,),
+    )  # fmt: skip
+    net = oracle(poses)
+    model = net.weights.models[0]
+    known = Followed(
+        model=model, surface=prepare_surface(model), refusal=net.weights.refusal,
+        icp=net.config.icp, look=lambda _: start,
+    )  # fmt: skip
+    views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
+    from depthpose.pose.types import CloudInput
+
+    inputs = [CloudInput(name=str(k), points_m=v, object="bracket") for k, v in enumerate(views)]
+    first, second = track(inputs, known)
+    assert (first.tracking, second.tracking) == ("found", "tracked")
+    assert second.certainty == 0.7
+    moved = second.alternatives[0].camera_from_model
+    assert float(add_m(moved, poses[1] @ half, model.vertices_m)) < 0.003
+
+
+def test_frames_are_taken_as_they_come() -> None:
+    poses, asked = moving(3), []
+
+    def camera_frames():  # noqa: ANN202
+        for k, pose in enumerate(poses):
+            asked.append(k)
+            yield frame(pose, k)
+
+    answers = oracle(poses).track(camera_frames(), CAMERA, first=poses[0])
+    assert next(answers).is_ok
+    assert asked == [0]
+
+
+def test_an_unknown_object_is_an_error() -> None:
+    with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
+        oracle(moving(1)).track([], CAMERA, "spoon")
+
+
+def test_depths_agree_with_the_true_pose_alone() -> None:
+    surface, truth = prepare_surface(bracket()), moving(1)[0]
+    scene_m = back_project(frame(truth).double(), K).reshape(-1, 3)
+    pose = Rigid(truth.R.double(), truth.t_m.double())
+    agrees, through, before = compare_depths(scene_m, pose, surface)
+    assert agrees > 0.85
+    assert before < 0.1
+    nearer = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0, 0.1]))
+    assert compare_depths(scene_m, nearer, surface)[1] > 0.9
+    farther = Rigid(pose.R, pose.t_m + torch.tensor([0.0, 0, 0.1]))
+    assert compare_depths(scene_m, farther, surface)[2] > 0.7
+    empty = torch.zeros(0, 3, dtype=torch.float64)
+    assert compare_depths(empty, pose, surface) == (0.0, 0.0, 0.0)
+    assert agrees + through + before == pytest.approx(1, abs=0.05)
+
+
+def test_files_say_how_an_estimate_came_about() -> None:
+    lost = PoseEstimate(name="a", object="b", status="doubtful", reason="so", tracking="lost")
+    row = prediction_row(Prediction(estimate=lost))
+    assert parse_prediction(row, "here").estimate.tracking == "lost"
+    plain = prediction_row(
+        Prediction(estimate=PoseEstimate(name="a", object="b", status="doubtful", reason="so"))
+    )
+    assert "tracking" not in plain
+    with pytest.raises(InputError, match="tracking is 'sort of'; write one of"):
+        parse_prediction({**row, "tracking": "sort of"}, "here")
