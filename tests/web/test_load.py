@@ -92,7 +92,7 @@ def serve(tmp_path: Path) -> Iterator[Callable[[float], Served]]:
     yield start
     for process in started:
         process.kill()
-        process.wait()
+        process.communicate()
 
 
 def ask(served: Served, samples: Path, ticket: str = "", timeout_s: float = 300) -> httpx2.Response:
