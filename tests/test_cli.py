@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -303,3 +305,20 @@ def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
 def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
     refuse_missing({"images": ["left/*.png", "s3://bucket/left"], "weights": ["hf://me/mine"]})
     refuse_missing({"weights": ("sgbm:default", "open3d"), "start": "nothing", "bop": None})
+
+
+@pytest.mark.parametrize(
+    ("place", "said"), [("/x/events", "/x/events: "), (None, "a temporary file in ")]
+)
+def test_a_full_disk_under_a_library_is_one_line(
+    place: str | None, said: str, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def refuse(**_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), place)
+
+    monkeypatch.setattr("depthpose.cli.weights.list_weights", refuse)
+    assert main(["weights", "list"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"depthpose: error: {said}")
+    assert "cannot be written: No space left on device; free the space" in line

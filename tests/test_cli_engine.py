@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 import torch
 from tests.core.engine.doubles import InProcessEngine, unpacked
-from tests.pose.made_object import bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.made_frames import draw_frame, made_models, made_pose, make_dataset
+from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.test_cli_pose_predict import oracle_weights
 
 from depthpose.cli import engine, main
 from depthpose.core.files import (
@@ -26,6 +28,7 @@ from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
+from depthpose.pose.bop import write_bop_scene
 from depthpose.pose.weights import write_pose_weights
 
 RIG = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], "baseline_m": 0.5}
@@ -249,9 +252,48 @@ def test_what_no_engine_takes_is_refused(
     assert "takes no videos" in capsys.readouterr().err
     assert match(home, tmp_path, str(home / "left")) == 2
     assert "there is no right image beside it" in capsys.readouterr().err
-    bop = ["pose", "predict", "--bop", str(tmp_path), "--out", str(tmp_path / "out"), *RAY]
-    assert main(bop) == 2
-    assert "leave it away for --bop" in capsys.readouterr().err
+    bop = ["pose", "predict", "--bop", str(tmp_path), *RAY]
+    assert main([*bop, "--out", "s3://street/poses"]) == 2
+    assert "come together in poses.json and BOP's csv" in capsys.readouterr().err
+    assert main([*bop, "--out", str(tmp_path / "out"), "--masks", "parts"]) == 2
+    assert "workers take masks that are there already" in capsys.readouterr().err
+
+
+def without_seconds(out: Path) -> list[dict[str, Any]]:
+    rows = json.loads((out / "poses.json").read_text())
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
+def test_a_data_set_of_poses_gives_the_files_of_the_plain_command(
+    tmp_path: Path, double: InProcessEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = make_dataset(tmp_path / "made", frames=2)
+    truths = [made_pose(0.24 * k - 0.12, 10 * number + k) for number in range(2) for k in range(2)]
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*made_models()), truths))
+    (dataset.instances[3].depth.parent / "000001.png").write_bytes(b"damaged")
+    words = ["pose", "predict", "--bop", str(dataset.folder), "--weights", str(path), "--out"]
+    assert main([*words, str(tmp_path / "plain"), "--batch", "1"]) == 1
+    big = [*words, str(tmp_path / "big"), *RAY, "--block", "3", "--batch", "1"]
+    assert main(big) == 1
+    rows = without_seconds(tmp_path / "big")
+    assert rows == without_seconds(tmp_path / "plain")
+    assert [row["status"] for row in rows] == ["ok", "ok", "unreadable", "unreadable"]
+    (name,) = (path.name for path in (tmp_path / "plain").glob("depthpose_*.csv"))
+    poses = [
+        [line.rpartition(",")[0] for line in (tmp_path / home / name).read_text().splitlines()]
+        for home in ("plain", "big")
+    ]
+    assert poses[0] == poses[1]
+    kept = {path.name for path in (tmp_path / "plain").iterdir()}
+    assert kept - {path.name for path in (tmp_path / "big").iterdir()} == set()
+    picture = "000001_000000.pose.png"
+    assert (tmp_path / "big" / picture).read_bytes() == (tmp_path / "plain" / picture).read_bytes()
+    # What was unreadable is tried again, and nothing else.
+    before = (tmp_path / "big" / "shards" / "000000.json").stat().st_mtime_ns
+    write_bop_scene(dataset.folder, "test", 1, [draw_frame(i, made_models()) for i in range(2)])
+    assert main(big) == 0
+    assert [row["status"] for row in without_seconds(tmp_path / "big")] == ["ok"] * 4
+    assert (tmp_path / "big" / "shards" / "000000.json").stat().st_mtime_ns != before
 
 
 def test_without_ray_the_extra_is_named(

@@ -1,5 +1,6 @@
 """One command at a time in a folder: the other waits, and is refused in the end."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -90,3 +91,32 @@ def test_the_first_record_stays(tmp_path: Path) -> None:
     write_once(tmp_path / "run.json", {"settings": {"a": 2}})
     assert '"a": 1' in (tmp_path / "run.json").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_a_record_that_cannot_be_opened_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a folder that has become read-only, whose record is there from before."""
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    (tmp_path / RECORD).write_text("{}")
+    monkeypatch.setattr("depthpose.core.hold.os.open", refuse)
+    with pytest.raises(InputError, match="cannot be written: Read-only file system"):
+        hold(tmp_path / RECORD, is_shared=False)
+
+
+def test_half_files_go_when_the_folder_is_ours_alone(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"a": 1})
+    release_folders()
+    half = tmp_path / ".part-0123456789ab.png"
+    half.write_bytes(b"half")
+    with holder(tmp_path, 600, RANK="0", WORLD_SIZE="2"), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RANK", "1")
+        patch.setenv("WORLD_SIZE", "2")
+        claim_folder(tmp_path, {"a": 1})
+        assert half.exists(), "another process of the launch may be writing it"
+    claim_folder(tmp_path, {"a": 1})
+    release_folders()
+    assert not half.exists()

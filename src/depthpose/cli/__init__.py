@@ -4,6 +4,7 @@ Only this room prints. A command's function is imported when it is named and imp
 when it runs, so that every ``--help`` answers at once.
 """
 
+import errno
 import platform
 import sys
 import warnings
@@ -102,6 +103,11 @@ _EXIT_CODES = """exit codes:
   130  interrupted"""
 
 
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+"""What a disk refuses where a library writes, or a temporary file; our writers say it themselves.
+"""
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -123,6 +129,11 @@ def main(words: Sequence[str] | None = None) -> int:
     except (InputError, MissingExtraError) as error:
         print(f"depthpose: error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if error.errno not in _OF_THE_DISK:
+            raise
+        print(f"depthpose: error: {_said_of(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as stop:
         said = str(stop) or "interrupted"
         print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
@@ -130,6 +141,16 @@ def main(words: Sequence[str] | None = None) -> int:
     finally:
         if "depthpose.core.hold" in sys.modules:
             sys.modules["depthpose.core.hold"].release_folders()
+
+
+def _said_of(error: OSError) -> str:
+    from tempfile import gettempdir
+
+    place = error.filename or f"a temporary file in {gettempdir()}"
+    return (
+        f"{place}: cannot be written: {error.strerror}; free the space, or choose another place "
+        "(TMPDIR names that of temporary files)"
+    )
 
 
 def _say_version() -> int:

@@ -119,9 +119,12 @@ class Weights:
     @contextmanager
     def unpacked(self) -> Iterator[str]:
         """Give it as a file for as long as the block runs."""
+        from depthpose.core.files.disk import refused_write
+
         with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
             path = Path(folder) / self.name
-            path.write_bytes(self.data)
+            with refused_write(path):
+                path.write_bytes(self.data)
             yield str(path)
 
 

@@ -103,9 +103,8 @@ def predict(
         device=own_device(device),
     )
     if engine.is_ray:
-        return _predict_on_ray(
-            (cloud, depth, mask, camera), weights, config, (object, unit, batch), out, engine
-        )
+        given = (cloud, depth, mask, camera) if bop is None else (bop, split, masks)
+        return _predict_on_ray(given, weights, config, (object, unit, batch), out, engine)
     (method,) = pose_methods([weights], config)
     if bop is not None:
         return _predict_bop(method, (bop, split, masks), Path(out), batch, config.device, view)
@@ -122,10 +121,9 @@ def predict(
         wanted = known if object is None else (pose_inputs.object_named(object, method),)
         return find_all(method, Path(depth), camera, wanted, unit, home)
     name = pose_inputs.object_named(object, method)
-    settings: dict[str, Any] = {"object": name}
     if cloud is not None:
         jobs = pose_inputs.cloud_jobs(Path(cloud), unit or "m", name, home)
-        settings |= {"unit": unit or "m"}
+        settings: dict[str, Any] = {"unit": unit or "m"}
     else:
         assert depth is not None
         if mask is None or camera is None:
@@ -133,9 +131,9 @@ def predict(
                 "--depth needs --camera beside it, and --mask unless it is to be found"
             )
         jobs = pose_inputs.view_jobs((Path(depth), Path(mask), camera), name, unit, home)
-        settings |= {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
+        settings = {"camera": str(camera.resolve()), "mask": str(Path(mask).resolve())}
         settings |= {} if unit is None else {"unit": unit}
-    settings = {**method.settings, **settings}
+    settings = {**method.settings, "object": name, **settings}
     pose_predicting.claim(home, settings, jobs, Path(cloud or depth or out))
     predictions = pose_predicting.predict_all(method, jobs, home, settings, batch, view)
     if predictions is None:
@@ -241,7 +239,7 @@ def _predict_bop(
 
 
 def _predict_on_ray(
-    given: tuple[str | None, str | None, str | None, Path | None],
+    given: tuple[str | None, str | None, str | None, Path | None] | tuple[Path, str, str],
     weights: str,
     config: EstimateConfig,
     details: tuple[str | None, Unit | None, int],
@@ -250,11 +248,13 @@ def _predict_on_ray(
 ) -> int:
     from depthpose.cli import engine_pose
 
-    (cloud, depth, mask, camera), (object, unit, batch) = given, details
-    if cloud is None and depth is None:
-        raise InputError(
-            "--engine ray takes --cloud, or --depth with --camera; leave it away for --bop"
-        )
+    object, unit, batch = details
+    if len(given) == 3:
+        from depthpose.cli.engine import Weights
+        from depthpose.cli.engine_bop import predict_bop
+
+        return predict_bop(given, Weights.read(weights), config, batch, out, on)
+    cloud, depth, mask, camera = given
     if depth is not None and camera is None:
         raise InputError("--depth needs --camera beside it")
     files = engine_pose.CLOUD_FILES if depth is None else engine_pose.VIEW_FILES

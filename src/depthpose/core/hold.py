@@ -36,7 +36,7 @@ _held: dict[Path, int] = {}
 """Records of the folders that this process writes to, locked, and their descriptors."""
 
 
-def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> None:
+def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
     """Keep other commands out of a folder until :func:`release_folders`, or the process ends.
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
@@ -47,12 +47,17 @@ def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> None:
         is_shared: let other processes of the same launch in.
         patience_s: how long another command may take to end.
 
+    Returns:
+        Whether the folder is this process's alone from now on.
+
     Raises:
-        InputError: another command holds the folder, and goes on holding it.
+        InputError: another command holds the folder, and goes on holding it; or nothing can be
+            written there.
     """
     if fcntl is None or record.resolve() in _held:
-        return
-    file = os.open(record, os.O_RDWR)
+        return False
+    with refused_write(record):
+        file = os.open(record, os.O_RDWR)
     kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
     last = time.monotonic() + patience_s
     while True:
@@ -68,10 +73,10 @@ def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> None:
             time.sleep(0.1)
         except OSError:  # no locks on this file system
             os.close(file)
-            return
+            return False
         else:
             _held[record.resolve()] = file
-            return
+            return not is_shared
 
 
 def release_folders() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_json, write_json
+from depthpose.core.files import read_json, remove_parts, write_json
 from depthpose.core.hold import hold, write_once
 
 RECORD = "run.json"
@@ -108,7 +108,7 @@ def claim_folder(
     """Make ``folder`` the home of a run with these settings, or continue such a run.
 
     It is this process's until :func:`depthpose.core.hold.release_folders`, and that of all
-    processes of one launch.
+    processes of one launch. What a killed run left half written in it is removed.
 
     Args:
         folder: made where it is missing.
@@ -130,7 +130,8 @@ def claim_folder(
     if not record.exists():
         write_once(record, run_record(settings))
     refuse_other_settings(folder, read_json(record), settings)
-    hold(record, is_shared=find_shard().world > 1)
+    if hold(record, is_shared=find_shard().world > 1):
+        remove_parts(folder)
 
 
 def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import secrets
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from io import BytesIO
@@ -10,14 +10,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import anyio
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
@@ -32,24 +30,18 @@ from depthpose.web.examples import depth_example, pose_example
 from depthpose.web.form import Form, without_paths
 from depthpose.web.guard import (
     LOOPBACK,
+    Guard,
     read_form,
     refuse_size,
-    refuse_stranger,
     say_crash,
     say_error,
     zip_files,
 )
+from depthpose.web.line import Line, paced
 from depthpose.web.pose import answer_pose, has_registration
 
-_SAFE = {
-    # Nothing is loaded from elsewhere, and nobody else may show the page in a frame.
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
+TICKET = "x-ticket"
+"""Header of a request: a word of its own, by which the page asks for its place in the queue."""
 _RESULTS = 3
 """Answers whose files are kept in memory for downloads."""
 _TYPES = {
@@ -70,6 +62,9 @@ class Limits:
     waiting: int = 4
     """Requests that may wait for the one that is computed."""
 
+    uploads: int = 32
+    """Requests whose files may arrive at the same time."""
+
     hosts: tuple[str, ...] | None = LOOPBACK
     """Names under which a browser may ask for the page; None: any. It keeps other web pages, which
     a browser has open too, from reading answers by a name of their own (DNS rebinding)."""
@@ -88,8 +83,8 @@ class Pages:
             "depth": cache(depth_example),
             "pose": cache(partial(pose_example, pose)),
         }
-        self._one = anyio.CapacityLimiter(1)
-        self._inside = 0
+        self._line = Line(limits.waiting)
+        self._uploads = 0
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
         template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
@@ -126,9 +121,14 @@ class Pages:
         if make is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
         try:
-            return JSONResponse(await anyio.to_thread.run_sync(make, limiter=self._one))
+            made = await self._line.compute("", make, request.is_disconnected)
         except InputError as error:
             raise HTTPException(400, str(error)) from error
+        return JSONResponse(made)
+
+    async def place(self, request: Request) -> Response:
+        """Say how many computations end before that of a ticket; null: none waits here."""
+        return JSONResponse({"before": self._line.before(request.path_params["ticket"])})
 
     async def estimate(self, request: Request) -> Response:
         """Take a form to an answer."""
@@ -136,22 +136,28 @@ class Pages:
         room = self._rooms.get(request.path_params["room"])
         if room is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
-        if self._inside > self._limits.waiting:  # one is at work
-            raise HTTPException(503, "too many requests wait for one computation; try again later")
-        self._inside += 1
-        try:
-            return await self._answer(request, room)
-        finally:
-            self._inside -= 1
-
-    async def _answer(self, request: Request, room: Callable[[Form], Answer]) -> Response:
+        self._line.refuse_full()
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
-                form = await read_form(request, Path(folder))
-                answer = await anyio.to_thread.run_sync(room, form, limiter=self._one)
+                form = await self._upload(request, Path(folder))
+                ticket = request.headers.get(TICKET, "")
+                work = partial(room, form)
+                answer = await self._line.compute(ticket, work, request.is_disconnected)
             except (InputError, MissingExtraError) as error:
                 raise HTTPException(400, without_paths(str(error), Path(folder))) from error
-        return JSONResponse(self._keep(answer))
+            except ClientDisconnect:
+                answer = None
+        return Response(status_code=400) if answer is None else JSONResponse(self._keep(answer))
+
+    async def _upload(self, request: Request, folder: Path) -> Form:
+        """Read the form, one of a few at the same time, as long as it keeps coming."""
+        if self._uploads >= self._limits.uploads:
+            raise HTTPException(503, "too many uploads at the same time; try again later")
+        self._uploads += 1
+        try:
+            return await read_form(Request(request.scope, paced(request.receive)), folder)
+        finally:
+            self._uploads -= 1
 
     async def download(self, request: Request) -> Response:
         """Give a file of one of the latest answers, or all of them as a ZIP."""
@@ -203,19 +209,15 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
     limits = Limits() if limits is None else limits
     pages = Pages(depth, pose, limits)
 
-    async def guard(request: Request, go_on: Callable[[Request], Awaitable[Response]]) -> Response:
-        response = refuse_stranger(request, limits.hosts) or await go_on(request)
-        response.headers.update(_SAFE)
-        return response
-
     return Starlette(
         routes=[
             Route("/", pages.home),
             Route("/assets/{name}", pages.asset),
             Route("/examples/{room}", pages.example),
             Route("/estimate/{room}", pages.estimate, methods=["POST"]),
+            Route("/queue/{ticket}", pages.place),
             Route("/results/{key}/{name}", pages.download),
         ],
-        middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)],
+        middleware=[Middleware(Guard, hosts=limits.hosts)],
         exception_handlers={HTTPException: say_error, Exception: say_crash},
     )

@@ -6,16 +6,50 @@ from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from starlette.datastructures import UploadFile
+from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from depthpose.core.errors import InputError
 from depthpose.web.form import Form, keep_file
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_SAFE = {
+    # Nothing is loaded from elsewhere, and nobody else may show the page in a frame.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
+
+
+class Guard:
+    """Refuses strangers, and says to the browser what the page may do.
+
+    Args:
+        app: what answers everybody else.
+        hosts: names under which a browser may ask; None: any.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: tuple[str, ...] | None) -> None:
+        self._app, self._hosts = app, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def send_safely(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_SAFE)
+            await send(message)
+
+        is_request = scope["type"] == "http"
+        refusal = refuse_stranger(Request(scope), self._hosts) if is_request else None
+        await (refusal or self._app)(scope, receive, send_safely)
 
 
 def refuse_stranger(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
@@ -96,7 +130,7 @@ def zip_files(files: Mapping[str, bytes]) -> bytes:
 async def say_error(_: Request, error: Exception) -> Response:
     """Answer a refusal with its sentence."""
     assert isinstance(error, HTTPException)
-    return _sentence(error.status_code, error.detail)
+    return _sentence(error.status_code, error.detail, error.headers)
 
 
 async def say_crash(_: Request, error: Exception) -> Response:
@@ -105,5 +139,5 @@ async def say_crash(_: Request, error: Exception) -> Response:
     return _sentence(500, f"depthpose failed ({kind}: {error}); the terminal says where")
 
 
-def _sentence(status: int, said: str) -> Response:
-    return JSONResponse({"error": said}, status_code=status)
+def _sentence(status: int, said: str, headers: Mapping[str, str] | None = None) -> Response:
+    return JSONResponse({"error": said}, status_code=status, headers=headers)

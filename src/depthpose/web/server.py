@@ -9,7 +9,8 @@ from starlette.applications import Starlette
 from depthpose.core.errors import InputError
 from depthpose.web.guard import LOOPBACK
 
-_CONNECTIONS = 40
+_CONNECTIONS = 400
+"""At once; beyond, a connection is answered with 503 before anything of it is read."""
 _LEAVE_S = 2
 """Seconds that open connections have to finish after Ctrl+C."""
 

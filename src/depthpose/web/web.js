@@ -79,19 +79,29 @@ for (const form of document.forms) form.addEventListener("submit", async event =
   event.preventDefault();
   const answer = form.parentElement.querySelector(".answer"), button = form.querySelector(".go");
   const words = button.textContent, began = performance.now();
+  const ticket = Math.random().toString(36).slice(2);
+  let before = null;
   const tick = setInterval(() => {
-    button.textContent = `computing, ${Math.round((performance.now() - began) / 1000)} s`;
+    const state = before ? `waiting, ${before} before you` : "computing";
+    button.textContent = `${state}, ${Math.round((performance.now() - began) / 1000)} s`;
   }, 200);
+  const ask = setInterval(async () => {
+    const response = await fetch(`queue/${ticket}`).catch(() => null);
+    before = (await response?.json().catch(() => null))?.before;
+  }, 1000);
   button.disabled = true;
   answer.setAttribute("aria-busy", "true");
   let found;
   try {
-    const response = await fetch(`estimate/${form.dataset.room}`, { method: "POST", body: new FormData(form) });
+    const response = await fetch(`estimate/${form.dataset.room}`, {
+      method: "POST", body: new FormData(form), headers: { "X-Ticket": ticket },
+    });
     found = await response.json();
   } catch {
     found = { error: "the server does not answer; is 'depthpose serve' still running?" };
   }
   clearInterval(tick);
+  clearInterval(ask);
   button.textContent = words;
   button.disabled = false;
   answer.removeAttribute("aria-busy");

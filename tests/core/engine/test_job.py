@@ -1,6 +1,8 @@
 import csv
+import errno
 import io
 import json
+import os
 import tarfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -198,3 +200,18 @@ def test_what_engines_lose_is_missed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="1 of 2 shards are missing, first 000001"):
         run_job(job, Forgetful())
     assert json.loads((tmp_path / "out" / "shards" / "000000.json").read_text())
+
+
+def test_a_full_disk_for_temporary_files_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker's error must be one of ours: Ray starts others again and again."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    home = write_texts(tmp_path / "in", {"a": "abc"})
+    job = job_of(tmp_path, [str(home)])
+    monkeypatch.setattr("depthpose.core.engine.work.shard_writer", refuse)
+    with pytest.raises(InputError, match=r"depthpose-.*cannot be written: No space left on device"):
+        run_job(job, InProcessEngine())

@@ -13,6 +13,7 @@ from depthpose.core.engine.items import Files, Item, refuse_name
 from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat, read_tar, shard_writer
 from depthpose.core.errors import InputError
+from depthpose.core.files.disk import refused_write
 from depthpose.core.files.store import exists, join, local_copy, publish, publish_bytes, read_from
 
 SHARDS = "shards"
@@ -117,7 +118,8 @@ class Runner:
             done = Done.from_json(read_from(record))
             if not done.failures:
                 return done
-        with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
+        temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
+        with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.{self._form}"
             entries = tuple(self._write(block, file, Path(scratch)))
             publish(file, join(self._out, SHARDS, file.name))

@@ -1,0 +1,95 @@
+"""Who is computed when: one at a time, first come, first served; and uploads that keep a pace."""
+
+import time
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any, TypeVar
+
+import anyio
+from starlette.exceptions import HTTPException
+
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Result = TypeVar("Result")
+
+GRACE_S, LEAST_BYTES_S = 10.0, 20_000
+"""An upload that brings less a second, after so long, is ended: it would hold a place for ever."""
+_FULL = "too many requests wait for one computation; try again later"
+
+
+class Line:
+    """Computations, one at a time.
+
+    Args:
+        most: requests that may wait for the one that is computed.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._one = anyio.CapacityLimiter(1)
+        self._tickets: list[str] = []
+
+    def refuse_full(self) -> None:
+        """Refuse one more.
+
+        Raises:
+            HTTPException: too many wait.
+        """
+        if len(self._tickets) > self._most:  # one of them is at work
+            raise HTTPException(503, _FULL)
+
+    def before(self, ticket: str) -> int | None:
+        """Count the computations that end before that of a ticket; None: it does not wait here."""
+        return self._tickets.index(ticket) if ticket in self._tickets else None
+
+    async def compute(
+        self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
+    ) -> Result | None:
+        """Compute in a thread when all who came before are done.
+
+        Args:
+            ticket: by which the one who waits asks for the place.
+            work: what is computed.
+            is_gone: whether nobody waits for the answer any more.
+
+        Returns:
+            None where nobody does: then nothing was computed.
+
+        Raises:
+            HTTPException: too many wait.
+        """
+        self.refuse_full()
+        self._tickets.append(ticket)
+        try:
+            async with self._one:
+                if await is_gone():
+                    return None
+                return await anyio.to_thread.run_sync(work)
+        finally:
+            self._tickets.remove(ticket)
+
+
+def paced(receive: Receive) -> Receive:
+    """Give a request's body as long as it keeps a pace.
+
+    Raises:
+        HTTPException: when it is awaited: the client sends too slowly.
+    """
+    start, size = time.monotonic(), 0
+
+    async def receive_in_time() -> MutableMapping[str, Any]:
+        nonlocal size
+        left_s = start + GRACE_S + size / LEAST_BYTES_S - time.monotonic()
+        try:
+            with anyio.fail_after(max(left_s, 0.0)):
+                message = await receive()
+        except TimeoutError as error:
+            raise HTTPException(
+                408,
+                f"the upload came too slowly ({size} bytes in {time.monotonic() - start:.0f} s, "
+                f"less than {LEAST_BYTES_S} a second); send smaller files",
+                # What is still to come is not waited for.
+                headers={"Connection": "close"},
+            ) from error
+        size += len(message.get("body", b""))
+        return message
+
+    return receive_in_time
