@@ -145,7 +145,7 @@ def test_one_file_serves_one_image_and_pairs(generator: UNetGenerator, tmp_path:
 def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     generator: UNetGenerator, tmp_path: Path
 ) -> None:
-    sizes: list[tuple[int, ...]] = []
+    sizes: list[tuple[int, int]] = []
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
     net = FakestereoNet.load(path)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from depthpose.cli.engine import EngineOptions
+from depthpose.cli.engine import EngineOptions, Weights
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, FloorName, MatcherConfig, Speed
 
@@ -92,7 +92,7 @@ def predict(
                 "'depthpose weights pack G --matcher S --out W'"
             )
         recipe = engine_depth.NetRecipe(
-            weights=engine_depth.Weights.read(weights),
+            weights=Weights.read(weights),
             config=config,
             with_right=False,
             with_sgbm=matcher == "sgbm",
@@ -224,7 +224,7 @@ def _match_on_ray(
     from depthpose.cli import engine_depth
 
     recipe = engine_depth.NetRecipe(
-        weights=None if weights is None else engine_depth.Weights.read(weights),
+        weights=None if weights is None else Weights.read(weights),
         config=config,
         with_right=True,
         with_sgbm=False,

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from depthpose.cli.engine import EngineOptions
+from depthpose.cli.engine import EngineOptions, Weights
 from depthpose.core.errors import InputError
 from depthpose.pose.config import (
     DiameterTable,
@@ -250,7 +250,6 @@ def _predict_on_ray(
 
     object, unit, batch = details
     if len(given) == 3:
-        from depthpose.cli.engine import Weights
         from depthpose.cli.engine_bop import predict_bop
 
         return predict_bop(given, Weights.read(weights), config, batch, out, on)
@@ -259,7 +258,7 @@ def _predict_on_ray(
         raise InputError("--depth needs --camera beside it")
     files = engine_pose.CLOUD_FILES if depth is None else engine_pose.VIEW_FILES
     work = engine_pose.PoseWork(
-        weights=engine_pose.Weights.read(weights),
+        weights=Weights.read(weights),
         config=config,
         object=object or "",
         unit=unit,
