@@ -347,10 +347,10 @@ def test_what_cannot_be_used_is_an_error(part: ObjectModel, given: dict, text: s
         Oracle(tiny_weights(part), [pose_at()]).estimate(**given)
 
 
-def test_one_of_several_objects_must_be_named(part: ObjectModel) -> None:
+def test_of_several_instances_the_object_must_be_named(part: ObjectModel) -> None:
     net = Oracle(tiny_weights(part, bottle()), [pose_at()])
     with pytest.raises(InputError, match="the weights know bracket, bottle; say which by object="):
-        net.estimate(cloud=torch.zeros(30, 3))
+        net.estimate_instances(depth=torch.ones(4, 4), mask=torch.ones(4, 4), focal_px=5.0)
 
 
 def line() -> torch.Tensor:

@@ -1,14 +1,18 @@
 """Known objects in depth without masks: planes go, regions are parted, answers do not overlap."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tests.pose.made_object import K, Oracle, bottle, bracket, pose_at, tiny_weights, view_of
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud
+from depthpose.pose.types import ObjectModel
 
 CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
@@ -87,3 +91,39 @@ def test_an_object_that_the_weights_do_not_know_is_refused() -> None:
     net = Oracle(tiny_weights(bracket()), TRUTHS)
     with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
         net.find(table(), CAMERA, ["spoon"])
+
+
+def cloud_of(model: ObjectModel, truth: Rigid) -> torch.Tensor:
+    depth_m, mask = view_of(model, truth)
+    return back_project(depth_m.double(), K)[mask].float()
+
+
+def test_which_object_a_cloud_shows_is_answered() -> None:
+    truth = pose_at(seed=3)
+    net = Oracle(tiny_weights(bracket(), bottle(), refusal=REFUSAL), [truth])
+    for model in (bracket(), bottle()):
+        found = net.estimate(cloud=cloud_of(model, truth))
+        assert (found.object, found.status) == (model.name, "ok")
+        named = net.estimate(cloud=cloud_of(model, truth), object=model.name)
+        assert found.certainty is not None
+        assert named.certainty is not None
+        assert found.certainty <= named.certainty
+
+
+def test_a_cloud_of_none_of_several_objects_is_refused() -> None:
+    generator = torch.Generator().manual_seed(0)
+    blob = 0.03 * torch.randn(2000, 3, generator=generator) + torch.tensor([0.0, 0.0, 0.8])
+    net = Oracle(tiny_weights(bracket(), bottle(), refusal=REFUSAL), [pose_at()])
+    found = net.estimate(cloud=blob)
+    assert found.camera_from_model is None
+    assert found.reason is not None
+    assert found.reason.startswith("none of bracket, bottle surely; ")
+
+
+def test_two_objects_that_look_alike_are_named_and_refused() -> None:
+    twin = replace(bracket(), name="twin")
+    truth = pose_at(seed=3)
+    net = Oracle(tiny_weights(bracket(), twin, refusal=REFUSAL), [truth])
+    found = net.estimate(cloud=cloud_of(bracket(), truth))
+    assert found.status == "doubtful"
+    assert found.reason == "it may be bracket (50%), twin (50%); say which by object"

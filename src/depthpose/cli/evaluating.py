@@ -19,8 +19,8 @@ from depthpose.depth.kitti import Dataset, join_datasets, open_dataset
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import StereoInput
 
-_SHOWN = ("method", "cap_m", "frames", "coverage", "abs_rel", "sq_rel", "rmse", "rmse_log", "d1",
-          "epe_px", "d1_all", "ause")  # fmt: skip
+_SHOWN = ("method", "weights", "speed", "cap_m", "frames", "coverage", "abs_rel", "sq_rel", "rmse",
+          "rmse_log", "d1", "epe_px", "d1_all", "ause")  # fmt: skip
 """Columns that are printed; the files hold all."""
 
 
@@ -190,12 +190,13 @@ def _show_progress(frames: Sequence[int]) -> Iterable[int]:
 def _describe(name: str, settings: dict[str, Any] | None) -> dict[str, Any]:
     """Columns that say whose predictions these are."""
     if settings is None:
-        return {"method": name, "sees": "", "weights": "", "weights_sha256": ""}
+        return {"method": name, "sees": "", "speed": "", "weights": "", "weights_sha256": ""}
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     suffix = holes.get(settings.get("with_filled_holes", ""), "")
     return {
         "method": settings.get("matcher", "") + suffix,
         "sees": settings.get("sees", "both views"),
+        "speed": settings.get("speed", "") if settings.get("sees") != "left view" else "",
         "weights": settings.get("weights", ""),
         "weights_sha256": settings.get("weights_sha256", "")[:12],
     }

@@ -1,6 +1,7 @@
 """Known objects in a depth image without a mask: regions, questions, and answers that agree."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,6 +35,8 @@ _SEEN_THROUGH = 0.2
 """Where the camera saw through more of the posed surface, there is no such object."""
 _SUNK = 0.15
 """Where a table or wall lies before more of the posed surface, there is no such object."""
+_ONE = 0.8
+"""Where no object among several has so large a share of the probability, none is answered."""
 _WHOLE, _HALF = 0.96, 0.5
 """An answer explains so much of its region, or half of it and leaves enough for another object:
 what has a little more to it than the object is another thing."""
@@ -170,18 +173,58 @@ def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]
     return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
 
 
-def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: Known) -> _Answer:
-    """Choose among objects that answered for one cloud; the others lower its certainty."""
-    slopes = known.refusal.candidate_slopes
-    shares = share_out([estimate.signals for estimate in some], slopes)
+def which_object(asked: Sequence[PoseEstimate], refusal: RefusalConfig) -> PoseEstimate:
+    """Say which object one input shows, from the answers for every object that it may be.
+
+    Those that are refused are none; the others share the probability of one.
+
+    Args:
+        asked: estimates for the same input, one an object.
+        refusal: how they are compared.
+
+    Returns:
+        The best, its certainty given the others; refused where none is ok, or where another object
+        is too likely.
+    """
+    some = [estimate for estimate in asked if estimate.is_ok]
+    spent: Counter[str] = Counter()
+    for estimate in asked:
+        spent.update(estimate.seconds)
+    if not some:
+        least = min(asked, key=lambda one: 1.0 if one.risk is None else one.risk)
+        names = ", ".join(one.object for one in asked)
+        reason = f"none of {names} surely; {least.object} comes nearest: {least.reason}"
+        return replace(least, reason=reason, seconds=dict(spent))
+    shares = share_out([one.signals for one in some], refusal.candidate_slopes)
+    best, share = _given_others(some, shares)
+    if share < _ONE:
+        said = ", ".join(
+            f"{one.object} ({float(s):.0%})" for one, s in zip(some, shares, strict=True)
+        )
+        return PoseEstimate(
+            name=best.name, object=best.object, status="doubtful", signals=best.signals,
+            reason=f"it may be {said}; say which by object", risk=best.risk, seconds=dict(spent),
+        )  # fmt: skip
+    return replace(best, seconds=dict(spent))
+
+
+def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
+    """Take the likeliest; the others lower its certainty."""
     number = int(shares.argmax())
     share, estimate = float(shares[number]), some[number]
     certainty = None if estimate.certainty is None else share * estimate.certainty
     others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
+    return replace(estimate, certainty=certainty, alternatives=others), share
+
+
+def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: Known) -> _Answer:
+    """Choose among objects that answered for one cloud; the others lower its certainty."""
+    shares = share_out([estimate.signals for estimate in some], known.refusal.candidate_slopes)
+    estimate, share = _given_others(some, shares)
     pose = estimate.camera_from_model
     assert pose is not None
     return _Answer(
-        estimate=replace(estimate, certainty=certainty, alternatives=others),
+        estimate=estimate,
         points_m=cloud,
         explained=_is_explained(cloud, pose, known.surface_of(estimate.object)),
         share=share,

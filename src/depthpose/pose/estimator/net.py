@@ -18,7 +18,7 @@ from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.estimator.alternatives import Copies, find_copies
 from depthpose.pose.estimator.batches import batches, network_directions
-from depthpose.pose.estimator.find import Known, find_objects, nothing_found
+from depthpose.pose.estimator.find import Known, find_objects, nothing_found, which_object
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
@@ -122,20 +122,25 @@ class GeoPoseNet:
             camera: of the depth image, its file of any format that is read, a dict of what such a
                 file holds, or the 3x3 matrix K.
             focal_px: the focal length alone [px], in place of a camera.
-            object: which one; None where the weights know one alone.
+            object: which one; None: whichever of those that the weights know it is, if any.
 
         Raises:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
-        which = self._object(object)
+        which = self.objects[0] if object is None else self._object(object)
+        names = self.objects if object is None else (which,)
         if cloud is not None and depth is None and mask is None:
-            return self.estimate_many([cloud_input(cloud, unit or "m", which, _NAME)])[0]
+            return self._which(cloud_input(cloud, unit or "m", which, _NAME), names)
         lens = choose_lens(camera, focal_px)
         if cloud is not None or depth is None or mask is None or lens is None:
             raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
-        view = view_input(depth, mask, lens, which, _NAME, unit)
-        return self.estimate_many([view])[0]
+        return self._which(view_input(depth, mask, lens, which, _NAME, unit), names)
+
+    def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
+        """Estimate one input as each of several objects, and take the one that it shows."""
+        asked = self.estimate_many([replace(given, object=name) for name in names])
+        return asked[0] if len(asked) == 1 else which_object(asked, self.weights.refusal)
 
     def estimate_instances(
         self,
