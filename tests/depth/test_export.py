@@ -15,7 +15,7 @@ from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.core.export import network_model
 from depthpose.core.files import write_image
-from depthpose.depth.config import Answer, GeneratorConfig, PSMNetConfig
+from depthpose.depth.config import Answer, GeneratorConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
 from depthpose.depth.export.network import SizelessPSMNet, SizelessSelection, gathered_volume
@@ -205,7 +205,8 @@ def infer_as_documented(exported: Path, least_px: float) -> None:
     subprocess.run(
         [sys.executable, "-c", blocked + code], cwd=exported, check=True, capture_output=True
     )
-    net = FakestereoNet.load(exported / "w.safetensors")
+    quick = MatcherConfig(speed="quick")
+    net = FakestereoNet.load(exported / "w.safetensors", config=quick)
     expected = net.estimate(exported / "street.png", exported / "camera.json")
     assert expected.depth_m is not None
     depth_m = np.load(exported / "street.depth_m.npy")

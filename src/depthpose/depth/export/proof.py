@@ -11,6 +11,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.export import Case, Export, Limit
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
 from depthpose.depth.stereo import PSMNetMatcher
@@ -44,6 +45,8 @@ networks take; one that is stretched to it; one that is enlarged; one that is pa
 _SHIFT_PX = 6
 _SKY = (0.72, 0.82, 0.95)
 """RGB of the sky at its brightest."""
+_QUICK = MatcherConfig(speed="quick")
+"""Graphs match pairs at the focal length of the weights' training."""
 _LEAST_PX = 1.0
 """Disparity from which depths are compared."""
 
@@ -85,7 +88,7 @@ def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None
-    matcher = None if weights.matcher is None else PSMNetMatcher(weights.matcher)
+    matcher = None if weights.matcher is None else PSMNetMatcher(weights.matcher, _QUICK)
     net = FakestereoNet(matcher, make_synthesiser(weights.generator))
     sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
     for size in _SIZES:
@@ -104,7 +107,7 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
 
 def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.matcher is not None
-    net = FakestereoNet(PSMNetMatcher(weights.matcher))
+    net = FakestereoNet(PSMNetMatcher(weights.matcher, _QUICK))
     work_px = weights.matcher.config.work_focal_px
     for size in _SIZES:
         left, right = _scenes(*size)
