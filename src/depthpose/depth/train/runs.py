@@ -280,15 +280,19 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
         )
 
 
+_FREE = ("max_disparity_px",)
+"""Knobs that no weight depends on: a matcher looks through any disparities in the same way."""
+
+
 def _start_from(network: Generator | PSMNet, found: Generator | PSMNet, source: str) -> None:
-    """Copy weights whose config is the network's own.
+    """Copy weights whose config is the network's own, but for the range of disparities.
 
     Raises:
         InputError: a knob differs, so the weights would mean something else.
     """
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     for knob, value in wanted.items():
-        if given[knob] != value:
+        if given[knob] != value and knob not in _FREE:
             raise InputError(
                 f"{source}: was trained with {knob} = {given[knob]!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
