@@ -96,7 +96,8 @@ TABLES = (
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
             "--protocol eigen-raw-camera --matcher sgbm --floor rows nearest "
             f"{_TRAIN} "
-            "--weights default both:default kitti-nc both:kitti-nc --out OUT/mono",
+            "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
+            "--out OUT/mono",
         ),
         files=("mono/rows.json",),
         numbers={**_DEPTH, **_DELTAS},
@@ -105,8 +106,11 @@ TABLES = (
             **_FLOORS,
             "one image (default)": {"weights": "default", "sees": "left view"},
             "one image (kitti-nc)": {"weights": "kitti-nc", "sees": "left view"},
-            "real stereo, our matcher (default)": {"weights": "default", "sees": "both views"},
-            "real stereo, our matcher (kitti-nc)": {"weights": "kitti-nc", "sees": "both views"},
+            **{
+                f"real stereo, our matcher ({name}), {speed}": {"weights": name, "speed": speed}
+                for name in ("default", "kitti-nc")
+                for speed in ("fine", "quick")
+            },
             "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
         },
     ),
@@ -132,16 +136,19 @@ TABLES = (
         after="The same pairs by `--protocol kitti-2015`",
         commands=(
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
-            "--weights default both:default kitti-nc both:kitti-nc --matcher sgbm "
-            "--out OUT/disparity",
+            "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
+            "--matcher sgbm --out OUT/disparity",
         ),
         files=("disparity/rows.json",),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
         rows={
             "one image, default": {"weights": "default", "sees": "left view"},
             "one image, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
-            "both views, default": {"weights": "default", "sees": "both views"},
-            "both views, kitti-nc": {"weights": "kitti-nc", "sees": "both views"},
+            **{
+                f"both views, {name}, {speed}": {"weights": name, "speed": speed}
+                for name in ("default", "kitti-nc")
+                for speed in ("fine", "quick")
+            },
             **_SGBM,
         },
     ),
