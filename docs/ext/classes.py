@@ -36,6 +36,11 @@ def classes_of(module_name: str, *, with_imported: bool) -> dict[str, type]:
     }
 
 
+def _foreign_bases(found: type) -> list[str]:
+    """Name the bases of a class that are not of this package: what it inherits is not shown."""
+    return [base.__name__ for base in found.__mro__ if not base.__module__.startswith("depthpose")]
+
+
 def write_pages(app: Sphinx) -> None:
     """Write a page for each class; remove those of classes that are no more."""
     folder = Path(app.srcdir) / FOLDER
@@ -46,6 +51,8 @@ def write_pages(app: Sphinx) -> None:
             module = match["name"]
             for name in _classes(match):
                 text = f"{name}\n{'=' * len(name)}\n\n.. autoclass:: {module}.{name}\n"
+                foreign = ", ".join(_foreign_bases(getattr(import_module(module), name)))
+                text += f"   :inherited-members: {foreign}\n"
                 wanted[folder / f"{module}.{name}.rst"] = text
     for path in set(folder.glob("*.rst")) - wanted.keys():
         path.unlink()

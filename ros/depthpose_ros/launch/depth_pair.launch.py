@@ -1,33 +1,16 @@
 """Depth from a rectified stereo camera."""
 
-from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-
+from depthpose_ros.launching import describe
 from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
     """Start the node with the parameters of a file."""
-    share = Path(get_package_share_directory("depthpose_ros"))
-    default = str(share / "config" / "depthpose.yaml")
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("params", default_value=default, description="parameters, YAML"),
-            Node(
-                package="depthpose_ros",
-                executable="depth_pair",
-                name="depth_pair",
-                namespace="depthpose",
-                parameters=[LaunchConfiguration("params")],
-                remappings=[
-                    (f"{side}/{topic}", f"/stereo/{side}/{topic}")
-                    for side in ("left", "right")
-                    for topic in ("image_rect", "camera_info")
-                ],
-            ),
-        ]
+    return describe(
+        executable="depth_pair",
+        remappings=[
+            (f"{side}/{topic}", f"/stereo/{side}/{topic}")
+            for side in ("left", "right")
+            for topic in ("image_rect", "camera_info")
+        ],
     )

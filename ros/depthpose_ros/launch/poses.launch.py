@@ -1,33 +1,16 @@
 """Poses of known objects in the images of a depth sensor."""
 
-from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-
+from depthpose_ros.launching import describe
 from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
     """Start the node with the parameters of a file."""
-    share = Path(get_package_share_directory("depthpose_ros"))
-    default = str(share / "config" / "depthpose.yaml")
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("params", default_value=default, description="parameters, YAML"),
-            Node(
-                package="depthpose_ros",
-                executable="poses",
-                name="poses",
-                namespace="depthpose",
-                parameters=[LaunchConfiguration("params")],
-                remappings=[
-                    ("depth", "/camera/depth/image_rect"),
-                    ("camera_info", "/camera/depth/camera_info"),
-                    ("mask", "/camera/mask"),
-                ],
-            ),
-        ]
+    return describe(
+        executable="poses",
+        remappings=[
+            ("depth", "/camera/depth/image_rect"),
+            ("camera_info", "/camera/depth/camera_info"),
+            ("mask", "/camera/mask"),
+        ],
     )

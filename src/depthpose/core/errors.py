@@ -38,10 +38,7 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return import_module("cv2")
-    except ImportError as error:
-        raise MissingExtraError("opencv-python-headless", "opencv", purpose) from error
+    return _import("cv2", ("opencv-python-headless", "opencv"), purpose)
 
 
 def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
@@ -50,10 +47,14 @@ def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry 
     Raises:
         MissingExtraError: it is not installed.
     """
+    return _import("open3d", ("open3d", "open3d"), purpose)
+
+
+def _import(module: str, package_and_extra: tuple[str, str], purpose: str) -> Any:  # noqa: ANN401
     try:
-        return import_module("open3d")
+        return import_module(module)
     except ImportError as error:
-        raise MissingExtraError("open3d", "open3d", purpose) from error
+        raise MissingExtraError(*package_and_extra, purpose) from error
 
 
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:

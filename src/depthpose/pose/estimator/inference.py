@@ -1,0 +1,149 @@
+"""Clouds and masked views that are read already, through the network to poses."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.devices import usable_device
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.pose.baselines import DepthImageNet
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.estimator.alternatives import Copies, find_copies
+from depthpose.pose.estimator.batches import batches, network_directions
+from depthpose.pose.estimator.pose import Voted, pose_from_directions
+from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.types import PoseEstimate
+from depthpose.pose.weights import PoseWeights
+
+
+class PoseInference:
+    """A network of directions made ready to run, with what is kept of each object.
+
+    Args:
+        weights: the network and the objects that it knows.
+        config: voting, ICP, limits, device.
+
+    Raises:
+        InputError: weights that cast no votes, or a device that is not there.
+    """
+
+    def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
+        self.config = EstimateConfig() if config is None else config
+        self.weights = weights
+        if isinstance(weights.network, DepthImageNet):
+            raise InputError(
+                "these weights regress a depth image and cast no votes; load them as "
+                "DepthImageRegressor"
+            )
+        self._network = weights.network.to(usable_device(self.config.device)).eval()
+        self._numbers = {model.name: k for k, model in enumerate(weights.models)}
+        self._surfaces: dict[int, Surface] = {}
+        self._copies: dict[int, Copies] = {}
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects that the weights know."""
+        return tuple(self._numbers)
+
+    @torch.inference_mode()
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate many at once, of any objects: the network is called for all of them together.
+
+        The answer for an input does not depend on those beside it, but for the rounding of the
+        network's sums.
+
+        Raises:
+            InputError: an unknown object, or a mask that does not fit its depth image.
+        """
+        estimates = {k: found for k, found, _ in self._each(inputs)}
+        return [estimates[k] for k in range(len(inputs))]
+
+    @torch.inference_mode()
+    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
+        """Estimate one pose, and give what the network said of each keypoint at each point.
+
+        Returns:
+            The estimate, and the cloud with the outputs in the camera frame; None for them where
+            the network was not asked, as there is too little to pose.
+
+        Raises:
+            InputError: as for :meth:`estimate_many`.
+        """
+        ((_, found, voted),) = self._each([given])
+        return found, voted
+
+    def _each(self, inputs: Sequence[AnyInput]) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
+        """Give each input's number, estimate and votes: first what is refused, then by batches."""
+        ready: list[tuple[int, Prepared, float]] = []
+        for k, given in enumerate(inputs):
+            start = time.perf_counter()
+            model = self.weights.models[self._number(given.object)]
+            prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
+            spent_s = time.perf_counter() - start
+            if isinstance(prepared, Refusal):
+                yield k, _refused(given, prepared, {"cloud": spent_s}), None
+            else:
+                ready.append((k, prepared, spent_s))
+        for some in batches(ready, self.config.batch_voxels):
+            numbers = [self._number(inputs[k].object) for k, _, _ in some]
+            directions, network_s = self._directions([p for _, p, _ in some], numbers)
+            total = sum(map(len, directions))
+            for (k, prepared, spent_s), outputs, number in zip(
+                some, directions, numbers, strict=True
+            ):
+                share_s = network_s * len(outputs) / total
+                seconds = {"cloud": spent_s, "network": share_s}
+                voted = Voted(prepared, outputs)
+                yield k, self._pose(inputs[k], number, voted, seconds), voted
+
+    def _directions(
+        self, clouds: list[Prepared], numbers: list[int]
+    ) -> tuple[list[Float[Tensor, "n k c"]], float]:
+        start = time.perf_counter()
+        found = network_directions(self._network, clouds, numbers, self.config.device)
+        return found, time.perf_counter() - start
+
+    def _pose(
+        self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
+    ) -> PoseEstimate:
+        model = self.weights.models[number]
+        if number not in self._copies:
+            up_to_symmetry = self.config.up_to_symmetry
+            self._copies[number] = find_copies(model, up_to_symmetry=up_to_symmetry)
+        found = pose_from_directions(
+            voted,
+            model,
+            self._surface(number),
+            self._copies[number],
+            self.weights.refusal,
+            self.config,
+        )
+        return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+
+    def _surface(self, number: int) -> Surface:
+        if number not in self._surfaces:
+            model = self.weights.models[number]
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        return self._surfaces[number]
+
+    def _number(self, name: str) -> int:
+        if name not in self._numbers:
+            raise InputError(
+                f"object {name!r}: the weights do not know it; {nearest_name(name, self.objects)}"
+            )
+        return self._numbers[name]
+
+
+def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status=refusal.status,
+        reason=refusal.reason,
+        seconds=seconds,
+    )
