@@ -37,8 +37,8 @@ from depthpose.web.guard import (
     say_error,
     zip_files,
 )
-from depthpose.web.line import Line, paced
 from depthpose.web.pose import answer_pose, has_registration
+from depthpose.web.queue import Queue, paced
 
 TICKET = "x-ticket"
 """Header of a request: a word of its own, by which the page asks for its place in the queue."""
@@ -83,7 +83,7 @@ class Pages:
             "depth": cache(depth_example),
             "pose": cache(partial(pose_example, pose)),
         }
-        self._line = Line(limits.waiting)
+        self._queue = Queue(limits.waiting)
         self._uploads = 0
         self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
@@ -121,14 +121,14 @@ class Pages:
         if make is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
         try:
-            made = await self._line.compute("", make, request.is_disconnected)
+            made = await self._queue.compute("", make, request.is_disconnected)
         except InputError as error:
             raise HTTPException(400, str(error)) from error
         return JSONResponse(made)
 
     async def place(self, request: Request) -> Response:
         """Say how many computations end before that of a ticket; null: none waits here."""
-        return JSONResponse({"before": self._line.before(request.path_params["ticket"])})
+        return JSONResponse({"before": self._queue.before(request.path_params["ticket"])})
 
     async def estimate(self, request: Request) -> Response:
         """Take a form to an answer."""
@@ -136,13 +136,13 @@ class Pages:
         room = self._rooms.get(request.path_params["room"])
         if room is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
-        self._line.refuse_full()
+        self._queue.refuse_full()
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
                 form = await self._upload(request, Path(folder))
                 ticket = request.headers.get(TICKET, "")
                 work = partial(room, form)
-                answer = await self._line.compute(ticket, work, request.is_disconnected)
+                answer = await self._queue.compute(ticket, work, request.is_disconnected)
             except (InputError, MissingExtraError) as error:
                 raise HTTPException(400, without_paths(str(error), Path(folder))) from error
             except ClientDisconnect:

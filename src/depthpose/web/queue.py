@@ -15,7 +15,7 @@ GRACE_S, LEAST_BYTES_S = 10.0, 20_000
 _FULL = "too many requests wait for one computation; try again later"
 
 
-class Line:
+class Queue:
     """Computations, one at a time.
 
     Args:
