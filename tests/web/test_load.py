@@ -21,7 +21,7 @@ from tests.web.samples import write_street
 pytestmark = pytest.mark.slow
 
 SERVER = """
-import sys, time, torch
+import pathlib, sys, time, torch
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.pose.estimator import GeoPoseNet
@@ -33,6 +33,8 @@ class Counted:
     def __call__(self, left, right):
         self.active += 1
         self.most, self.calls = max(self.most, self.active), self.calls + 1
+        while pathlib.Path(sys.argv[2]).exists():
+            time.sleep(0.02)
         time.sleep(float(sys.argv[1]))
         self.active -= 1
         return torch.full(left.shape[1:], 8.0)
@@ -55,6 +57,8 @@ class Served:
 
     process: "subprocess.Popen[str]"
     port: int
+    hold: Path
+    """While this file exists, no computation ends."""
 
     @property
     def url(self) -> str:
@@ -63,6 +67,16 @@ class Served:
     def memory_kb(self) -> int:
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(status.partition("VmRSS:")[2].split()[0])
+
+    def before(self, ticket: str) -> int | None:
+        """How many computations end before that of a ticket."""
+        return json.loads(httpx2.get(f"{self.url}/queue/{ticket}", timeout=60).text)["before"]
+
+    def await_place(self, ticket: str, place: int | None) -> None:
+        until = time.monotonic() + 60
+        while self.before(ticket) != place:
+            assert time.monotonic() < until
+            time.sleep(0.02)
 
     def stop(self) -> tuple[int, int]:
         """Most computations at the same time, and how many there were."""
@@ -83,11 +97,12 @@ def serve(tmp_path: Path) -> Iterator[Callable[[float], Served]]:
     started: list[subprocess.Popen[str]] = []
 
     def start(seconds: float) -> Served:
-        words = [sys.executable, "-c", SERVER, str(seconds)]
+        hold = tmp_path / "hold"
+        words = [sys.executable, "-c", SERVER, str(seconds), str(hold)]
         own = {**os.environ, "TMPDIR": str(tmp_path)}
         started.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=own))
         assert started[-1].stdout is not None
-        return Served(started[-1], int(started[-1].stdout.readline()))
+        return Served(started[-1], int(started[-1].stdout.readline()), hold)
 
     yield start
     for process in started:
@@ -159,40 +174,40 @@ def test_slow_uploads_block_nobody_and_are_ended(
 
 
 def test_the_place_in_the_queue_is_true(serve: Callable[[float], Served], samples: Path) -> None:
-    served = serve(2.0)
-
-    def before(ticket: str) -> int | None:
-        return json.loads(httpx2.get(f"{served.url}/queue/{ticket}", timeout=60).text)["before"]
-
+    served = serve(1.0)
+    served.hold.touch()
     with ThreadPoolExecutor(5) as pool:
         waiting = []
         for k in range(5):
             waiting.append(pool.submit(ask, served, samples, f"t{k}"))
-            until = time.monotonic() + 60
-            while before(f"t{k}") is None and not waiting[k].done():
-                assert time.monotonic() < until
-                time.sleep(0.02)
+            served.await_place(f"t{k}", k)
         assert ask(served, samples).status_code == 503
+        served.hold.unlink()
         seen: list[int] = []
-        while (place := before("t4")) is not None:
+        while (place := served.before("t4")) is not None:
             seen.append(place)
             time.sleep(0.1)
         assert seen == sorted(seen, reverse=True)
         assert {2, 1, 0} <= set(seen)
         assert [one.result().status_code for one in waiting] == [200] * 5
-    assert before("t4") is None
+    assert served.before("t4") is None
 
 
 def test_nothing_is_computed_for_who_has_gone(
     serve: Callable[[float], Served], samples: Path
 ) -> None:
-    served = serve(3.0)
-    with ThreadPoolExecutor(1) as pool:
-        first = pool.submit(ask, served, samples)
-        time.sleep(1.0)
-        for _ in range(3):
-            with pytest.raises(httpx2.TimeoutException):
-                ask(served, samples, timeout_s=0.5)
+    served = serve(0.0)
+    served.hold.touch()
+    with ThreadPoolExecutor(4) as pool:
+        first = pool.submit(ask, served, samples, "first")
+        served.await_place("first", 0)
+        gone = []
+        for k in range(3):
+            gone.append(pool.submit(ask, served, samples, f"gone{k}", timeout_s=3))
+            served.await_place(f"gone{k}", k + 1)
+        for one in gone:
+            assert isinstance(one.exception(), httpx2.TimeoutException)
+        served.hold.unlink()
         assert first.result().status_code == 200
         assert ask(served, samples).status_code == 200
     assert served.stop() == (1, 2)

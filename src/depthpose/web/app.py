@@ -38,7 +38,7 @@ from depthpose.web.guard import (
     zip_files,
 )
 from depthpose.web.pose import answer_pose, has_registration
-from depthpose.web.queue import Queue, paced
+from depthpose.web.queue import Queue, has_gone, paced
 
 TICKET = "x-ticket"
 """Header of a request: a word of its own, by which the page asks for its place in the queue."""
@@ -121,7 +121,7 @@ class Pages:
         if make is None:
             raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
         try:
-            made = await self._queue.compute("", make, request.is_disconnected)
+            made = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
             raise HTTPException(400, str(error)) from error
         return JSONResponse(made)
@@ -142,7 +142,7 @@ class Pages:
                 form = await self._upload(request, Path(folder))
                 ticket = request.headers.get(TICKET, "")
                 work = partial(room, form)
-                answer = await self._queue.compute(ticket, work, request.is_disconnected)
+                answer = await self._queue.compute(ticket, work, partial(has_gone, request.receive))
             except (InputError, MissingExtraError) as error:
                 raise HTTPException(400, without_paths(str(error), Path(folder))) from error
             except ClientDisconnect:

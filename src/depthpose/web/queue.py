@@ -12,6 +12,7 @@ Result = TypeVar("Result")
 
 GRACE_S, LEAST_BYTES_S = 10.0, 20_000
 """An upload that brings less a second, after so long, is ended: it would hold a place for ever."""
+MOMENT_S = 0.02
 _FULL = "too many requests wait for one computation; try again later"
 
 
@@ -65,6 +66,19 @@ class Queue:
                 return await anyio.to_thread.run_sync(work)
         finally:
             self._tickets.remove(ticket)
+
+
+async def has_gone(receive: Receive) -> bool:
+    """Whether the client of a request that was read whole has closed its connection.
+
+    What is still to come of the request is read first, and the server gets a moment to see the
+    end of a connection from which it had stopped reading.
+    """
+    with anyio.move_on_after(MOMENT_S):
+        while (await receive())["type"] != "http.disconnect":
+            pass
+        return True
+    return False
 
 
 def paced(receive: Receive) -> Receive:
