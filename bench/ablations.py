@@ -23,7 +23,6 @@ from depthpose.cli import main as depthpose
 from depthpose.core.checkpoint import bound_facts
 from depthpose.core.files import write_json
 from depthpose.core.loop import AdamConfig, LoopConfig
-from depthpose.core.report import markdown_table, write_table
 from depthpose.depth.config import (
     AugmentConfig,
     GeneratorConfig,
@@ -32,11 +31,12 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.streets import draw_street
 from depthpose.depth.synthesis import UNetGenerator
+from depthpose.depth.synthetic import draw_street
 from depthpose.depth.train import STAGES, Run
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.report.tables import markdown_table, write_table
 
 FOCAL_PX = 186.0
 """A quarter of KITTI's resolution: an arm takes minutes on one core."""

@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 
 from depthpose.core.files import write_image
-from depthpose.core.report import markdown_table, write_table
 from depthpose.core.run import environment
+from depthpose.report.tables import markdown_table, write_table
 
 
 def main() -> None:

@@ -21,17 +21,17 @@ import torch
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.export.extra import import_export
-from depthpose.core.report import markdown_table, write_table
+from depthpose.core.export.graph import import_export
 from depthpose.core.run import environment
 from depthpose.depth.config import MatcherConfig, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
-from depthpose.depth.streets import Streets
 from depthpose.depth.synthesis import SelectionGenerator, openvino_generator
 from depthpose.depth.synthesis.openvino import import_openvino
+from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoInput, StereoSample
 from depthpose.depth.weights import read_depth_weights
+from depthpose.report.tables import markdown_table, write_table
 
 SEED, CALIBRATION_SEED, CALIBRATION_FRAMES = 771, 772, 8
 Feed = dict[str, np.ndarray]

@@ -20,15 +20,15 @@ import torch
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.files import read_depth_png
-from depthpose.core.report import markdown_table
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import open_bop
 from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share
-from depthpose.pose.objects import make_frames
+from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.report.tables import markdown_table
 
 SEED = 0x7AB1E
 Row = dict[str, Any]

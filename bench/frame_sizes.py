@@ -19,16 +19,16 @@ from tqdm import tqdm
 from depthpose import FakestereoNet
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.report import markdown_table
 from depthpose.depth.config import MatcherConfig
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
+from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.evaluate import evaluate
-from depthpose.depth.kitti import Dataset, join_datasets, open_dataset
 from depthpose.depth.predictions import predict
-from depthpose.depth.sizes import focal_size, resize_image
 from depthpose.depth.stereo import PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthesis.synthesiser import Drawn, draw_right, pad_to_multiple
 from depthpose.depth.weights import read_depth_weights
+from depthpose.report.tables import markdown_table
 
 Draw = Callable[[UNetGenerator, Tensor], Tensor]
 

@@ -24,16 +24,16 @@ import torch
 from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.report import markdown_table, write_table
 from depthpose.pose.baselines import FpfhEstimator
-from depthpose.pose.bop.models import models_folder, read_bop_models, read_models_info
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.datasets.models import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m, risk_coverage
-from depthpose.pose.objects import Objects
+from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
+from depthpose.report.tables import markdown_table, write_table
 
 SEED = 0x7E57ED
 POINTS = 1000

@@ -21,13 +21,13 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.report import markdown_table
 from depthpose.depth.config import GeneratorConfig, MatcherConfig
+from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.sizes import focal_size, resize_image
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
+from depthpose.report.tables import markdown_table
 
 HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
 

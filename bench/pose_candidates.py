@@ -16,14 +16,14 @@ from collections.abc import Sequence
 import torch
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.report import markdown_table
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet, fit_candidate_slopes
 from depthpose.pose.estimator.alternatives import Copies, find_copies, share_out
-from depthpose.pose.objects import Objects
+from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights
+from depthpose.report.tables import markdown_table
 
 SEED = 0xCA5E
 BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.01))

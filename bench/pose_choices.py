@@ -22,10 +22,10 @@ import torch
 
 from depthpose.core.config import read_config
 from depthpose.core.files import write_json
-from depthpose.core.report import markdown_table, write_table
 from depthpose.pose.baselines.config import PointNetConfig
 from depthpose.pose.train import STAGES, PoseTraining, Run
 from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig, ModelsConfig
+from depthpose.report.tables import markdown_table, write_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml"
 WIDE = {"encoder": (32, 64, 128, 256), "decoder": (64, 64, 64, 128)}

@@ -22,14 +22,14 @@ import torch
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import ticket_generator
-from depthpose.core.report import markdown_table
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.objects import Objects
-from depthpose.pose.objects.negatives import SCALES, NegativeKind, negative_of
+from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
 from depthpose.pose.train.held_out import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel
 from depthpose.pose.weights import PoseWeights
+from depthpose.report.tables import markdown_table
 
 SEED = 0x0DD
 ITSELF = "itself"

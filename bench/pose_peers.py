@@ -22,7 +22,6 @@ import torch
 from real_poses import RealCase, real_cases
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.report import markdown_table, write_table
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
 from depthpose.pose.config import EstimateConfig, VotingConfig
@@ -32,6 +31,7 @@ from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, auc
 from depthpose.pose.types import CloudInput, PoseEstimate
 from depthpose.pose.weights import PoseWeights, read_pose_weights
+from depthpose.report.tables import markdown_table, write_table
 
 POINTS = 2000
 Row = dict[str, Any]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from depthpose.core.files import read_cloud
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import open_bop
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
 

@@ -24,7 +24,6 @@ from depthpose.cli import main as depthpose
 from depthpose.core.checkpoint import bound_facts
 from depthpose.core.files import write_json
 from depthpose.core.loop import AdamConfig, LoopConfig
-from depthpose.core.report import markdown_table, write_table
 from depthpose.depth.config import (
     Answer,
     AugmentConfig,
@@ -33,8 +32,8 @@ from depthpose.depth.config import (
     PairsConfig,
     SelectionConfig,
 )
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.kitti import open_dataset
 from depthpose.depth.stereo import PSMNetMatcher
 from depthpose.depth.synthesis import Drawn, SelectionGenerator
 from depthpose.depth.synthesis.selection import mix_shifts
@@ -42,6 +41,7 @@ from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
 from depthpose.depth.train import STAGES, Run
 from depthpose.depth.train.config import SelectTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.report.tables import markdown_table, write_table
 
 FOCAL_PX = 186.0
 """A quarter of KITTI's resolution: an arm takes minutes on one core."""

@@ -11,10 +11,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose import FakestereoNet
-from depthpose.core.report import markdown_table
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.streets import Streets
+from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
+from depthpose.report.tables import markdown_table
 
 SEED = 9
 """No weights were trained on streets of this seed."""

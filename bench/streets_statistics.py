@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from depthpose.core.files import read_disparity_png, read_image, write_json
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.streets import draw_street
+from depthpose.depth.synthetic import draw_street
 
 ROWS, SIZE = 36, (640, 360)
 BINS = np.arange(0, 101, 4.0)

@@ -24,16 +24,16 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import ticket_generator
-from depthpose.core.raster import rasterize
-from depthpose.core.report import markdown_table
+from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.augment import measure, random_rotation
 from depthpose.pose.config import SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share
-from depthpose.pose.objects import drawn_triangles
+from depthpose.pose.synthetic import drawn_triangles
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.report.tables import markdown_table
 
 SEED = 0x7AC4
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 572.0

@@ -18,13 +18,13 @@ from stereo_speed import out_folder
 from torch.utils.data import DataLoader
 
 from depthpose.core.config import read_config
-from depthpose.core.report import markdown_table
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import PairsConfig, StreetsConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import FinetuneTask, StereoTask, TrainingPairs, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+from depthpose.report.tables import markdown_table
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.files import read_image
-from depthpose.core.report import markdown_table, write_table
-from depthpose.demo.motorcycle import read_motorcycle
+from depthpose.demo.depth import read_motorcycle
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.kitti import open_dataset
 from depthpose.depth.types import StereoInput
 from depthpose.depth.unlike import measure_familiarity
+from depthpose.report.tables import markdown_table, write_table
 
 PAIRS = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
          "street_pairs/kitti_single", "street_pairs/kitti2015_eval_drives", "more/kitti_road",

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.files import write_image
-from depthpose.core.report import markdown_table, write_table
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.streets import StreetFrame, draw_street
+from depthpose.depth.synthetic import StreetFrame, draw_street
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.report.tables import markdown_table, write_table
 
 
 def mean(values: Tensor, mask: Tensor) -> float:

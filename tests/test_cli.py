@@ -11,7 +11,7 @@ import torch
 from tests.made_street import make_street
 
 from depthpose.cli import COMMANDS, main
-from depthpose.cli.early import refuse_missing
+from depthpose.cli.help import refuse_missing
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
 from depthpose.depth.types import StereoInput
 

@@ -28,7 +28,7 @@ from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
-from depthpose.pose.bop import write_bop_scene
+from depthpose.pose.datasets import write_bop_scene
 from depthpose.pose.weights import write_pose_weights
 
 RIG = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], "baseline_m": 0.5}

@@ -14,7 +14,7 @@ from tests.pose.made_object import tiny_weights
 from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
 from depthpose.pose.baselines import fpfh
-from depthpose.pose.bop import BopDataset, Detection, encode_rle, read_mask, write_detections
+from depthpose.pose.datasets import BopDataset, Detection, encode_rle, read_mask, write_detections
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate

@@ -11,7 +11,7 @@ from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import write_image
-from depthpose.pose.bop import (
+from depthpose.pose.datasets import (
     BopDataset,
     Detection,
     encode_rle,

@@ -23,7 +23,8 @@ from tests.pose.made_object import (
     view_of,
 )
 
-from depthpose.cli import main, pose_methods
+from depthpose.cli import main
+from depthpose.cli.pose import methods as pose_methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,
@@ -34,9 +35,9 @@ from depthpose.core.files import (
     write_image,
 )
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
-from depthpose.pose.bop import BopDataset
-from depthpose.pose.bop.results import read_results
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.datasets import BopDataset
+from depthpose.pose.datasets.results import read_results
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.weights import write_pose_weights

@@ -10,7 +10,7 @@ from tests.pose.made_object import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import read_image
-from depthpose.pose.bop import BopDataset
+from depthpose.pose.datasets import BopDataset
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.weights import write_pose_weights
 

@@ -9,10 +9,11 @@ from tests.pose.made_frames import make_dataset
 from tests.pose.made_object import K, Oracle, bottle, bracket, tiny_weights, view_of
 from tests.pose.test_track import moving
 
-from depthpose.cli import main, pose_methods
+from depthpose.cli import main
+from depthpose.cli.pose import methods as pose_methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
-from depthpose.pose.bop.results import read_results
+from depthpose.pose.datasets.results import read_results
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.weights import write_pose_weights

@@ -12,14 +12,14 @@ from tests.made_street import make_street
 from tests.pages.read_page import read_page
 
 from depthpose.cli import main
-from depthpose.cli.methods import Method
-from depthpose.cli.reproducing import Order, reproduce_table, write_figure
+from depthpose.cli.depth.methods import Method
+from depthpose.cli.thesis.depth_tables import Order, reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.files import read_image, write_depth_png, write_image
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.kitti import open_dataset
-from depthpose.depth.tables import find_table
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.thesis.depth_tables import find_table
 
 CAMERA_Z = ("--protocol", "eigen-raw-camera")
 

@@ -8,7 +8,8 @@ import pytest
 import yaml
 from tests.pose.made_linemod import make_linemod
 
-from depthpose.cli import main, reproduce_all
+from depthpose.cli import main
+from depthpose.cli.thesis import reproduce_all
 
 ADAM = {"learning_rate": 1e-3}
 LOOP = {"steps": 1, "batch_size": 2}

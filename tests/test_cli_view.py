@@ -13,14 +13,15 @@ import pytest
 import torch
 from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 
-from depthpose.cli import main, pose_methods
-from depthpose.cli.viewing import Viewer, open_viewer
+from depthpose.cli import main
+from depthpose.cli.pose import methods as pose_methods
 from depthpose.core.camera import Camera
 from depthpose.core.files import Cloud, write_cloud
 from depthpose.core.loop import Progress
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.pose.types import CloudInput, PoseEstimate
 from depthpose.pose.weights import write_pose_weights
+from depthpose.report.viewer import Viewer, open_viewer
 
 TRUTH = pose_at(seed=1)
 _SHAPES = ("Pinhole", "Image", "DepthImage", "Points3D", "Mesh3D", "TextLog", "Scalars", "Clear")

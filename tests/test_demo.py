@@ -13,15 +13,14 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
 from depthpose.core.run import read_settings
 from depthpose.demo import make_demo
-from depthpose.demo.depth import _nets
-from depthpose.demo.motorcycle import read_motorcycle
+from depthpose.demo.depth import _nets, read_motorcycle
 from depthpose.demo.pose import show_poses
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.objects import PARTS
 from depthpose.pose.predictions import read_predictions
+from depthpose.pose.synthetic import PARTS
 
 _SCENE = r'<script type="application/json">(.*?)</script>'
 

@@ -34,7 +34,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 def test_the_command_line_loads_nothing_heavy() -> None:
     assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & modules_after(
-        "import depthpose.cli.depth, depthpose.cli.pose"
+        "import depthpose.cli.depth.commands, depthpose.cli.pose.commands"
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 from tests.written import ROOT, read_blocks, run
 from tests.written import commands as commands_of
 
-from depthpose.pose.objects import write_part
+from depthpose.pose.synthetic import write_part
 
 README = (ROOT / "README.md").read_text()
 BLOCKS = read_blocks(ROOT / "README.md")

@@ -14,7 +14,7 @@ from torch import nn
 
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.config import PairsConfig
-from depthpose.depth.kitti import read_split
+from depthpose.depth.datasets import read_split
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES

@@ -17,7 +17,7 @@ from depthpose.core.camera import (
     project,
     resize_camera,
 )
-from depthpose.core.camera.model import check_intrinsics
+from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.errors import InputError
 
 K = torch.tensor([[700.0, 3.0, 610.0], [0, 720.0, 170.0], [0, 0, 1]], dtype=torch.float64)

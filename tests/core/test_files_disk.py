@@ -133,7 +133,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.loop import Journal
 from depthpose.core.loop.state import write_state
-from depthpose.core.report import Section, write_page, write_table
+from depthpose.report.tables import Section, write_page, write_table
 from depthpose.core.run import claim_folder
 
 @dataclass(frozen=True)

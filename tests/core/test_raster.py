@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from depthpose.core import raster
+from depthpose.core import render as raster
 from depthpose.core.errors import InputError
-from depthpose.core.raster import edge_functions, rasterize, rasterize_orthographic
+from depthpose.core.render import edge_functions, rasterize, rasterize_orthographic
 
 WIDTH, HEIGHT = 37, 23
 K = torch.tensor([[40.0, 1.5, 17.2], [0, 33.0, 11.4], [0, 0, 1]], dtype=torch.float64)

@@ -10,7 +10,8 @@ from PIL import Image
 
 from depthpose.core.draw import rising_scale
 from depthpose.core.files import Cloud, write_image
-from depthpose.core.report import (
+from depthpose.report.scene import Layer, Scene
+from depthpose.report.tables import (
     Drawing,
     Picture,
     Section,
@@ -21,7 +22,6 @@ from depthpose.core.report import (
     write_page,
     write_table,
 )
-from depthpose.core.scene import Layer, Scene
 
 ROWS = [{"name": "a|b", "x": 0.123456, "n": 3}, {"name": "c", "x": 80.0, "more": None}]
 

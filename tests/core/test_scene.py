@@ -3,9 +3,9 @@ import base64
 import numpy as np
 import torch
 
-from depthpose.core import scene as scenes
 from depthpose.core.files import Cloud
-from depthpose.core.scene import Layer, Lines, Scene, colored_lines, frame_axes, page_file
+from depthpose.report import scene as scenes
+from depthpose.report.scene import Layer, Lines, Scene, colored_lines, frame_axes, page_file
 
 
 def decoded(layer: dict) -> tuple[np.ndarray, np.ndarray]:

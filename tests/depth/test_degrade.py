@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from depthpose.core.errors import InputError
+from depthpose.depth.augment import degrade, through_jpeg
 from depthpose.depth.config import DegradeConfig
-from depthpose.depth.degrade import degrade, through_jpeg
 
 NOTHING = DegradeConfig(
     colour=0.0,

@@ -24,11 +24,10 @@ from depthpose.depth.config import (
     SGBMConfig,
     Speed,
 )
-from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
-from depthpose.depth.estimator.virtual import join_matches
-from depthpose.depth.sizes import resize_image
+from depthpose.depth.estimator.rig import join_matches
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput

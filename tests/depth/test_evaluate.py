@@ -8,10 +8,10 @@ import torch
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
+from depthpose.depth.datasets import Dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth, evaluate, frame_result
-from depthpose.depth.kitti import Dataset, open_dataset
 from depthpose.depth.predictions import (
     is_finished,
     predict,

@@ -13,8 +13,9 @@ from PIL import Image
 from depthpose.cli import main
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.files import read_colmap_map, write_colmap_map, write_json, write_map
+from depthpose.core.files import write_json, write_map
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.exchange import read_colmap_map, write_colmap_map
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 H, W, F = 4, 6, 8.0

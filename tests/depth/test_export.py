@@ -67,7 +67,9 @@ def selection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
     """Folder with ``w.safetensors``: a generator that selects, without a matcher."""
-    monkeypatch.setattr("depthpose.depth.export.views.network_model", lambda *_: selection_network)
+    monkeypatch.setattr(
+        "depthpose.depth.export.network.network_model", lambda *_: selection_network
+    )
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 

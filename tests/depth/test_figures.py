@@ -3,8 +3,8 @@ import torch
 
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
-from depthpose.depth.figures import Panel, arrange, draw_figure_2_1, draw_figure_2_5
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.thesis.depth_figures import Panel, arrange, draw_figure_2_1, draw_figure_2_5
 
 H, W = 20, 60
 

@@ -7,9 +7,9 @@ import torch
 from depthpose.core.camera import StereoRig, resize_camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image
+from depthpose.depth.baselines import NearestImageFloor, RowDepthFloor, fill_by_pyramid
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, read_known_depth
 from depthpose.depth.disparity import depth_from_disparity
-from depthpose.depth.floors import NearestImageFloor, RowDepthFloor, fill_by_pyramid
-from depthpose.depth.kitti import Dataset, join_datasets, open_dataset, read_known_depth
 from depthpose.depth.types import StereoInput
 
 W, H = 48, 32

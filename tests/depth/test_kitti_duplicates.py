@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from depthpose.core.files import write_image
-from depthpose.depth.kitti import Dataset, find_duplicates, likeness_matrix, open_dataset
+from depthpose.depth.datasets import Dataset, find_duplicates, likeness_matrix, open_dataset
 
 H, W = 120, 400
 

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
-from depthpose.depth.kitti import (
+from depthpose.depth.datasets import (
     check_dataset,
     known_truths,
     lidar_truth,
     open_dataset,
     read_split,
 )
-from depthpose.depth.kitti.calibration import read_object_calibration, read_plain_calibration
+from depthpose.depth.datasets.calibration import read_object_calibration, read_plain_calibration
 
 W, H = 20, 12
 P2 = "700 0 10 45 0 700 6 0.2 0 0 1 0.003"

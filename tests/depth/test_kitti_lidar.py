@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from depthpose.core.files import write_map
+from depthpose.depth.datasets import lidar_truth, open_dataset, project_lidar
+from depthpose.depth.datasets.calibration import LidarDepth
 from depthpose.depth.evaluate import evaluate
-from depthpose.depth.kitti import lidar_truth, open_dataset, project_lidar
-from depthpose.depth.kitti.lidar import LidarDepth
 
 FRONT = np.array([[0.0, -10, 0, 0], [0, 0, -10, 0], [1, 0, 0, 0]])  # u = -10 y/x, v = -10 z/x
 

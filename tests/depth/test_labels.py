@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose import FakestereoNet
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.depth.kitti import open_dataset
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.labels import LabelConfig, label_pair, label_pairs
 from depthpose.depth.stereo import CallableMatcher
 

@@ -17,7 +17,7 @@ from tests.made_street import write_pairs
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.depth.kitti import Dataset, lidar_truth, open_dataset, pack_frames
+from depthpose.depth.datasets import Dataset, lidar_truth, open_dataset, pack_frames
 
 CONFIG = """
 generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],

@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_depth_png, write_disparity_png, write_image
 from depthpose.core.loop import LoopConfig
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
-from depthpose.depth.kitti import open_dataset
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.train import Run, TrainingPairs, train_stereo
 from depthpose.depth.train.config import StereoTraining
 

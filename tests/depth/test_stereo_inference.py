@@ -20,11 +20,10 @@ from depthpose.depth.stereo import (
     normalise,
     tile_change_px,
 )
-from depthpose.depth.stereo.expectation import Size, expected_disparity
-from depthpose.depth.stereo.first_layer import FirstLayer
+from depthpose.depth.stereo.plan import Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
 from depthpose.depth.stereo.psmnet_matcher import lower_where_disagreeing, pad_top_right
-from depthpose.depth.stereo.tiles import Tiling, match_tiles
+from depthpose.depth.stereo.volume import FirstLayer, Size, expected_disparity
 from depthpose.depth.types import Match
 
 SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4, 2))

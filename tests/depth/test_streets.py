@@ -12,7 +12,7 @@ from depthpose.core.camera import StereoRig, resize_camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.streets import (
+from depthpose.depth.synthetic import (
     StreetFrame,
     Streets,
     draw_scene,
@@ -26,8 +26,8 @@ from depthpose.depth.streets import (
     vegetation,
     vehicles,
 )
-from depthpose.depth.streets.road import draw_road
-from depthpose.depth.streets.sensor import draw_sensors
+from depthpose.depth.synthetic.road import draw_road
+from depthpose.depth.synthetic.sensor import draw_sensors
 
 PLAIN = StreetsConfig(scale=0.25, jpeg_share=0.0, rectification_error_px=0.0)
 

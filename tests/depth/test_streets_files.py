@@ -8,15 +8,15 @@ import torch
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.kitti import (
+from depthpose.depth.datasets import (
     RawFrame,
     has_raw_frame,
     lidar_truth,
     open_dataset,
     write_raw_frame,
 )
-from depthpose.depth.streets import camera_from_velodyne, draw_street
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.synthetic import camera_from_velodyne, draw_street
 
 
 @pytest.fixture(scope="module")

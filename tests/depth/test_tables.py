@@ -1,7 +1,7 @@
 import pytest
 
 from depthpose.core.errors import InputError
-from depthpose.depth.tables import TABLES, find_table, join_published
+from depthpose.thesis.depth_tables import TABLES, find_table, join_published
 
 OURS = {
     "method": "net", "weights": "w", "protocol": "eigen-raw", "cap_m": 80.0, "frames": 697,

@@ -33,7 +33,7 @@ from depthpose.depth.train import (
     train_select,
 )
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining
-from depthpose.depth.train.select_pairs import SelectionSample, SelectionSamples
+from depthpose.depth.train.select import SelectionSample, SelectionSamples
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 
 TINY = SelectionConfig(

@@ -9,9 +9,9 @@ from torch import Tensor
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import SHIPPED
 from depthpose.depth.config import StreetsConfig
+from depthpose.depth.disparity import resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.sizes import resize_image
-from depthpose.depth.streets import draw_scene, kitti_rig, make_scene
+from depthpose.depth.synthetic import draw_scene, kitti_rig, make_scene
 from depthpose.depth.types import StereoInput
 
 ALLOWED = 0.05

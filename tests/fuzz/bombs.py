@@ -37,14 +37,14 @@ from depthpose.core.files import (
 )
 from depthpose.core.loop import read_metrics
 from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.kitti import read_split
-from depthpose.depth.kitti.calibration import read_plain_calibration
+from depthpose.depth.datasets import read_split
+from depthpose.depth.datasets.calibration import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
-from depthpose.pose.bop import read_mask
-from depthpose.pose.bop.detections import read_detections
-from depthpose.pose.bop.linemod import read_yaml
-from depthpose.pose.bop.results import read_results
+from depthpose.pose.datasets import read_mask
+from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.masks import read_detections
+from depthpose.pose.datasets.results import read_results
 from depthpose.pose.mesh import read_model
 
 Bomb = tuple[str, Callable[[], bytes | int], Callable[[Path], object]]

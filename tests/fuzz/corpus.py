@@ -39,16 +39,16 @@ from depthpose.core.files import (
 from depthpose.core.loop import read_metrics
 from depthpose.core.run import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
-from depthpose.depth.kitti import RawFrame, open_dataset, read_split, write_raw_frame
-from depthpose.depth.kitti.calibration import read_object_calibration, read_plain_calibration
+from depthpose.depth.datasets import RawFrame, open_dataset, read_split, write_raw_frame
+from depthpose.depth.datasets.calibration import read_object_calibration, read_plain_calibration
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
-from depthpose.pose.bop import open_bop, read_mask
-from depthpose.pose.bop.detections import read_detections
-from depthpose.pose.bop.linemod import read_yaml
-from depthpose.pose.bop.results import BopResult, read_results, write_results
+from depthpose.pose.datasets import open_bop, read_mask
+from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.masks import read_detections
+from depthpose.pose.datasets.results import BopResult, read_results, write_results
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
@@ -368,7 +368,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
     """Results, detections and predictions of a data set."""
     from tests.pose.made_frames import made_pose
 
-    from depthpose.pose.bop.detections import Detection, write_detections
+    from depthpose.pose.datasets.masks import Detection, write_detections
     from depthpose.pose.predictions import Prediction, write_predictions
 
     pose = made_pose(0.1, 3)

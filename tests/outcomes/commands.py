@@ -20,9 +20,9 @@ from depthpose.core.camera import write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.depth.types import StereoSample
 from depthpose.depth.weights import write_depth_weights
-from depthpose.pose.bop import write_bop_models
+from depthpose.pose.datasets import write_bop_models
 from depthpose.pose.network import ResUNet
-from depthpose.pose.objects import make_part, write_part
+from depthpose.pose.synthetic import make_part, write_part
 from depthpose.pose.weights import write_pose_weights
 
 VIEW = """

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from depthpose.pages.choose import (
+from depthpose.report.choose import (
     MOST_VIEWS,
     choose_answers,
     choose_ranked,

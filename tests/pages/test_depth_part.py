@@ -10,7 +10,7 @@ from tests.pages.read_page import drawings
 from depthpose.core.draw import draw_depth, draw_share
 from depthpose.core.files import Cloud
 from depthpose.depth.types import DepthEstimate
-from depthpose.pages.depth import DepthError, DepthShown, depth_section
+from depthpose.report.depth import DepthError, DepthShown, depth_section
 
 SAMPLE = make_street(0.1)
 PAIR = replace(SAMPLE.input, right=None)

@@ -8,11 +8,11 @@ import torch
 from tests.pages.read_page import drawings
 from tests.pose.made_object import K, bracket, cloud_of, pose_at, view_of
 
-from depthpose.core.report import Section
 from depthpose.core.rigid import Rigid
-from depthpose.pages.pose import PoseShown, pose_section, spreads
-from depthpose.pose.overlay import FOUND, TRUE
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
+from depthpose.report.overlay import FOUND, TRUE
+from depthpose.report.pose import PoseShown, pose_section, spreads
+from depthpose.report.tables import Section
 
 POSE = pose_at(seed=1)
 FOUND_HERE = PoseEstimate(

@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 from tests.pose.made_object import bottle, bracket
 
-from depthpose.core.raster import rasterize
+from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.bop import (
+from depthpose.pose.datasets import (
     BopDataset,
     BopFrame,
     BopObject,

@@ -8,10 +8,10 @@ import yaml
 from tests.pose.made_frames import draw_frame, made_models
 
 from depthpose.core.files import write_depth_png, write_image
-from depthpose.pose.bop import BopDataset, open_bop
-from depthpose.pose.bop.dataset import read_instance_mask
-from depthpose.pose.bop.linemod import segnet_mask
-from depthpose.pose.bop.write import write_bop_models, write_mask
+from depthpose.pose.datasets import BopDataset, open_bop
+from depthpose.pose.datasets.dataset import read_instance_mask
+from depthpose.pose.datasets.linemod import segnet_mask
+from depthpose.pose.datasets.write import write_bop_models, write_mask
 from depthpose.pose.types import ObjectModel
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.camera import back_project
-from depthpose.core.raster import rasterize
+from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet

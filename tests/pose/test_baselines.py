@@ -13,7 +13,7 @@ from torch import Tensor
 
 from depthpose.core.camera import project
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.raster import rasterize
+from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb, turn_axis_to
 from depthpose.pose.baselines import (
     DepthImageConfig,
@@ -26,7 +26,7 @@ from depthpose.pose.baselines import (
     poses_of,
     rotation_from_6d,
 )
-from depthpose.pose.baselines.crop import EMPTY, DepthCrop
+from depthpose.pose.baselines.depth_image import EMPTY, DepthCrop
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, SeenPoints, ViewInput

@@ -16,7 +16,7 @@ from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_depth_png
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import (
+from depthpose.pose.datasets import (
     BopFrame,
     BopObject,
     check_bop,
@@ -25,8 +25,8 @@ from depthpose.pose.bop import (
     write_bop_models,
     write_bop_scene,
 )
-from depthpose.pose.bop.linemod import segnet_mask
-from depthpose.pose.bop.models import read_bop_models
+from depthpose.pose.datasets.linemod import segnet_mask
+from depthpose.pose.datasets.models import read_bop_models
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.train.task import keypoint_copies
 from depthpose.pose.types import ObjectModel, Symmetries

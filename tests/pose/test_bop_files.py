@@ -9,7 +9,7 @@ from tests.pose.made_frames import make_dataset
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import (
+from depthpose.pose.datasets import (
     BopResult,
     Detection,
     decode_rle,
@@ -21,7 +21,7 @@ from depthpose.pose.bop import (
     write_detections,
     write_results,
 )
-from depthpose.pose.bop.masks import read_mask
+from depthpose.pose.datasets.masks import read_mask
 
 
 def test_masks_of_every_kind_are_read(tmp_path: Path) -> None:

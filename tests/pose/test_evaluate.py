@@ -15,9 +15,9 @@ from tests.pose.made_frames import (
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.bop import BopDataset, Target
-from depthpose.pose.bop.linemod import linemod_symmetries
 from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.datasets import BopDataset, Target
+from depthpose.pose.datasets.linemod import linemod_symmetries
 from depthpose.pose.evaluate import (
     diameter_of,
     errors,

@@ -5,9 +5,14 @@ import torch
 from tests.pose.made_object import bracket
 
 from depthpose.core.errors import InputError
-from depthpose.pose.figures import arrange_grid, draw_features, draw_field, embed_line
-from depthpose.pose.figures.canvas import draw_discs, spectral
-from depthpose.pose.figures.tsne import joint_probabilities, kl_gradient
+from depthpose.thesis.pose_figures import (
+    arrange_grid,
+    draw_discs,
+    draw_features,
+    draw_field,
+    spectral,
+)
+from depthpose.thesis.tsne import embed_line, joint_probabilities, kl_gradient
 
 
 def test_neighbourhoods_have_the_perplexity_that_was_asked_for() -> None:

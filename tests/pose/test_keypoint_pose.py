@@ -6,9 +6,9 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
-from depthpose.pose.bop import open_bop
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface

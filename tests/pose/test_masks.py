@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from depthpose.core.errors import InputError
-from depthpose.pose.bop import encode_rle, mask_from_rle, read_mask
+from depthpose.pose.datasets import encode_rle, mask_from_rle, read_mask
 
 MASK = torch.tensor([[False, True, False], [True, False, False]])
 # Column by column: one of the background, two of the object, three of the background.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import open_bop
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.evaluate.errors import make_ruler, measure
 from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
 from depthpose.pose.metrics import (

@@ -4,10 +4,10 @@ import torch
 from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.files import Cloud
-from depthpose.core.scene import Lines
 from depthpose.pose.mesh import make_model
-from depthpose.pose.overlay import TRUE, bent_edges, keypoint_layers, pose_layers, vote_layer
 from depthpose.pose.types import CloudInput, ObjectModel
+from depthpose.report.overlay import TRUE, bent_edges, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.scene import Lines
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:

@@ -8,7 +8,7 @@ import trimesh
 
 from depthpose.core.errors import InputError
 from depthpose.pose.mesh import propose_symmetries, read_model, symmetries_from_proposals
-from depthpose.pose.objects import PARTS, make_part, write_part
+from depthpose.pose.synthetic import PARTS, make_part, write_part
 
 
 @pytest.mark.parametrize("name", sorted(PARTS))

@@ -8,7 +8,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.bop import read_results
+from depthpose.pose.datasets import read_results
 from depthpose.pose.predictions import (
     Job,
     Place,

@@ -10,8 +10,8 @@ from tests.pose.made_object import bracket, cloud_of, pose_at
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad, perturb
-from depthpose.pose.bop import open_bop
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import refine_best, refine_pose

@@ -11,9 +11,9 @@ from depthpose.core.loop import ticket_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.scale import scale_of
-from depthpose.pose.objects.negatives import NegativeKind, mirrored, negative_of, scaled
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.negatives import NegativeKind, mirrored, negative_of, scaled
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)

@@ -153,7 +153,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
     by_table = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
-    monkeypatch.setattr("depthpose.pose.sparse.search.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
@@ -168,7 +168,7 @@ def test_no_look_leaves_the_table(
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
     found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
-    monkeypatch.setattr("depthpose.pose.sparse.search.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
     wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
     assert torch.equal(found, wanted)
 
@@ -364,7 +364,7 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     pull = features_of(coordinates, 5, seed=3)
     single = [t.float().requires_grad_() for t in (x, weight)]
     double = [t.clone().requires_grad_() for t in (x, weight)]
-    monkeypatch.setattr("depthpose.pose.sparse.product.BLOCK_PRODUCTS", 8 * 5 * 16)
+    monkeypatch.setitem(conv_function.__globals__, "BLOCK_PRODUCTS", 8 * 5 * 16)
     monkeypatch.setitem(conv_function.__globals__, "GRID_PRODUCTS", -1)
     found, expected = conv(single[0], single[1], m), conv(double[0], double[1], m)
     torch.testing.assert_close(found, expected.float(), rtol=1e-4, atol=1e-4)

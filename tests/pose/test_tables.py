@@ -12,15 +12,9 @@ from depthpose.pose.baselines.one_by_one import ransac_one_by_one
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
-from depthpose.pose.objects import Objects
-from depthpose.pose.tables import (
-    LINEMOD,
-    ROWS,
-    VotingCase,
-    cases_of,
-    compare_voting,
-    join_by_object,
-)
+from depthpose.pose.synthetic import Objects
+from depthpose.thesis.pose_tables import LINEMOD, ROWS, join_by_object
+from depthpose.thesis.voting import VotingCase, cases_of, compare_voting
 
 
 def test_printed_means_are_those_of_the_printed_numbers() -> None:

@@ -17,7 +17,6 @@ from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import write_bop_models, write_bop_scene
 from depthpose.pose.config import (
     CloudConfig,
     MeshConfig,
@@ -25,12 +24,13 @@ from depthpose.pose.config import (
     RefusalConfig,
     SensorConfig,
 )
+from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.estimator import risk_of
 from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
-from depthpose.pose.objects import Objects, make_frames, write_part
 from depthpose.pose.sparse import Voxels
+from depthpose.pose.synthetic import Objects, make_frames, write_part
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -44,10 +44,15 @@ from depthpose.pose.train import (
     train_pose,
 )
 from depthpose.pose.train.config import CalibrationConfig
-from depthpose.pose.train.held_out import HELD_OUT_SEED, HeldOut, held_out_objects
-from depthpose.pose.train.judge import calibrated, judged, table_text
-from depthpose.pose.train.run import packed
-from depthpose.pose.train.task import keypoint_copies
+from depthpose.pose.train.held_out import (
+    HELD_OUT_SEED,
+    HeldOut,
+    calibrated,
+    held_out_objects,
+    judged,
+    table_text,
+)
+from depthpose.pose.train.task import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -412,7 +417,7 @@ def _as_known(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate
 
 
 def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("depthpose.pose.train.judge._posed", _as_known)
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", _as_known)
     weights = tiny_weights(*_models())
     held_out = HeldOutConfig(number=100, occlusions=(0.0,))
     uncalibrated = judged(weights, _MADE, held_out)["0"]
@@ -435,7 +440,7 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
         seen.append(objects)
         return _as_known(weights, objects)
 
-    monkeypatch.setattr("depthpose.pose.train.judge._posed", posed)
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
     weights = tiny_weights(*_models())
     assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
     _ = calibrated(weights, _MADE, CalibrationConfig(number=20))
@@ -454,7 +459,7 @@ def test_a_network_that_is_never_right_is_not_looked_at_for_long(
         estimates, errors = _as_known(weights, objects)
         return estimates, [0.5 for _ in errors]
 
-    monkeypatch.setattr("depthpose.pose.train.judge._posed", wrong)
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", wrong)
     weights = tiny_weights(*_models())
     refusal = calibrated(weights, _MADE, CalibrationConfig(number=600)).refusal
     assert looked_at == [2 * 50]

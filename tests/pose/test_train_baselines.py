@@ -21,12 +21,12 @@ from depthpose.core.files import write_image
 from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
-from depthpose.pose.bop import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.objects import Objects
 from depthpose.pose.resnet import ResNet18
 from depthpose.pose.segmentation import SegmentationConfig, Segmenter
+from depthpose.pose.synthetic import Objects
 from depthpose.pose.train import (
     STAGES,
     DepthImageTraining,
@@ -45,7 +45,7 @@ from depthpose.pose.train.images import (
     cut_window,
     jitter_colors,
 )
-from depthpose.pose.train.segmentation_config import ImageAugmentConfig, ImagesConfig
+from depthpose.pose.train.other_configs import ImageAugmentConfig, ImagesConfig
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
 MADE = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))

@@ -10,9 +10,9 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import write_bop_models
 from depthpose.pose.config import CloudConfig, RefusalConfig
-from depthpose.pose.objects import make_part, write_part
+from depthpose.pose.datasets import write_bop_models
+from depthpose.pose.synthetic import make_part, write_part
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 

@@ -20,7 +20,7 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.streets import Streets
+from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
 from depthpose_ros.messages import depth_of
 from depthpose_ros.work import DepthFromImage, DepthFromPair, Poses

@@ -6,11 +6,11 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.streets import Streets
-from depthpose.pose.bop.write import write_mask
+from depthpose.depth.synthetic import Streets
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.objects import Objects, make_part, write_part
+from depthpose.pose.datasets.write import write_mask
+from depthpose.pose.synthetic import Objects, make_part, write_part
 
 PART = "flange"
 

@@ -27,7 +27,7 @@ from depthpose.depth.stereo import CallableMatcher, PSMNetMatcher
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import adds_m
-from depthpose.pose.objects import make_part
+from depthpose.pose.synthetic import make_part
 from depthpose.web import Limits, make_app
 from depthpose.web import pose as pose_tab
 
@@ -312,7 +312,7 @@ def test_the_network_is_asked_once(
 def test_a_picture_of_too_many_pixels_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.web.form.MOST_PIXELS", 1000)
+    monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
     assert "scale it down" in refusal(ask(page, "depth", samples, {"image": "left.png"}))[1]
 
 

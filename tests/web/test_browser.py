@@ -17,8 +17,8 @@ from tests.web.samples import PART, write_street, write_view
 
 from depthpose.cli import main
 from depthpose.core.files import Cloud
-from depthpose.core.report import Section, write_page
-from depthpose.core.scene import Layer, Scene, colored_lines
+from depthpose.report.scene import Layer, Scene, colored_lines
+from depthpose.report.tables import Section, write_page
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import torch
 
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
-from depthpose.web.form import Form, keep_file, without_paths
+from depthpose.web.answer import Form, keep_file, without_paths
 
 
 def form(folder: Path, **fields: str) -> Form:

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from inspect import cleandoc, signature
 
 from depthpose import __version__
-from depthpose.cli.early import refuse_missing
+from depthpose.cli.help import refuse_missing
 from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
 
 COMMANDS = {
@@ -25,48 +25,60 @@ COMMANDS = {
     ),
     "doctor": ("doctor:doctor", "what is installed, and a try of each room; or what files are"),
     "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
-    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose track": ("pose_tracking:track", "follow an object through depth images or clouds"),
-    "pose train": ("pose_training:train", "your CAD file, or a config, to a network that poses it"),
+    "pose predict": (
+        "pose.commands:predict",
+        "a cloud, a masked depth image, or a data set, to poses",
+    ),
+    "pose track": ("pose.track:track", "follow an object through depth images or clouds"),
+    "pose train": ("pose.training:train", "your CAD file, or a config, to a network that poses it"),
     "pose calibrate": (
-        "pose_training:calibrate",
+        "pose.training:calibrate",
         "choose anew when poses of trained weights are withheld",
     ),
-    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
-    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
-    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
+    "pose evaluate": ("pose.commands:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth.commands:match", "a real stereo pair, or many, to metric depth"),
+    "depth predict": ("depth.commands:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "training:train",
+        "depth.training:train",
         "stages view, select, stereo, finetune: generator, matcher, one through the other",
     ),
     "depth calibrate": (
-        "calibrating:calibrate",
+        "depth.training:calibrate",
         "choose when an image is refused as unlike the known",
     ),
-    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "depth evaluate": ("depth.commands:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
-        "making:make_streets",
+        "data.making:make_streets",
         "made streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
     "data make objects": (
-        "making:make_objects",
+        "data.making:make_objects",
         "made frames of your CAD files on a table, in BOP's layout",
     ),
     "data rectify": (
-        "rectifying:rectify",
+        "data.rectifying:rectify",
         "raw pairs and their calibration to rectified pairs that depth match takes",
     ),
-    "data check": ("data:check", "walk a dataset before hours of work and name what is wrong"),
+    "data check": (
+        "data.commands:check",
+        "walk a dataset before hours of work and name what is wrong",
+    ),
     "data label": (
-        "data:label",
+        "data.commands:label",
         "truth for pairs that have none, by a matcher, where both views agree",
     ),
-    "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
+    "data pack": (
+        "data.commands:pack",
+        "a data set as tar shards: few large files, from a disk or a store",
+    ),
     "data export-depth": (
-        "exchanging:export_depth",
+        "data.commands:export_depth",
         "predicted depth as COLMAP's and nerfstudio's files",
     ),
-    "data duplicates": ("data:duplicates", "find evaluation images that a training set has seen"),
+    "data duplicates": (
+        "data.commands:duplicates",
+        "find evaluation images that a training set has seen",
+    ),
     "weights list": ("weights:list_weights", "name the weights at hand"),
     "weights show": ("weights:show_weights", "say what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
@@ -81,18 +93,27 @@ COMMANDS = {
     "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
     "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
-    "reproduce": ("reproduce:reproduce", "a table of chapter 2: published rows, ours, difference"),
+    "reproduce": (
+        "thesis.reproduce:reproduce",
+        "a table of chapter 2: published rows, ours, difference",
+    ),
     "reproduce all": (
-        "reproduce_all:reproduce_all",
+        "thesis.reproduce_all:reproduce_all",
         "every table of a chapter, trainings and all, from KITTI or LineMOD on disk",
     ),
-    "reproduce 3.1": ("pose_reproduce:table_3_1", "the method beside its baselines, by object"),
-    "reproduce 3.2": ("pose_reproduce:table_3_2", "LineMOD: published rows, ours, difference"),
-    "reproduce 3.3": ("pose_reproduce:table_3_3", "RANSAC against least squares"),
-    "figure": ("reproduce:figure", "a figure of chapter 2 from your frames and weights"),
-    "figure 3-2": ("pose_figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
-    "figure 3-4": ("pose_figures:figure_3_4", "true and predicted directions to a keypoint"),
-    "figure 3-5": ("pose_figures:figure_3_5", "boxes of true and estimated poses"),
+    "reproduce 3.1": (
+        "thesis.reproduce_pose:table_3_1",
+        "the method beside its baselines, by object",
+    ),
+    "reproduce 3.2": (
+        "thesis.reproduce_pose:table_3_2",
+        "LineMOD: published rows, ours, difference",
+    ),
+    "reproduce 3.3": ("thesis.reproduce_pose:table_3_3", "RANSAC against least squares"),
+    "figure": ("thesis.reproduce:figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": ("thesis.figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": ("thesis.figures:figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("thesis.figures:figure_3_5", "boxes of true and estimated poses"),
 }
 _THESIS = ("reproduce", "figure")
 """Groups of commands that make the tables and figures of the thesis again."""
@@ -197,7 +218,7 @@ def _run(name: str, rest: list[str]) -> int:
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
 
-    from depthpose.cli.wording import in_words_of
+    from depthpose.cli.help import in_words_of
 
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:

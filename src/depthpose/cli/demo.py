@@ -24,8 +24,8 @@ def demo(
     """
     from functools import partial
 
-    from depthpose.core.report import plain_table
     from depthpose.demo import make_demo
+    from depthpose.report.tables import plain_table
 
     result = make_demo(out, weights, pose_weights, tell=partial(print, flush=True))
     print(plain_table(result.poses, _OF_POSES))

@@ -155,7 +155,7 @@ def _try_pose() -> str:
     from depthpose.pose.config import ObjectsConfig
     from depthpose.pose.estimator import GeoPoseNet
     from depthpose.pose.metrics import adds_m
-    from depthpose.pose.objects import Objects
+    from depthpose.pose.synthetic import Objects
 
     net = GeoPoseNet.load("parts")
     flange = next(model for model in net.weights.models if model.name == "flange")

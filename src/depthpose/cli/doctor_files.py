@@ -19,8 +19,8 @@ from depthpose.core.camera import (
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_image, read_json, read_map
 from depthpose.core.files.images import opened_image
-from depthpose.pose.bop import mask_from_rle
 from depthpose.pose.cloud import frame_advice
+from depthpose.pose.datasets import mask_from_rle
 from depthpose.pose.mesh import exact_diameter, unit_advice
 from depthpose.pose.mesh.models import MESHES, read_geometry
 

@@ -13,7 +13,7 @@ def list_weights(folder: Path | None = None) -> int:
         folder: look here instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-    from depthpose.core.report import plain_table
+    from depthpose.report.tables import plain_table
 
     home = folder or SHIPPED
     found = sorted(home.glob("*.safetensors"))
@@ -180,7 +180,7 @@ def complete_weights(
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.bop.models import read_bop_models
+    from depthpose.pose.datasets.models import read_bop_models
     from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
     from depthpose.pose.weights import known_numbers

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.shipped import SHIPPED as SHIPPED
-from depthpose.core.shipped import find_weights as find_weights
+from depthpose.core.hub import SHIPPED as SHIPPED
+from depthpose.core.hub import find_weights as find_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 

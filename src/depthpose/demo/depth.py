@@ -6,21 +6,24 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.draw import depth_scale, draw_depth
 from depthpose.core.files import write_image
-from depthpose.core.report import Picture, Section
-from depthpose.demo.motorcycle import read_motorcycle
 from depthpose.depth.config import SGBMConfig, StreetsConfig
+from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import depth_errors, disparity_errors
 from depthpose.depth.predictions import write_estimate, write_estimate_cloud
-from depthpose.depth.streets import Streets
-from depthpose.depth.types import DepthEstimate, StereoSample
-from depthpose.pages.depth import DepthError, DepthShown, depth_section
+from depthpose.depth.synthetic import Streets
+from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
+from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.tables import Picture, Section
 
 STREETS_SEED = 9
 """No weights were trained on streets of this seed."""
@@ -154,3 +157,33 @@ def _show(folder: Path, title: str, sample: StereoSample, estimate: DepthEstimat
     error = DepthError(error=(estimate.disparity_px - truth_px).abs(), is_disparity=True)
     shown = DepthShown(pair=sample.input, estimate=estimate, range_m=range_m, error=error)
     return depth_section(title, shown, with_image=False)
+
+
+def read_motorcycle() -> StereoSample | None:
+    """Read the pair with its true disparity, or None where scikit-image is not installed.
+
+    Calibration is that of scikit-image's documentation: images a quarter of the original size,
+    principal points 31.086 px apart, baseline 193.001 mm.
+    """
+    try:
+        from skimage.data import stereo_motorcycle
+    except ImportError:
+        return None
+    left, right, disparity = stereo_motorcycle()
+    K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
+    rig = StereoRig(
+        width=left.shape[1],
+        height=left.shape[0],
+        K=K,
+        baseline_m=0.193001,
+        cx_right_minus_left_px=31.086,
+    )
+    disparity_px = torch.from_numpy(np.array(disparity, np.float32))
+    disparity_px[~torch.isfinite(disparity_px)] = torch.nan
+    truth = StereoTruth(disparity_px=disparity_px, depth_m=depth_from_disparity(disparity_px, rig))
+    pair = StereoInput(name="motorcycle", left=_image(left), right=_image(right), camera=rig)
+    return StereoSample(input=pair, truth=truth)
+
+
+def _image(pixels: np.ndarray) -> Float[Tensor, "3 h w"]:
+    return torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1).float() / 255

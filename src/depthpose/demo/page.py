@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.report import table_files, write_page, write_table
 from depthpose.core.run import claim_folder, environment
 from depthpose.demo.depth import show_depth
 from depthpose.demo.pose import show_poses
+from depthpose.report.tables import table_files, write_page, write_table
 
 _PAGE = "report.html"
 _FOLDERS = (

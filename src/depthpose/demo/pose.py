@@ -5,17 +5,17 @@ from typing import Any
 
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
-from depthpose.core.report import Picture, Section
-from depthpose.core.scene import Layer, Scene
-from depthpose.pose.bop import BopFrame, open_bop, write_bop_models, write_bop_scene
-from depthpose.pose.bop.write import write_mask
 from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets import BopFrame, open_bop, write_bop_models, write_bop_scene
+from depthpose.pose.datasets.write import write_mask
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import evaluate
-from depthpose.pose.objects import make_frames
-from depthpose.pose.overlay import draw_pose, grey_depth, pose_layers, posed_cloud
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
+from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ViewInput
+from depthpose.report.overlay import draw_pose, grey_depth, pose_layers, posed_cloud
+from depthpose.report.scene import Layer, Scene
+from depthpose.report.tables import Picture, Section
 
 FRAMES_SEED = 9
 """No weights were trained on frames of this seed."""

@@ -12,9 +12,9 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
 from depthpose.core.run import claim_folder
+from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.kitti import Dataset
 from depthpose.depth.types import StereoInput
 
 

@@ -13,7 +13,7 @@ from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.stereo.weights import KIND as PSMNET
+from depthpose.depth.stereo.published import KIND as PSMNET
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"

@@ -1,11 +1,18 @@
 """What the page shows of one estimate."""
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from depthpose.core.camera import Camera, read_camera
 from depthpose.core.draw import Scale
-from depthpose.core.scene import Scene
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, write_json
+from depthpose.core.files.disk import write_bytes
+from depthpose.report.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,3 +62,129 @@ class Answer:
 def read_files(folder: Path) -> dict[str, bytes]:
     """Take the files of a folder into memory, so that the folder can go."""
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+MOST_PIXELS = 12_500_000
+"""Of a picture: those of a phone."""
+KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "image": ("a picture", IMAGES),
+    "right": ("a picture", IMAGES),
+    "depth": ("a depth image", (".png", ".npy", ".pfm")),
+    "mask": ("a mask", (".png", ".jpg", ".jpeg", ".bmp")),
+    "camera": ("a camera file", (".json", ".yaml", ".yml", ".xml", ".txt")),
+    "cloud": ("a point cloud", (".ply", ".pcd", ".npy", ".xyz", ".txt")),
+    "cad": ("a model file", (".ply", ".stl", ".obj", ".glb")),
+}
+"""What each field of the forms takes."""
+
+_FIELDS = "the camera fields"
+_LONGEST_NAME = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class Form:
+    """Fields and files of one request.
+
+    Attributes:
+        folder: where its files lie, and where results may; it is removed with the request.
+        fields: words as typed.
+        files: by field.
+    """
+
+    folder: Path
+    fields: Mapping[str, str]
+    files: Mapping[str, Path]
+
+    def file(self, field: str) -> Path:
+        """Give the file of a field.
+
+        Raises:
+            InputError: none was chosen.
+        """
+        if field not in self.files:
+            what, suffixes = KINDS[field]
+            raise InputError(f"{field}: no file; choose {what} ({', '.join(suffixes)})")
+        return self.files[field]
+
+    def number(self, field: str) -> float | None:
+        """Give the number of a field; None where it was left empty.
+
+        Raises:
+            InputError: it is none.
+        """
+        text = self.fields.get(field, "").strip()
+        if not text:
+            return None
+        try:
+            value = float(text.replace(",", "."))
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{field} is {text!r}; write a number such as 0.5")
+        return value
+
+    def camera(self, keys: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
+        """Read the camera file that was sent, or make a camera of the fields.
+
+        Args:
+            keys: of a camera file, from the fields; taken where no file was sent.
+            size: of the image (width, height), for files that do not say it.
+
+        Raises:
+            InputError: as :func:`depthpose.core.camera.read_camera`.
+        """
+        if "camera" in self.files:
+            return read_camera(self.files["camera"], size)
+        path = self.folder / _FIELDS
+        # The same way as a file, so that the same mistakes are found.
+        write_json(path, {k: v for k, v in keys.items() if v is not None})
+        return read_camera(path)
+
+    def results(self) -> Path:
+        """Make the folder for the results."""
+        folder = self.folder / "results"
+        folder.mkdir()
+        return folder
+
+
+def without_paths(text: str, folder: Path) -> str:
+    """Take this machine's folders out of a message: a user knows the names of the files."""
+    fields = "|".join(KINDS)
+    return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)
+
+
+def small_size(path: Path) -> tuple[int, int]:
+    """Give a picture's width and height before it is read.
+
+    Raises:
+        InputError: it has more pixels than this page takes.
+    """
+    width, height = image_size(path)
+    if width * height > MOST_PIXELS:
+        raise InputError(
+            f"{path.name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
+            "that this page takes; scale it down, or use the command line"
+        )
+    return width, height
+
+
+def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
+    """Write a file that was sent, under its own name where that is harmless.
+
+    Raises:
+        InputError: the form has no such field, or its type is another.
+    """
+    if field not in KINDS:
+        raise InputError(f"{field!r} is no file field of this page; known are {', '.join(KINDS)}")
+    what, suffixes = KINDS[field]
+    # ASCII alone: results bear the name too, and go into the header of an answer.
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", sent_name.replace("\\", "/").rpartition("/")[2])
+    path = Path(name.lstrip(".-"))
+    if path.suffix.lower() not in suffixes or not path.stem:
+        raise InputError(
+            f"{field}: {sent_name!r} is not {what}; this field takes {', '.join(suffixes)}"
+        )
+    kept = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
+    write_bytes(kept, data)
+    return kept

@@ -21,13 +21,12 @@ from starlette.routing import Route
 
 from depthpose import __version__
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.scene import page_file
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.web.answer import Answer, Shown
+from depthpose.report.scene import page_file
+from depthpose.web.answer import Answer, Form, Shown, without_paths
 from depthpose.web.depth import answer_depth
 from depthpose.web.examples import depth_example, pose_example
-from depthpose.web.form import Form, without_paths
 from depthpose.web.guard import (
     LOOPBACK,
     Guard,

@@ -6,15 +6,14 @@ import time
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
+from depthpose.depth.disparity import focal_size
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.virtual import square_camera
+from depthpose.depth.estimator.rig import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
-from depthpose.depth.sizes import focal_size
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.pages.depth import depth_facts, depth_scene, said_grey
-from depthpose.web.answer import Answer, Shown, read_files
-from depthpose.web.form import Form, small_size
+from depthpose.report.depth import depth_facts, depth_scene, said_grey
+from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 _MOST_WORK_PIXELS = 8_000_000
 """Of the picture as the networks see it, at the focal length that they were trained at."""

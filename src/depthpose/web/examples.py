@@ -8,11 +8,11 @@ from typing import Any
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import write_depth_png, write_image
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.streets import Streets
-from depthpose.pose.bop.write import write_mask
+from depthpose.depth.synthetic import Streets
 from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets.write import write_mask
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.objects import make_frames
+from depthpose.pose.synthetic import make_frames
 
 _SEED = 9
 """No weights were trained on streets or views of this seed."""

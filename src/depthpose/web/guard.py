@@ -13,7 +13,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from depthpose.core.errors import InputError
-from depthpose.web.form import Form, keep_file
+from depthpose.web.answer import Form, keep_file
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _SAFE = {

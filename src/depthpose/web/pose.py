@@ -11,8 +11,6 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError, install_words
 from depthpose.core.files import read_map, write_cloud, write_image
-from depthpose.core.scene import Scene
-from depthpose.pages.pose import pose_facts, pose_scene, pose_sentence, pose_tables
 from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
@@ -20,11 +18,12 @@ from depthpose.pose.estimator import GeoPoseNet, Voted
 from depthpose.pose.estimator.find import explained_mask
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface
-from depthpose.pose.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.web.answer import Answer, Shown, read_files
-from depthpose.web.form import Form, small_size
+from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
+from depthpose.report.pose import pose_facts, pose_scene, pose_sentence, pose_tables
+from depthpose.report.scene import Scene
+from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 OWN_CAD = "cad"
 """The choice of an object that stands for the CAD file."""

@@ -1,26 +1,26 @@
 """Pinhole camera and rectified stereo rig."""
 
+from depthpose.core.camera.camera_file import AnyCamera as AnyCamera
+from depthpose.core.camera.camera_file import AnyLens as AnyLens
+from depthpose.core.camera.camera_file import camera_of as camera_of
+from depthpose.core.camera.camera_file import centred_camera as centred_camera
 from depthpose.core.camera.camera_file import (
     check_image_matches_camera as check_image_matches_camera,
 )
+from depthpose.core.camera.camera_file import choose_lens as choose_lens
 from depthpose.core.camera.camera_file import read_camera as read_camera
 from depthpose.core.camera.camera_file import read_rig as read_rig
 from depthpose.core.camera.camera_file import write_camera as write_camera
-from depthpose.core.camera.epipolar import epipolar_distance_px as epipolar_distance_px
-from depthpose.core.camera.epipolar import essential_matrix as essential_matrix
-from depthpose.core.camera.epipolar import fundamental_matrix as fundamental_matrix
 from depthpose.core.camera.facts import refuse_other_resolution as refuse_other_resolution
 from depthpose.core.camera.facts import refuse_outside as refuse_outside
 from depthpose.core.camera.facts import suspicious_centre as suspicious_centre
-from depthpose.core.camera.given import AnyCamera as AnyCamera
-from depthpose.core.camera.given import AnyLens as AnyLens
-from depthpose.core.camera.given import camera_of as camera_of
-from depthpose.core.camera.given import centred_camera as centred_camera
-from depthpose.core.camera.given import choose_lens as choose_lens
-from depthpose.core.camera.model import Camera as Camera
-from depthpose.core.camera.model import StereoRig as StereoRig
+from depthpose.core.camera.pinhole import Camera as Camera
+from depthpose.core.camera.pinhole import StereoRig as StereoRig
 from depthpose.core.camera.pinhole import back_project as back_project
 from depthpose.core.camera.pinhole import crop_camera as crop_camera
+from depthpose.core.camera.pinhole import epipolar_distance_px as epipolar_distance_px
+from depthpose.core.camera.pinhole import essential_matrix as essential_matrix
+from depthpose.core.camera.pinhole import fundamental_matrix as fundamental_matrix
 from depthpose.core.camera.pinhole import pad_camera as pad_camera
 from depthpose.core.camera.pinhole import pixel_grid as pixel_grid
 from depthpose.core.camera.pinhole import project as project

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from depthpose.core.camera.model import Camera, StereoRig
+from depthpose.core.camera.pinhole import Camera, StereoRig
 from depthpose.core.errors import InputError
 
 Size = tuple[int, int]

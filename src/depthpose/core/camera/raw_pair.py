@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from depthpose.core.camera.facts import Size
-from depthpose.core.camera.model import check_intrinsics
+from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.camera.storage import Names, matrix, named, numbers, read_storage
 from depthpose.core.camera.stored_camera import is_ros, read_two_files, size_of
 from depthpose.core.errors import InputError

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from depthpose.core.camera.facts import Size, camera_from_facts, facts_from_projections
-from depthpose.core.camera.model import StereoRig
+from depthpose.core.camera.pinhole import StereoRig
 from depthpose.core.camera.raw_pair import RawCamera, RawPair
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.rigid import Rigid

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from depthpose.core.engine.items import Item
-from depthpose.core.engine.plan import PLAN, Block, make_plan
+from depthpose.core.engine.plan import PLAN, Block, Item, make_plan
 from depthpose.core.engine.shard import ShardFormat, read_shard
 from depthpose.core.engine.work import SHARDS, Done, Work
 from depthpose.core.errors import InputError

@@ -1,12 +1,190 @@
 """Blocks of inputs, each of which becomes one shard of results; fixed by the first run."""
 
+import csv
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import PurePosixPath
+from typing import Any
 
-from depthpose.core.engine.items import Item
-from depthpose.core.errors import InputError
-from depthpose.core.files.store import exists, join, publish_bytes, read_from
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.files.store import (
+    absolute,
+    exists,
+    is_url,
+    join,
+    list_files,
+    publish_bytes,
+    read_from,
+)
+
+TARS = (".tar", ".tgz", ".gz")
+MANIFESTS = (".parquet", ".csv")
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """What an input is made of.
+
+    Attributes:
+        roles: a word for each of its files, such as ``("left", "right")``. They are the columns of
+            a manifest; a member of a tar shard is ``KEY.ROLE.SUFFIX``, of a single role
+            ``KEY.SUFFIX`` does.
+        suffixes: that the files may have, in lower case, with the dot.
+    """
+
+    roles: tuple[str, ...]
+    suffixes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One input.
+
+    Attributes:
+        name: that of its results: unique in a job, relative, without a suffix.
+        files: paths or URLs, in the order of the roles of the work.
+    """
+
+    name: str
+    files: tuple[str, ...]
+
+
+def find_items(words: Sequence[str], files: Files) -> list[Item]:
+    """Find inputs that are no tar shards.
+
+    Args:
+        words: one file, folder or pattern for each role, paired in the order of their names; or
+            of a single role any number of them; or manifests.
+        files: what an input is made of.
+
+    Raises:
+        InputError: nothing is there, sides that cannot be paired, or two inputs of one name.
+    """
+    manifests = [word for word in words if is_manifest(word)]
+    others = [word for word in words if not is_manifest(word)]
+    found = [item for word in manifests for item in _read_manifest(word, files.roles)]
+    if others and len(files.roles) > 1:
+        found += _pair(others, files)
+    else:
+        listed = [url for word in others for url in list_files(word, files.suffixes)]
+        found += [Item(stem(url), (url,)) for url in listed]
+    _refuse_twice(found)
+    return found
+
+
+def find_tars(words: Iterable[str]) -> list[str]:
+    """List tar shards: files themselves, or those of a pattern."""
+    found = [url for word in words for url in list_files(word, TARS) if is_tar(url)]
+    return list(dict.fromkeys(found))
+
+
+def is_tar(word: str) -> bool:
+    """Whether a word names tar shards."""
+    return word.lower().endswith((".tar", ".tar.gz", ".tgz"))
+
+
+def is_manifest(word: str) -> bool:
+    """Whether a word names a list of inputs."""
+    return word.lower().endswith(MANIFESTS)
+
+
+def stem(url: str) -> str:
+    """Name the result of a file: its name without the suffix."""
+    return PurePosixPath(url).stem
+
+
+def refuse_name(name: str, source: str) -> None:
+    """Refuse a name that would lead out of the folder of the results.
+
+    Raises:
+        InputError: it is empty, absolute or holds ``..``.
+    """
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name or "\\" in name:
+        raise InputError(
+            f"{source}: the name {name!r} is no name of a result; write letters, digits and '/'"
+        )
+
+
+def import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no types
+    """Import Parquet's reader and writer, which the extra ``ray`` brings.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import_module("pyarrow.parquet")
+        return import_module("pyarrow")
+    except ImportError as error:
+        raise MissingExtraError("pyarrow", "ray", purpose) from error
+
+
+def _pair(words: Sequence[str], files: Files) -> list[Item]:
+    if len(words) != len(files.roles):
+        raise InputError(
+            f"{', '.join(words)}: an input has {' and '.join(files.roles)}; give a path for each "
+            "of them, or one manifest"
+        )
+    sides = [list_files(word, files.suffixes) for word in words]
+    counts = [len(side) for side in sides]
+    if len(set(counts)) > 1:
+        said = ", ".join(f"{word} holds {n}" for word, n in zip(words, counts, strict=True))
+        raise InputError(f"{said}: each input needs one file of each. Remove those without.")
+    return [Item(stem(some[0]), some) for some in zip(*sides, strict=True)]
+
+
+def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
+    rows = _parquet_rows(url) if url.lower().endswith(".parquet") else _csv_rows(url)
+    folder = url.rpartition("/")[0] or "."
+    for number, row in enumerate(rows, 1):
+        missing = [role for role in roles if not isinstance(row.get(role), str) or not row[role]]
+        if missing:
+            raise InputError(
+                f"{url}: row {number} has no {missing[0]!r}; the columns are "
+                f"{', '.join(roles)} (paths or URLs) and, if you like, name"
+            )
+        files = tuple(_beside(row[role], folder) for role in roles)
+        name = row.get("name") or stem(files[0])
+        refuse_name(str(name), f"{url}: row {number}")
+        yield Item(str(name), files)
+
+
+def _beside(path: str, folder: str) -> str:
+    """Read a relative path from where its manifest lies."""
+    return path if is_url(path) or path.startswith("/") else absolute(join(folder, path))
+
+
+def _csv_rows(url: str) -> Iterator[Mapping[str, Any]]:
+    try:
+        text = read_from(url).decode("utf-8-sig")
+        yield from csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{url}: not a CSV table in UTF-8 ({error}); save it so") from error
+
+
+def _parquet_rows(url: str) -> Iterator[Mapping[str, Any]]:
+    arrow = import_pyarrow("a Parquet manifest")
+    try:
+        file = arrow.parquet.ParquetFile(io.BytesIO(read_from(url)))
+        for batch in file.iter_batches():
+            yield from batch.to_pylist()
+    except (arrow.ArrowException, OSError) as error:
+        raise InputError(f"{url}: not a Parquet file ({error}); write it anew") from error
+
+
+def _refuse_twice(items: Sequence[Item]) -> None:
+    first: dict[str, Item] = {}
+    for item in items:
+        other = first.setdefault(item.name, item)
+        if other is not item:
+            raise InputError(
+                f"{other.files[0]} and {item.files[0]} would both be {item.name!r} in the "
+                "results; give a manifest with a column 'name'"
+            )
+
 
 PLAN = "plan.jsonl"
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from depthpose.core.engine.items import import_pyarrow
+from depthpose.core.engine.plan import import_pyarrow
 from depthpose.core.errors import InputError
 from depthpose.core.files.store import opened, read_from
 

@@ -9,8 +9,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Protocol, runtime_checkable
 
-from depthpose.core.engine.items import Files, Item, refuse_name
-from depthpose.core.engine.plan import Block
+from depthpose.core.engine.plan import Block, Files, Item, refuse_name
 from depthpose.core.engine.shard import ShardFormat, read_tar, shard_writer
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_write

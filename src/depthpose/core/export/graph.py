@@ -6,11 +6,12 @@ where it shrinks.
 
 import json
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from depthpose.core.export.extra import import_export
+from depthpose.core.errors import MissingExtraError
 
 OPSET = 18
 Shape = Sequence[int | str]
@@ -137,3 +138,25 @@ class Graph:
 
 def _onnx_type(dtype: type) -> int:
     return import_export().helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+
+
+_PACKAGES = (
+    "onnxruntime",
+    "onnxscript",
+    "onnx.compose",
+    "onnx.inliner",
+    "onnx.numpy_helper",
+    "onnx",
+)
+
+
+def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
+    """Import ONNX, and make sure that what goes with it is there too.
+
+    Raises:
+        MissingExtraError: one of the three is not installed.
+    """
+    try:
+        return [import_module(name) for name in _PACKAGES][-1]
+    except ImportError as error:
+        raise MissingExtraError("onnx, onnxruntime and onnxscript", "export", "export") from error

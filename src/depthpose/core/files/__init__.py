@@ -8,12 +8,6 @@ from depthpose.core.files.cloud import Cloud as Cloud
 from depthpose.core.files.cloud import read_cloud as read_cloud
 from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
-from depthpose.core.files.colmap import read_colmap_map as read_colmap_map
-from depthpose.core.files.colmap import write_colmap_map as write_colmap_map
-from depthpose.core.files.depth_png import read_depth_png as read_depth_png
-from depthpose.core.files.depth_png import read_disparity_png as read_disparity_png
-from depthpose.core.files.depth_png import write_depth_png as write_depth_png
-from depthpose.core.files.depth_png import write_disparity_png as write_disparity_png
 from depthpose.core.files.disk import AnyPath as AnyPath
 from depthpose.core.files.disk import atomic_write as atomic_write
 from depthpose.core.files.disk import read_bytes as read_bytes
@@ -25,7 +19,11 @@ from depthpose.core.files.images import list_images as list_images
 from depthpose.core.files.images import picture_tensor as picture_tensor
 from depthpose.core.files.images import read_image as read_image
 from depthpose.core.files.images import write_image as write_image
+from depthpose.core.files.maps import read_depth_png as read_depth_png
+from depthpose.core.files.maps import read_disparity_png as read_disparity_png
 from depthpose.core.files.maps import read_map as read_map
+from depthpose.core.files.maps import write_depth_png as write_depth_png
+from depthpose.core.files.maps import write_disparity_png as write_disparity_png
 from depthpose.core.files.maps import write_map as write_map
 from depthpose.core.files.text import read_json as read_json
 from depthpose.core.files.text import read_key_values as read_key_values

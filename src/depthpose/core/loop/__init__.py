@@ -1,8 +1,14 @@
 """The one training loop: a task in, trained weights and a run folder out."""
 
-from depthpose.core.loop.card import card_text, held_out_text, leave_card
 from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam
-from depthpose.core.loop.journal import Journal, read_metrics, run_files
+from depthpose.core.loop.journal import (
+    Journal,
+    card_text,
+    held_out_text,
+    leave_card,
+    read_metrics,
+    run_files,
+)
 from depthpose.core.loop.loop import Interrupted, Progress, train
 from depthpose.core.loop.task import Evidence, Samples, Task, Turn, shuffled_index, ticket_generator
 

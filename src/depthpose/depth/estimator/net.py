@@ -21,7 +21,7 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, say_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import depth_from_disparity
+from depthpose.depth.disparity import depth_from_disparity, focal_size, resize_image
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
@@ -30,9 +30,13 @@ from depthpose.depth.estimator.inputs import (
     refuse_unrectified,
     usable_right,
 )
-from depthpose.depth.estimator.matchers import choose_matcher, set_answer
-from depthpose.depth.estimator.virtual import from_virtual, join_matches, square_camera
-from depthpose.depth.sizes import focal_size, resize_image
+from depthpose.depth.estimator.rig import (
+    choose_matcher,
+    from_virtual,
+    join_matches,
+    set_answer,
+    square_camera,
+)
 from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser, openvino_generator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
@@ -112,7 +116,7 @@ class FakestereoNet:
             weights: weights of both networks, of the generator alone (then ``matcher`` is
                 needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
                 ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
-                What names weights: :func:`depthpose.core.shipped.find_weights`.
+                What names weights: :func:`depthpose.core.hub.find_weights`.
             matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.camera.given import AnyCamera, AnyLens, choose_lens
+from depthpose.core.camera.camera_file import AnyCamera, AnyLens, choose_lens
 from depthpose.core.errors import Notice, refuse_unknown
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator.inputs import Picture, as_tensor

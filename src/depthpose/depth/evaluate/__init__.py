@@ -9,10 +9,10 @@ from depthpose.depth.evaluate.evaluate import Measured as Measured
 from depthpose.depth.evaluate.evaluate import evaluate as evaluate
 from depthpose.depth.evaluate.evaluate import measure_frame as measure_frame
 from depthpose.depth.evaluate.evaluate import summarise as summarise
+from depthpose.depth.evaluate.frames import PROTOCOLS as PROTOCOLS
 from depthpose.depth.evaluate.frames import FrameResult as FrameResult
+from depthpose.depth.evaluate.frames import Protocol as Protocol
 from depthpose.depth.evaluate.frames import clamped_depth as clamped_depth
+from depthpose.depth.evaluate.frames import find_protocol as find_protocol
 from depthpose.depth.evaluate.frames import frame_result as frame_result
-from depthpose.depth.evaluate.protocols import PROTOCOLS as PROTOCOLS
-from depthpose.depth.evaluate.protocols import Protocol as Protocol
-from depthpose.depth.evaluate.protocols import find_protocol as find_protocol
-from depthpose.depth.evaluate.protocols import has_truth as has_truth
+from depthpose.depth.evaluate.frames import has_truth as has_truth

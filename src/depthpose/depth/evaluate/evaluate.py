@@ -10,16 +10,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.depth.datasets import Dataset
+from depthpose.depth.datasets import read_disparity as read_truth_disparity
 from depthpose.depth.evaluate.frames import (
     Compared,
     Prepared,
+    Protocol,
     compare_depth,
     compare_disparity,
+    find_protocol,
     prepare,
 )
-from depthpose.depth.evaluate.protocols import Protocol, find_protocol
-from depthpose.depth.kitti import Dataset
-from depthpose.depth.kitti import read_disparity as read_truth_disparity
 from depthpose.depth.metrics import (
     depth_errors,
     disparity_errors,

@@ -11,8 +11,8 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.export import Graph, Value, network_model
 from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
-from depthpose.depth.estimator.virtual import SKY_M
-from depthpose.depth.export.network import SizelessPSMNet
+from depthpose.depth.estimator.rig import SKY_M
+from depthpose.depth.export.network import DrawnValues, SizelessPSMNet, drawn
 from depthpose.depth.export.steps import (
     columns,
     focal_size,
@@ -25,7 +25,6 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
-from depthpose.depth.export.views import DrawnValues, drawn
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.weights import DepthWeights

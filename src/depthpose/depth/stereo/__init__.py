@@ -10,9 +10,8 @@ from depthpose.depth.stereo.psmnet_matcher import (
     tile_change_px,
     with_usable_precision,
 )
-from depthpose.depth.stereo.published import psmnet_from_published
+from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
-from depthpose.depth.stereo.weights import import_psmnet
 
 __all__ = [
     "CallableMatcher",

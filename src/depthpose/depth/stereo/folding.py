@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.depth.stereo.features import ConvNorm, FeatureExtractor
+from depthpose.depth.stereo.psmnet import ConvNorm, FeatureExtractor
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d

@@ -13,13 +13,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.depth.stereo.expectation import Size, expected_disparity
-from depthpose.depth.stereo.features import ConvNorm
-from depthpose.depth.stereo.first_layer import FirstLayer, LookedPair
 from depthpose.depth.stereo.folding import CostConv, RowsConv, fold_features, folded_weight
 from depthpose.depth.stereo.plan import Steps
-from depthpose.depth.stereo.psmnet import Head, Hourglass, PSMNet
-from depthpose.depth.stereo.slabs import Slab, convolve, spans, whole
+from depthpose.depth.stereo.psmnet import ConvNorm, Head, Hourglass, PSMNet
+from depthpose.depth.stereo.volume import (
+    FirstLayer,
+    LookedPair,
+    Size,
+    Slab,
+    convolve,
+    expected_disparity,
+    spans,
+    whole,
+)
 from depthpose.depth.types import Match
 
 Views = Float[Tensor, "b 3 h w"]

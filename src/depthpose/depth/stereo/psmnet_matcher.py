@@ -15,13 +15,16 @@ from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
-from depthpose.depth.disparity import left_right_difference_px
-from depthpose.depth.sizes import focal_size, resize_image, resized_match
+from depthpose.depth.disparity import (
+    focal_size,
+    left_right_difference_px,
+    resize_image,
+    resized_match,
+)
 from depthpose.depth.stereo.inference import PSMNetInference
 from depthpose.depth.stereo.matcher import check_pair
-from depthpose.depth.stereo.plan import Footprint
+from depthpose.depth.stereo.plan import Footprint, Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.tiles import Tiling, match_tiles
 from depthpose.depth.types import Match
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

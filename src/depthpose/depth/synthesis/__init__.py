@@ -1,11 +1,11 @@
 """Left image to right image: a U-Net that paints (pix2pix), a network that selects (Deep3D)."""
 
-from depthpose.depth.synthesis.discriminators import (
+from depthpose.depth.synthesis.generator import (
     PatchDiscriminator,
     PixelDiscriminator,
+    UNetGenerator,
     make_discriminator,
 )
-from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.openvino import openvino_generator
 from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (

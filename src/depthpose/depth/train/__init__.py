@@ -1,6 +1,5 @@
 """Stages of a training, one loop: a generator, the matcher, the generator through the matcher."""
 
-from depthpose.depth.train.finetune import FinetuneTask
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.runs import (
     STAGES,
@@ -10,10 +9,8 @@ from depthpose.depth.train.runs import (
     train_stereo,
     train_view,
 )
-from depthpose.depth.train.select import SelectTask
-from depthpose.depth.train.select_pairs import SelectionSamples
-from depthpose.depth.train.stereo import StereoTask
-from depthpose.depth.train.view import ViewTask
+from depthpose.depth.train.select import SelectionSamples, SelectTask
+from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 
 __all__ = [
     "STAGES",

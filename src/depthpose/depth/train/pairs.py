@@ -13,9 +13,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import shuffled_index, ticket_generator
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
+from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
-from depthpose.depth.kitti import Dataset, known_truths, lidar_truth, open_dataset
-from depthpose.depth.streets import Streets, kitti_rig, street_rig
+from depthpose.depth.synthetic import Streets, kitti_rig, street_rig
 
 BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""

@@ -30,12 +30,9 @@ from depthpose.depth.train.config import (
     StereoTraining,
     ViewTraining,
 )
-from depthpose.depth.train.finetune import FinetuneTask
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.select import SelectTask
-from depthpose.depth.train.select_pairs import SelectionSamples
-from depthpose.depth.train.stereo import StereoTask
-from depthpose.depth.train.view import ViewTask
+from depthpose.depth.train.select import SelectionSamples, SelectTask
+from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")

@@ -1,14 +1,90 @@
 """The depth image regressed by a 2D network: the first baseline of table 3.1."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, turn_axis_to
 from depthpose.pose.baselines.config import DepthImageConfig
-from depthpose.pose.baselines.crop import DepthCrop, camera_from_crop
 from depthpose.pose.resnet import ResNet18
+from depthpose.pose.types import ViewInput
+
+EMPTY = -2.0
+"""Of a pixel without the object: below all that a depth can be, -1 to 1."""
+
+
+class DepthCrop(NamedTuple):
+    """A crop, and where it lies; batched with leading axes.
+
+    Attributes:
+        image: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
+        R: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
+            object looks alike in the crop wherever in the image it is, if its rotation is said in
+            this frame.
+        middle_m: the point of that ray at the mean depth, in the camera frame.
+        side_m: width of the crop at the mean depth.
+    """
+
+    image: Float[Tensor, "*b 1 size size"]
+    R: Float[Tensor, "*b 3 3"]
+    middle_m: Float[Tensor, "*b 3"]
+    side_m: Float[Tensor, "*b"]
+
+
+def cut_depth(
+    view: ViewInput, config: DepthImageConfig, diameter_m: float | None = None
+) -> DepthCrop | None:
+    """Cut the object out of a view; None where fewer pixels than ``min_points`` have a depth.
+
+    Args:
+        view: depth and mask.
+        config: size, margin, contrast.
+        diameter_m: pixels farther than this from the median depth belong to something else; None
+            keeps all.
+    """
+    depth_m = torch.where(view.mask, view.depth_m, torch.nan)
+    is_seen = depth_m.isfinite() & (depth_m > 0)
+    if diameter_m is not None and bool(is_seen.any()):
+        is_seen &= (depth_m - depth_m[is_seen].median()).abs() <= diameter_m
+    if int(is_seen.sum()) < config.min_points:
+        return None
+    rows, columns = is_seen.nonzero(as_tuple=True)
+    low = torch.stack([columns.min(), rows.min()]).float() - 0.5
+    high = torch.stack([columns.max(), rows.max()]).float() + 0.5
+    middle_px, side_px = (low + high) / 2, config.margin * float((high - low).max())
+    mean_m = depth_m[is_seen].mean()
+    relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
+    relief = torch.where(is_seen, relief, EMPTY)
+    K = view.K.to(depth_m)
+    ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
+    return DepthCrop(
+        image=_window(relief, middle_px, side_px, config.crop_px)[None],
+        R=turn_axis_to(ray).to(ray),
+        middle_m=ray * mean_m,
+        side_m=side_px * mean_m / K[0, 0],
+    )
+
+
+def camera_from_crop(crop: DepthCrop, R: Float[Tensor, "b 3 3"], offset: Tensor) -> Rigid:
+    """Carry a pose from the crop's frame, offsets in its widths, to that of the camera."""
+    shift = crop.side_m[:, None] * offset
+    return Rigid(crop.R @ R, crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1))
+
+
+def _window(
+    values: Float[Tensor, "h w"], middle_px: Float[Tensor, "2"], side_px: float, size: int
+) -> Float[Tensor, "{size} {size}"]:
+    """Resize a square by nearest neighbour: depth is not mixed over edges."""
+    steps = (torch.arange(size) + 0.5) / size - 0.5
+    column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
+    height, width = values.shape
+    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
+    found = values[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
+    return torch.where(is_inside, found, EMPTY)
+
 
 KIND = "depth-image"
 _NUMBERS = 9

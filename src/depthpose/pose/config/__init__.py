@@ -1,10 +1,10 @@
 """Every knob of the pose room that needs no torch: frozen dataclasses that refuse at birth."""
 
+from depthpose.pose.config.estimate import DiameterTable as DiameterTable
 from depthpose.pose.config.estimate import EstimateConfig as EstimateConfig
+from depthpose.pose.config.estimate import EvaluationConfig as EvaluationConfig
 from depthpose.pose.config.estimate import RefusalConfig as RefusalConfig
-from depthpose.pose.config.evaluation import DiameterTable as DiameterTable
-from depthpose.pose.config.evaluation import EvaluationConfig as EvaluationConfig
-from depthpose.pose.config.evaluation import SymmetryRule as SymmetryRule
+from depthpose.pose.config.estimate import SymmetryRule as SymmetryRule
 from depthpose.pose.config.geometry import CloudConfig as CloudConfig
 from depthpose.pose.config.geometry import IcpConfig as IcpConfig
 from depthpose.pose.config.geometry import InlierTest as InlierTest

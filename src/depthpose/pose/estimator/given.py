@@ -18,11 +18,11 @@ from depthpose.core.camera import (
     refuse_other_resolution,
     refuse_outside,
 )
-from depthpose.core.camera.given import intrinsics_of
+from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
-from depthpose.pose.bop import mask_from_rle, read_mask
 from depthpose.pose.config import Unit, metres_of
+from depthpose.pose.datasets import mask_from_rle, read_mask
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput
 

@@ -10,13 +10,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.pose.bop import BopDataset, Instance
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.evaluate.errors import Ruler, make_ruler, measure
-from depthpose.pose.evaluate.frames import frames_hash
-from depthpose.pose.evaluate.matching import match
-from depthpose.pose.evaluate.objects import diameter_of, is_adds
-from depthpose.pose.evaluate.rows import Row, mean_row, object_row, risk_rows
+from depthpose.pose.datasets import BopDataset, Instance
+from depthpose.pose.evaluate.errors import Ruler, make_ruler, match, measure
+from depthpose.pose.evaluate.rows import (
+    Row,
+    diameter_of,
+    frames_hash,
+    is_adds,
+    mean_row,
+    object_row,
+    risk_rows,
+)
 from depthpose.pose.predictions import (
     STAGES,
     Prediction,

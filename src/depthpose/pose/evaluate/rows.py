@@ -1,14 +1,22 @@
 """Rows of instances to a row an object, and to their mean."""
 
+import hashlib
 import statistics
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.errors import InputError
+from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.datasets import BopDataset, Instance, Target
 from depthpose.pose.metrics import BOP_PIXELS, BOP_SHARES, auc, average_recall
+from depthpose.pose.predictions import Place, place_of
+from depthpose.pose.types import ObjectModel
 
 Row = dict[str, Any]
 _COUNTS = ("instances", "annotated")
@@ -111,3 +119,65 @@ def _times(rows: Sequence[Row]) -> Row:
 
 def _column(rows: Sequence[Row], name: str) -> Float[Tensor, " n"]:
     return torch.tensor([row[name] for row in rows], dtype=torch.float64)
+
+
+def frames_hash(instances: Sequence[Instance]) -> str:
+    """Give the SHA-256 of the list of instances, a line each: scene, image, object, place."""
+    lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
+    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+
+
+def of_targets(dataset: BopDataset, targets: Sequence[Target]) -> BopDataset:
+    """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
+
+    Raises:
+        InputError: a target is not annotated so many times.
+    """
+    found: dict[Place, list[Instance]] = defaultdict(list)
+    for instance in dataset.instances:
+        found[place_of(instance)].append(instance)
+    kept: list[Instance] = []
+    for target in targets:
+        place = Place(target.scene_id, target.image_id, target.object_id)
+        there = sorted(found[place], key=lambda i: -(i.visible_fraction or 0.0))
+        if len(there) < target.count:
+            raise InputError(
+                f"{dataset.folder}: the targets ask for {target.count} of object "
+                f"{target.object_id} in scene {target.scene_id}, image {target.image_id}, but "
+                f"{len(there)} are annotated in split {dataset.split!r}; give the list of this "
+                "very split"
+            )
+        kept += there[: target.count]
+    kept.sort(key=lambda i: (i.scene_id, i.image_id, i.index))
+    return replace(dataset, instances=kept)
+
+
+PVNET_DIAMETERS_M = {
+    1: 0.097430, 2: 0.286908, 4: 0.171593, 5: 0.193416, 6: 0.152633, 8: 0.259425, 9: 0.107131,
+    10: 0.176364, 11: 0.164857, 12: 0.148204, 13: 0.303153, 14: 0.285155, 15: 0.208394,
+}  # fmt: skip
+"""Of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
+
+_OTHER_DATA_SET = 0.25
+
+
+def diameter_of(model: ObjectModel, config: EvaluationConfig) -> float:
+    """Give the diameter [m] that the thresholds are shares of.
+
+    Raises:
+        InputError: PVNet's table is asked for an object that it does not have.
+    """
+    if config.diameters == "bop":
+        return model.diameter_m
+    printed_m = PVNET_DIAMETERS_M.get(model.number, 0.0)
+    if abs(printed_m / model.diameter_m - 1) > _OTHER_DATA_SET:
+        raise InputError(
+            f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
+            "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
+        )
+    return printed_m
+
+
+def is_adds(model: ObjectModel, config: EvaluationConfig) -> bool:
+    """Whether an object is measured by ADD-S."""
+    return config.adds == "all" or not model.symmetries.is_none

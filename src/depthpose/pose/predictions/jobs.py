@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from depthpose.core.errors import InputError
 from depthpose.core.run import claim_folder
-from depthpose.pose.bop import BopDataset, Detection, Instance, read_mask
+from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
 from depthpose.pose.predictions.records import (
     POSES,
     Place,

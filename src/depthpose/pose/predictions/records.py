@@ -12,8 +12,8 @@ from torch import Tensor
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
-from depthpose.pose.bop import Instance
-from depthpose.pose.bop.parse import integer, number, read_rows
+from depthpose.pose.datasets import Instance
+from depthpose.pose.datasets.parse import integer, number, read_rows
 from depthpose.pose.types import Alternative, PoseEstimate, Status, Tracking
 
 POSES = "poses.json"

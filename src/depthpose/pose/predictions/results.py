@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from depthpose.core.errors import InputError
-from depthpose.pose.bop import BopDataset, BopResult, read_results, write_results
+from depthpose.pose.datasets import BopDataset, BopResult, read_results, write_results
 from depthpose.pose.predictions.records import Place, Prediction, score_of
 from depthpose.pose.types import PoseEstimate
 

@@ -1,12 +1,56 @@
 """FCN (Long, Shelhamer and Darrell, CVPR 2015) on a residual encoder."""
 
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
+from depthpose.core.config import config_from_dict, config_to_dict
+from depthpose.core.errors import InputError
 from depthpose.pose.resnet import ResNet18
-from depthpose.pose.segmentation.config import SegmentationConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationConfig:
+    """The network, how an image is brought to it, and what becomes of its answer."""
+
+    stride: Literal[8, 16, 32] = 8
+    """FCN-8s, 16s or 32s: size in pixels of the finest features that have a say."""
+
+    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    """Channels of the encoder's stages; published weights have these."""
+
+    long_side_px: int = 640
+    """Images are brought to this long side before the network, up or down, and the answer is
+    brought back."""
+
+    with_one_instance: bool = True
+    """An image shows each object once: the largest connected part is kept, the others are errors.
+    Else each connected part is an instance."""
+
+    min_share: float = 0.0005
+    """Parts below this share of the image's pixels are no object (150 pixels of 640x480)."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if min(self.widths) < 1:
+            raise InputError(f"widths must be 1 or more, got {self.widths}")
+        if self.long_side_px < 32:
+            raise InputError(
+                f"long_side_px is {self.long_side_px}, but the coarsest feature is 32 pixels wide; "
+                "take 640"
+            )
+        if not 0 <= self.min_share < 1:
+            raise InputError(
+                f"min_share is {self.min_share}, but it is a share of the image; take 0.0005"
+            )
 
 
 class FCN(nn.Module):
@@ -55,3 +99,77 @@ def _bilinear_twice(classes: int) -> nn.ConvTranspose2d:
         every = torch.arange(classes)
         layer.weight[every, every] = ramp[:, None] * ramp
     return layer
+
+
+KIND = "segmentation"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SegmentationWeights:
+    """What a weights file of this kind holds.
+
+    Attributes:
+        network: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``.
+        objects: names, in the order of the classes.
+        numbers: BOP's ``obj_id`` of each.
+        facts: the card in short: ``trained_on``, ``licence`` and the like.
+    """
+
+    network: FCN
+    objects: tuple[str, ...]
+    numbers: tuple[int, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        assert len(self.objects) == len(self.numbers) == self.network.classes - 1
+
+
+def write_segmentation(
+    path: Path, weights: SegmentationWeights, *, with_half: bool = False
+) -> None:
+    """Write a network with its config and objects to one ``.safetensors`` file.
+
+    Args:
+        path: where to.
+        weights: what to write.
+        with_half: store 16-bit floats: half the size.
+    """
+    config = {
+        "network": config_to_dict(weights.network.config),
+        "objects": list(weights.objects),
+        "numbers": list(weights.numbers),
+    }
+    state = weights.network.state_dict()
+    if with_half:
+        state = {k: t.to(torch.float16) if t.is_floating_point() else t for k, t in state.items()}
+    save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=weights.facts))
+
+
+def read_segmentation(path: Path) -> SegmentationWeights:
+    """Read what :func:`write_segmentation` wrote.
+
+    Raises:
+        InputError: no such weights, or weights that do not fit their own config.
+    """
+    checkpoint = read_checkpoint(path, KIND)
+    config = config_from_dict(checkpoint.config, _FileConfig, source=str(path))
+    if len(config.objects) != len(config.numbers) or not config.objects:
+        raise InputError(
+            f"{path}: its config names {len(config.objects)} objects and {len(config.numbers)} "
+            "numbers; each object has both. Export it again."
+        )
+    count, knobs = len(config.objects), config.network
+    network = build_network(lambda: FCN(count, knobs), checkpoint, str(path))
+    return SegmentationWeights(
+        network=network.eval(),
+        objects=config.objects,
+        numbers=config.numbers,
+        facts=checkpoint.facts,
+    )
+
+
+@dataclass(frozen=True)
+class _FileConfig:
+    network: SegmentationConfig = dataclasses.field(default_factory=SegmentationConfig)
+    objects: tuple[str, ...] = ()
+    numbers: tuple[int, ...] = ()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from scipy import ndimage
 from torch import Tensor
 
@@ -16,9 +16,12 @@ from depthpose.core.arrays import Image, check_image
 from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.devices import usable_device
 from depthpose.pose.resnet import normalise_colors
-from depthpose.pose.segmentation.config import SegmentationConfig
-from depthpose.pose.segmentation.network import FCN
-from depthpose.pose.segmentation.weights import SegmentationWeights, read_segmentation
+from depthpose.pose.segmentation.network import (
+    FCN,
+    SegmentationConfig,
+    SegmentationWeights,
+    read_segmentation,
+)
 
 _MULTIPLE = 32
 
@@ -144,3 +147,27 @@ def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[
     pixels = torch.bincount(label.flatten(), minlength=1)
     pixels[0] = 0
     return label, pixels
+
+
+class Overlap:
+    """Counts pixels of each class that are found, true and both, over all images given.
+
+    Args:
+        classes: background and objects.
+    """
+
+    def __init__(self, classes: int) -> None:
+        self.both = torch.zeros(classes, dtype=torch.int64)
+        self.either = torch.zeros(classes, dtype=torch.int64)
+
+    def add(self, found: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"]) -> None:
+        """Count one image, or a batch."""
+        classes = len(self.both)
+        pairs = (truth * classes + found).flatten().cpu()
+        table = torch.bincount(pairs, minlength=classes**2).view(classes, classes)
+        self.both += table.diagonal()
+        self.either += table.sum(0) + table.sum(1) - table.diagonal()
+
+    def iou(self) -> Float[Tensor, " classes"]:
+        """Intersection over union of each class; NaN for one that is neither found nor true."""
+        return torch.where(self.either > 0, self.both / self.either, torch.nan)

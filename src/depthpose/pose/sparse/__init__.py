@@ -5,12 +5,10 @@ a coarser level holds ``floor(c / 2) * 2`` of the finer one's coordinates, the o
 run with x fastest, odd kernels are centred and even ones start at 0.
 """
 
-from depthpose.pose.sparse.cache import CoordinateCache
 from depthpose.pose.sparse.conv import conv
-from depthpose.pose.sparse.kernel_map import KernelMap, kernel_offsets
+from depthpose.pose.sparse.kernel_map import CoordinateCache, KernelMap, kernel_offsets
 from depthpose.pose.sparse.keys import COORDINATE_LIMIT, batch_coordinates
-from depthpose.pose.sparse.layers import RowNorm, SparseConv, SparseConvTranspose
-from depthpose.pose.sparse.voxels import Voxels
+from depthpose.pose.sparse.layers import RowNorm, SparseConv, SparseConvTranspose, Voxels
 
 __all__ = [
     "COORDINATE_LIMIT",

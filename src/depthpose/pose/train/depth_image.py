@@ -24,17 +24,17 @@ from depthpose.core.loop import (
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_shard
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
-from depthpose.pose.bop import open_bop
 from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator import DepthImageRegressor
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import is_within_diameter
-from depthpose.pose.objects import Objects
-from depthpose.pose.train.baselines_config import DepthImageTraining
+from depthpose.pose.synthetic import Objects
+from depthpose.pose.train.clouds import read_models
 from depthpose.pose.train.held_out import held_out_objects, pose_error
-from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, card_facts, claim_run, packed, train_words, with_classes
+from depthpose.pose.train.other_configs import DepthImageTraining
+from depthpose.pose.train.task import Run, card_facts, claim_run, packed, train_words, with_classes
 from depthpose.pose.types import ObjectModel, ViewSample
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 

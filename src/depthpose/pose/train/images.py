@@ -14,11 +14,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import shuffled_index, ticket_generator
 from depthpose.pose.augment import uniform, whole
-from depthpose.pose.bop import Instance, open_bop
-from depthpose.pose.bop.dataset import read_instance_mask
-from depthpose.pose.bop.models import models_folder, object_name, read_models_info
+from depthpose.pose.datasets import Instance, open_bop
+from depthpose.pose.datasets.dataset import read_instance_mask
+from depthpose.pose.datasets.models import models_folder, object_name, read_models_info
 from depthpose.pose.segmentation import SegmentationConfig
-from depthpose.pose.train.segmentation_config import ImageAugmentConfig, ImagesConfig
+from depthpose.pose.train.other_configs import ImageAugmentConfig, ImagesConfig
 
 _LUMA = (0.299, 0.587, 0.114)
 

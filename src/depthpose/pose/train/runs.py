@@ -15,17 +15,25 @@ from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.train.baselines_config import DepthImageTraining, PointNetTraining
-from depthpose.pose.train.clouds import TrainingClouds
+from depthpose.pose.train.clouds import TrainingClouds, read_models
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.depth_image import train_depth_image
-from depthpose.pose.train.held_out import HeldOut
-from depthpose.pose.train.judge import calibrated, judged, table_text
-from depthpose.pose.train.models import read_models
-from depthpose.pose.train.run import Run, card_facts, claim_run, packed, train_words, with_classes
+from depthpose.pose.train.held_out import HeldOut, calibrated, judged, table_text
+from depthpose.pose.train.other_configs import (
+    DepthImageTraining,
+    PointNetTraining,
+    SegmentationTraining,
+)
 from depthpose.pose.train.segmentation import train_segmentation
-from depthpose.pose.train.segmentation_config import SegmentationTraining
-from depthpose.pose.train.task import PoseTask
+from depthpose.pose.train.task import (
+    PoseTask,
+    Run,
+    card_facts,
+    claim_run,
+    packed,
+    train_words,
+    with_classes,
+)
 from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 

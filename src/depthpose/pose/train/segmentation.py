@@ -24,8 +24,8 @@ from depthpose.pose.train.images import (
     LabelledImage,
     TrainingImages,
 )
-from depthpose.pose.train.run import Run, claim_run, with_origin
-from depthpose.pose.train.segmentation_config import SegmentationTraining
+from depthpose.pose.train.other_configs import SegmentationTraining
+from depthpose.pose.train.task import Run, claim_run, with_origin
 
 
 class SegmentationTask:

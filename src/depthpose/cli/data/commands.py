@@ -1,0 +1,255 @@
+"""``depthpose data ...``."""
+
+import math
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from depthpose.core.errors import InputError
+
+
+def check(
+    path: tyro.conf.Positional[Path], split: str | None = None, with_decoding: bool = True
+) -> int:
+    """Walk a dataset and name everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
+
+    A line for each file that is missing, truncated or of the wrong size, then a summary. Exit code
+    0: nothing wrong. 1: something is. 2: the folder cannot be understood.
+
+    Args:
+        path: the dataset's folder.
+        split: check only these frames: eigen-train, eigen-val, eigen-train-val, eigen-test,
+            eigen-benchmark, or a file of monodepth's or monodepth2's form; of a BOP dataset, one
+            of its splits.
+        with_decoding: decode every image in full, which finds truncation; off reads headers only.
+    """
+    from tqdm import tqdm
+
+    from depthpose.depth.datasets import check_dataset
+    from depthpose.pose.datasets import check_bop, is_bop
+
+    check_folder = check_bop if is_bop(path) else check_dataset
+    with tqdm(unit=" frames", leave=False, disable=None) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        report = check_folder(path, split, with_decoding=with_decoding, progress=show)
+    for problem in (*report.notices, *report.problems):
+        print(f"{problem.kind}: {problem.path}: {problem.message}")
+    print(report.summary)
+    return 0 if report.is_ok else 1
+
+
+def pack(
+    path: tyro.conf.Positional[Path],
+    out: Path,
+    split: str | None = None,
+    shard_mb: int = 256,
+) -> int:
+    """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
+
+    Whatever takes a data set takes OUT, or a URL to which it was copied (s3://, gs://): a training
+    reads it by index, and a shard of a store comes to this machine, into ~/.cache/depthpose or
+    $DEPTHPOSE_CACHE, when it is first read. Files are copied as they are. index.json is written
+    last; what was stopped before begins again.
+
+        depthpose data pack KITTI --split eigen-train-val --out shards
+
+    Args:
+        path: the data set's folder.
+        out: a new folder for shards, calibration and index.
+        split: pack these frames alone.
+        shard_mb: megabytes of a shard, from which on the next one begins.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.run import refuse_to_replace
+    from depthpose.depth.datasets import open_dataset, pack_frames
+
+    if shard_mb < 1:
+        raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
+    refuse_to_replace(out / "index.json")
+    dataset = open_dataset(path, split)
+    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
+        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
+    print(f"{len(dataset)} frames in {shards} shards: {out}")
+    return 0
+
+
+def duplicates(
+    train: tyro.conf.Positional[Path],
+    evaluation: tyro.conf.Positional[Path],
+    at_least: float | None = None,
+    out: Path | None = None,
+) -> int:
+    """List images of one set that show nearly the same as images of another.
+
+    Training on a frame of the evaluation's drives flatters every number. Left images are compared
+    by their fine structure over small shifts and zooms: 1 is the same picture, two streets stay
+    below 0.3. The list is for the eye: look at what it names. Always says the likest pair. Exit
+    code 0: none. 1: some.
+
+        depthpose data duplicates my-pairs kitti-eval
+
+    Args:
+        train: folder of the first set, in any layout that 'data check' knows.
+        evaluation: folder of the second set.
+        at_least: list pairs from this likeness on; 0.3 by default.
+        out: folder to write the list to as well: duplicates.json, .csv and .md.
+    """
+    from dataclasses import asdict
+
+    from tqdm import tqdm
+
+    from depthpose.core.run import claim_folder
+    from depthpose.depth.datasets import DUPLICATE_LIKENESS, find_duplicates, open_dataset
+    from depthpose.report.tables import markdown_table, table_files, write_table
+
+    threshold = DUPLICATE_LIKENESS if at_least is None else at_least
+    if not -1 <= threshold <= 1:
+        raise InputError(f"--at-least {threshold:g}: a likeness is -1 .. 1; take 0.3")
+    first, second = open_dataset(train), open_dataset(evaluation)
+    ranked = find_duplicates(
+        first, second, threshold, lambda frames: tqdm(frames, unit=" frames", disable=None)
+    )
+    rows = [asdict(pair) for pair in ranked if pair.likeness >= threshold]
+    if rows:
+        print(markdown_table(rows))
+    if out is not None:
+        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
+        write_table(out, rows, name="duplicates")
+    likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
+    what = f"{len(first)} x {len(second)} images"
+    print(f"{what}: {len(rows)} pairs of likeness {threshold:g} or more; {likest}")
+    return 1 if rows else 0
+
+
+def label(
+    path: tyro.conf.Positional[Path],
+    out: Path,
+    weights: str = "default",
+    device: str = "cpu",
+    max_difference_px: float = 1.0,
+    max_difference_share: float = 0.03,
+    min_confidence: float = 0.5,
+) -> int:
+    """Match pairs that have no truth both ways, and keep as truth what both views agree on.
+
+    What is written is a folder of pairs that every training takes. What comes of such labels is no
+    better than their matcher, and has its blind spots; a matcher that has seen evaluation frames
+    tells them on.
+
+        depthpose data label my-pairs --out my-pairs-labelled
+
+    Args:
+        path: a dataset with right views and calibration.
+        out: folder to write to.
+        weights: weights with a matcher, by name or file; the terms of theirs bind what comes of it.
+        device: cpu, cuda, cuda:1, ...
+        max_difference_px: largest difference of both views' disparities.
+        max_difference_share: the same as a share of the disparity; the larger limit holds.
+        min_confidence: least confidence of the matcher.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import file_sha256, find_weights
+    from depthpose.depth.config import MatcherConfig
+    from depthpose.depth.datasets import open_dataset
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.labels import LabelConfig, label_pairs
+
+    config = LabelConfig(
+        largest_difference_px=max_difference_px,
+        largest_share=max_difference_share,
+        least_confidence=min_confidence,
+    )
+    dataset = open_dataset(path)
+    settings = {
+        "dataset": dataset.name,
+        "weights_sha256": file_sha256(find_weights(weights)),
+        **asdict(config),
+    }
+    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
+    labelled = label_pairs(net, dataset, config, out, settings)
+    shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
+    known = f", {sum(shares) / len(shares):.0%} of their pixels are known" if shares else ""
+    print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
+    return 0
+
+
+def export_depth(
+    results: tyro.conf.Positional[Path],
+    format: Literal["colmap", "nerfstudio"],
+    out: Path,
+    files: Literal["png", "npy"] = "png",
+    images: Path | None = None,
+    scale: float = 1.0,
+) -> int:
+    """Write depth of 'depth predict' or 'depth match' where COLMAP or nerfstudio look for it.
+
+    colmap: OUT/stereo/depth_maps/IMAGE.geometric.bin; OUT is a dense workspace. COLMAP's
+    stereo_fusion wants normal maps too, which are not written.
+    nerfstudio: OUT/depths/NAME.png or .npy in millimetres, 0 where nothing is known. Where OUT
+    holds transforms.json, transforms_depth.json is written beside it, with depth_file_path of
+    each frame: ns-train depth-nerfacto --data OUT/transforms_depth.json.
+
+    A reconstruction from images alone has a scale of its own, and depth is in metres: --scale says
+    how many of its units a metre is.
+
+        depthpose data export-depth out --format colmap --out dense
+        depthpose data export-depth out --format nerfstudio --files npy --out data
+
+    Args:
+        results: folder of predictions.
+        format: whose files.
+        out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
+        files: of nerfstudio: png holds 65.535 m at most, what is farther becomes unknown; npy all.
+        images: of colmap: the folder that its names of images count from, if not each one's own.
+        scale: units of the reconstruction a metre.
+    """
+    from depthpose.core.run import claim_folder
+    from depthpose.depth import exchange
+
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"--scale {scale:g}: units a metre are positive; 1 where metres are meant")
+    if images is not None and format != "colmap":
+        raise InputError(f"--images {images} is for --format colmap; leave it away")
+    settings = {"command": "data export-depth", "results": str(results.resolve()), "scale": scale}
+    if format == "colmap":
+        named = exchange.colmap_files(results, images)
+        claim_folder(out, {**settings, "format": format}, named.values())
+        _count(exchange.write_colmap(results, out, named, scale), len(named))
+        print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
+        return 0
+    named = exchange.nerfstudio_files(results, files)
+    told = exchange.nerfstudio_frames(out, named)
+    own = {**settings, "format": format, "files": files}
+    claim_folder(out, own, [*named.values(), exchange.TRANSFORMS_DEPTH])
+    lost = sum(_count(exchange.write_nerfstudio(results, out, named, scale), len(named)))
+    if told is not None:
+        exchange.write_transforms(out, told)
+    _say_nerfstudio(out, len(named), lost, is_told=told is not None)
+    return 0
+
+
+def _count(written: "Iterable[Any]", total: int) -> list[Any]:
+    from tqdm import tqdm
+
+    return list(tqdm(written, total=total, unit=" frames", leave=False, disable=None))
+
+
+def _say_nerfstudio(out: Path, frames: int, lost: int, *, is_told: bool) -> None:
+    beside = "transforms_depth.json names them" if is_told else "no transforms.json lies there"
+    print(f"{out}: depth of {frames} frames in depths; {beside}")
+    if lost:
+        print(
+            f"depthpose: {lost} pixels are beyond 65.535 m, which a PNG cannot hold, and are "
+            "unknown there; --files npy keeps them",
+            file=sys.stderr,
+        )

@@ -1,0 +1,158 @@
+"""``depthpose data rectify``."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from depthpose.core.camera import EpipolarResidual, RawCamera, RawPair, Rectifier
+
+_LOOKED_AT = 8
+"""Pairs that are rectified and measured before anything is written."""
+_WARN_PX, _REFUSE_PX = 0.5, 1.0
+_SIDES = ("left", "right")
+_ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
+
+
+def rectify(
+    left: tyro.conf.Positional[str],
+    right: tyro.conf.Positional[str],
+    camera: Path,
+    out: Path,
+    unit: Literal["m", "mm"] = "m",
+    fisheye: bool = False,
+    keep: float = 0.0,
+    check: bool = True,
+) -> int:
+    """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
+
+    Writes left/NAME.png, right/NAME.png and camera.json, the camera of the rectified pairs: OUT is
+    what 'depth match' and 'data check' take. Up to 8 pairs are looked at before anything is
+    written: how many rows matched features differ by is said (median and 95 %), warned of from
+    0.5 px on and refused from 1 px on. Needs the extra 'opencv'.
+
+        depthpose data rectify left.png right.png --camera stereo.yaml --out rectified
+        depthpose data rectify 'raw/cam0/*.png' 'raw/cam1/*.png' --camera camchain.yaml --out out
+        depthpose depth match rectified/left rectified/right --camera rectified/camera.json --out o
+
+    Args:
+        left: raw left image, a folder of them, or a quoted pattern such as 'left/*.png'.
+        right: raw right image, folder or pattern; images are paired in sorted order.
+        camera: calibration of both cameras: a camchain of Kalibr, a file of OpenCV's K1, D1, K2,
+            D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
+            with left.yaml and right.yaml of ROS.
+        out: folder for the results.
+        unit: of the translation between the cameras; mm where the board's squares were given so.
+        fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); the files of ROS and Kalibr say it.
+        keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
+        check: refuse what is swapped or differs by more than a row.
+    """
+    from tqdm import tqdm
+
+    from depthpose.cli.depth.matching import list_pairs
+    from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
+    from depthpose.core.files import image_size, write_image
+    from depthpose.core.run import claim_folder, claim_names
+
+    calibration = read_raw_pair(
+        camera, unit_m=0.001 if unit == "mm" else 1.0, is_fisheye=True if fisheye else None
+    )
+    lefts, rights = list_pairs(left, right)
+    _refuse_own_results(out, [*lefts, *rights])
+    rectifier = make_rectifier(calibration, image_size(lefts[0]), keep)
+    pairs = list(zip(lefts, rights, strict=True))
+    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=check)
+    claim_folder(out, _settings(calibration, keep), [*_SIDES, "camera.json"])
+    claim_names(out, {path.stem: path for path in lefts})
+    for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
+        for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
+            write_image(out / side / f"{first.stem}.png", image)
+    write_camera(out / "camera.json", rectifier.rig)
+    print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
+    return 0
+
+
+def _measure(rectifier: "Rectifier", pairs: list[tuple[Path, Path]]) -> "EpipolarResidual":
+    """Match features of some pairs, spread over all."""
+    import numpy as np
+
+    from depthpose.core.camera import epipolar_residual, match_features
+
+    count = min(_LOOKED_AT, len(pairs))
+    some = [pairs[k * len(pairs) // count] for k in range(count)]
+    return epipolar_residual(
+        np.concatenate([match_features(*_rectified(rectifier, *pair)) for pair in some])
+    )
+
+
+def _rectified(rectifier: "Rectifier", first: Path, second: Path) -> tuple["Tensor", "Tensor"]:
+    from depthpose.core.files import read_image
+
+    images = [read_image(path) for path in (first, second)]
+    for path, image in zip((first, second), images, strict=True):
+        rectifier.refuse_other_size(image, str(path))
+    return rectifier.rectify(*images)
+
+
+def _say_residual(found: "EpipolarResidual", rectifier: "Rectifier", *, is_refused: bool) -> None:
+    rig = rectifier.rig
+    print(
+        f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
+        f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
+    )
+    if not found.is_known:
+        _warn(f"only {found.matches} features match, so whether rows agree is not known")
+        return
+    said = (
+        f"epipolar residual: median {found.median_px:.2f} px, 95 % {found.p95_px:.2f} px "
+        f"({found.matches} matches)"
+    )
+    wrong = _what_is_wrong(found)
+    if wrong and is_refused:
+        raise InputError(f"{said}: {wrong}. Nothing was written (--no-check writes all the same)")
+    print(said)
+    if wrong or found.median_px > _WARN_PX:
+        _warn(wrong or f"the median is above {_WARN_PX:g} px, which costs depth far away; {_ASK}")
+
+
+def _what_is_wrong(found: "EpipolarResidual") -> str | None:
+    if found.is_swapped:
+        return "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
+    if found.median_px > _REFUSE_PX:
+        return (
+            f"rows differ by more than {_REFUSE_PX:g} px, so this is not the calibration of these "
+            f"images, or LEFT and RIGHT are exchanged; {_ASK}"
+        )
+    return None
+
+
+def _warn(said: str) -> None:
+    print(f"depthpose: {said}", file=sys.stderr)
+
+
+def _refuse_own_results(out: Path, files: list[Path]) -> None:
+    homes = {(out / side).resolve() for side in _SIDES}
+    if any(path.parent.resolve() in homes for path in files):
+        raise InputError(
+            f"--out {out}: the inputs lie in its left or right, where the results would be written "
+            "over them; choose another folder"
+        )
+
+
+def _settings(calibration: "RawPair", keep: float) -> dict[str, object]:
+    def lens(one: "RawCamera") -> dict[str, object]:
+        return {"K": one.K.tolist(), "D": list(one.distortion), "is_fisheye": one.is_fisheye}
+
+    return {
+        "command": "data rectify",
+        "left": lens(calibration.left),
+        "right": lens(calibration.right),
+        "right_from_left": calibration.right_from_left.matrix().tolist(),
+        "keep": keep,
+    }

@@ -1,0 +1,202 @@
+"""The work behind ``depthpose depth evaluate``."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth.page import frame_sections
+from depthpose.core.errors import InputError
+from depthpose.core.run import environment, find_shard, read_settings, wait_for
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
+from depthpose.depth.evaluate import PROTOCOLS, Evaluation, Protocol, evaluate, has_truth
+from depthpose.depth.predictions import is_finished, predict
+from depthpose.depth.types import StereoInput
+from depthpose.report.tables import Section, plain_table, write_page, write_table
+
+_SHOWN = ("method", "weights", "speed", "cap_m", "frames", "coverage", "abs_rel", "sq_rel", "rmse",
+          "rmse_log", "d1", "epe_px", "d1_all", "ause")  # fmt: skip
+"""Columns that are printed; the files hold all."""
+
+
+def open_frames(data: Path, split: str | None) -> Dataset:
+    """Open the dataset and say what it is."""
+    dataset = open_dataset(data, split)
+    print(f"{dataset.name}: {len(dataset)} frames, layout {dataset.layout}")
+    return dataset
+
+
+def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
+    """Predict every frame that has truth to compare with, and a right view if it is needed.
+
+    Where several processes run the command (``torchrun``, ``accelerate launch``), each predicts
+    its share, and the first goes on when the files of all are there.
+
+    Returns:
+        The folder of the predictions.
+    """
+    frames = list(enumerate(dataset.frames))
+    usable = [
+        i
+        for i, frame in frames
+        if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
+    ]
+    shard = find_shard()
+    mine = [usable[k] for k in shard.share(len(usable))]
+    names = [dataset.frames[i].name for i in mine]
+    readers = [partial(_read, dataset, i, method.with_right) for i in mine]
+    home = folder / method.name
+    written = predict(method.net, readers, names, home, method.settings)
+    for _ in tqdm(written, method.name, total=len(names), disable=None, unit=" frames"):
+        pass
+    if shard.rank == 0:
+        wait_for([dataset.frames[i].name for i in usable], partial(is_finished, home))
+    return home
+
+
+def open_training(folders: Sequence[Path], without: Sequence[str]) -> Dataset:
+    """Open the frames that a floor is fitted to."""
+    if not folders:
+        raise InputError("a floor is fitted to training frames: give --train FOLDER, or several.")
+    return join_datasets([open_dataset(folder) for folder in folders], without)
+
+
+def _read(dataset: Dataset, index: int, with_right: bool) -> StereoInput:
+    """Read an input; what a method must not see is not in it."""
+    pair = dataset.read_input(index)
+    return pair if with_right else replace(pair, right=None)
+
+
+def measure(
+    dataset: Dataset,
+    folders: Sequence[Path],
+    protocol: str,
+    caps_m: Sequence[float],
+    out: Path,
+    ready: Sequence[Evaluation] = (),
+) -> int:
+    """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print.
+
+    Rows that are ``ready`` stand below the others.
+    """
+    if find_shard().rank > 0:
+        return 0
+    each = measure_each(dataset, folders, protocol, caps_m)
+    measured = join([*each, *ready])
+    write_table(out, measured.rows)
+    write_details(measured, out)
+    page = out / "report.html"
+    sections = [
+        Section(title="Mean over frames", text=describe_protocol(protocol), rows=measured.rows),
+        *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
+        *detail_sections(measured),
+    ]
+    write_page(page, f"{protocol} on {dataset.name}", sections, environment())
+    print(plain_table(measured.rows, _SHOWN))
+    say_skipped(measured)
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
+    return 0
+
+
+def measure_all(
+    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
+) -> Evaluation:
+    """Measure several folders of predictions as one table; each row says whose it is."""
+    return join(measure_each(dataset, folders, protocol, caps_m))
+
+
+def measure_each(
+    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
+) -> list[Evaluation]:
+    """Measure folders of predictions one by one; each row says whose it is."""
+    found: list[Evaluation] = []
+    for folder in folders:
+        result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
+        found.append(signed(result, folder.name, read_settings(folder)))
+    return found
+
+
+def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+    """Let each row say whose predictions it is of.
+
+    Args:
+        result: of one set of predictions.
+        name: of their folder.
+        settings: that made them, where they are ours.
+    """
+    who = _describe(name, settings)
+    short = {column: who[column] for column in ("method", "sees", "weights")}
+    return Evaluation(
+        rows=[who | row for row in result.rows],
+        per_frame=[short | row for row in result.per_frame],
+        deciles=[short | row for row in result.deciles],
+        skipped=result.skipped,
+    )
+
+
+def join(each: Sequence[Evaluation]) -> Evaluation:
+    """Put the rows of several evaluations below each other."""
+    return Evaluation(
+        rows=[row for one in each for row in one.rows],
+        per_frame=[row for one in each for row in one.per_frame],
+        deciles=[row for one in each for row in one.deciles],
+        skipped={name: why for one in each for name, why in one.skipped.items()},
+    )
+
+
+def write_details(measured: Evaluation, out: Path) -> None:
+    """Write each frame's numbers, and the error by confidence where there is any."""
+    write_table(out, measured.per_frame, name="frames")
+    if measured.deciles:
+        write_table(out, measured.deciles, name="confidence")
+
+
+def detail_sections(measured: Evaluation) -> list[Section]:
+    """Make the parts of a page below its table."""
+    without_truth = [{"frame": name, "why": why} for name, why in measured.skipped.items()]
+    sections = [
+        Section(
+            title="Error by confidence",
+            text="Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)",
+            rows=measured.deciles,
+        ),
+        Section(title="Each frame", rows=measured.per_frame),
+        Section(title="Skipped frames", rows=without_truth),
+    ]
+    return [section for section in sections if section.rows]
+
+
+def describe_protocol(protocol: str) -> str:
+    """Say in a line how the numbers were measured."""
+    return f"{protocol}: {PROTOCOLS[protocol].summary}."
+
+
+def say_skipped(measured: Evaluation) -> None:
+    """Name the frames that do not count."""
+    for name, why in measured.skipped.items():
+        print(f"skipped: {name}: {why}", file=sys.stderr)
+    print(f"{len(measured.skipped)} frames skipped")
+
+
+def _show_progress(frames: Sequence[int]) -> Iterable[int]:
+    return tqdm(frames, unit=" frames", disable=None)
+
+
+def _describe(name: str, settings: dict[str, Any] | None) -> dict[str, Any]:
+    """Columns that say whose predictions these are."""
+    if settings is None:
+        return {"method": name, "sees": "", "speed": "", "weights": "", "weights_sha256": ""}
+    holes = {True: " (holes filled)", False: " (matched pixels)"}
+    suffix = holes.get(settings.get("with_filled_holes", ""), "")
+    return {
+        "method": settings.get("matcher", "") + suffix,
+        "sees": settings.get("sees", "both views"),
+        "speed": settings.get("speed", "") if settings.get("sees") != "left view" else "",
+        "weights": settings.get("weights", ""),
+        "weights_sha256": settings.get("weights_sha256", "")[:12],
+    }

@@ -1,0 +1,139 @@
+"""The work behind ``depthpose depth match``."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth.page import PAGE, write_depth_page
+from depthpose.core.camera import StereoRig, read_rig
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, list_images, read_image
+from depthpose.core.run import claim_folder, claim_names, find_shard
+from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
+from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Files of stereo pairs that share one rig."""
+
+    left: list[Path]
+    right: list[Path]
+    rig: StereoRig
+
+    @classmethod
+    def find(cls, left: str, right: str, camera: Path) -> "Pairs":
+        """List both sides, and refuse sides that cannot be paired."""
+        lefts, rights = list_pairs(left, right)
+        return cls(left=lefts, right=rights, rig=read_rig(camera, image_size(lefts[0])))
+
+    def read(self, index: int) -> StereoInput:
+        """Read one pair."""
+        return StereoInput(
+            name=self.left[index].stem,
+            left=read_image(self.left[index]),
+            right=read_image(self.right[index]),
+            camera=self.rig,
+        )
+
+
+def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
+    """List the images of both sides, which are paired in the order of their names.
+
+    Raises:
+        InputError: a side has none, the sides cannot be paired, or two results had one name.
+    """
+    lefts, rights = list_images(left), list_images(right)
+    if len(lefts) != len(rights):
+        raise InputError(
+            f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
+            "needs one right image. Remove the ones without a partner."
+        )
+    stems = [path.stem for path in lefts]
+    if len(set(stems)) != len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
+    return lefts, rights
+
+
+def refuse_unusable_first(pairs: Pairs) -> None:
+    """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    refuse_unrectified_pair(pairs.read(0))
+
+
+def refuse_unrectified_pair(pair: StereoInput) -> None:
+    """Refuse a pair that is swapped or not rectified, and name the option that takes it."""
+    try:
+        refuse_unrectified(pair)
+    except InputError as error:
+        raise InputError(f"{error} (--no-check matches them all the same.)") from error
+
+
+def say_tile_change(pairs: Pairs, method: Method) -> None:
+    """Print how far tiles move the disparity of the first pair from that of the whole image."""
+    pair = pairs.read(0)
+    assert pair.right is not None
+    assert isinstance(method.net, FakestereoNet)
+    assert isinstance(method.net.matcher, PSMNetMatcher)
+    change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
+    print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
+
+
+def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
+    """Match what is not finished; a pair that fails is named at the end and stops no other."""
+    rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
+    claim_folder(out, {**method.settings, "camera": rig}, [PAGE])
+    claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
+    failures: list[str] = []
+    mine = find_shard().share(len(pairs.left))
+    for index in tqdm(mine, unit=" pairs", disable=None):
+        name = pairs.left[index].stem
+        if is_finished(out, name) and (not with_cloud or has_cloud(out, name)):
+            continue
+        try:
+            pair = pairs.read(index)
+            estimate = method.net.estimate_pair(pair)
+        except InputError as error:
+            if len(pairs.left) == 1:
+                raise
+            failures.append(str(error))
+            continue
+        write_match(out, pair, estimate, with_cloud=with_cloud)
+    for failure in failures:
+        print(f"depthpose: failed: {failure}", file=sys.stderr)
+    print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
+    if find_shard().rank == 0:
+        _write_page(pairs, out, failures)
+    return 1 if failures else 0
+
+
+def write_match(out: Path, pair: StereoInput, estimate: DepthEstimate, *, with_cloud: bool) -> None:
+    """Write the files of a matched pair; the disparity comes last."""
+    if with_cloud:
+        write_estimate_cloud(out, pair, estimate)
+    write_estimate(out, pair, estimate)
+
+
+def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:
+    """Write the page of what is finished: other processes may still be at work."""
+    places = {path.stem: k for k, path in enumerate(pairs.left) if is_finished(out, path.stem)}
+
+    def read(names: Sequence[str]) -> Iterator[StereoInput]:
+        for name in names:
+            with suppress(InputError):
+                yield pairs.read(places[name])
+
+    write_depth_page(out, list(places), read, failures)

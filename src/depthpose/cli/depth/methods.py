@@ -1,0 +1,159 @@
+"""Methods by their words on the command line, with what decides their results."""
+
+import hashlib
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, cast, get_args
+
+from tqdm import tqdm
+
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.run import own_device
+from depthpose.depth.baselines import NearestImageFloor, RowDepthFloor
+from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig, Speed
+from depthpose.depth.datasets import Dataset
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.predictions import Estimator
+from depthpose.depth.stereo import with_usable_precision
+
+_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
+
+
+class Method(NamedTuple):
+    """An estimator, what to call it, and the JSON values that decide its results.
+
+    ``with_right`` says whether it is shown the real right view.
+    """
+
+    name: str
+    net: Estimator
+    settings: dict[str, Any]
+    with_right: bool = True
+
+
+def weights_method(
+    weights: str,
+    config: MatcherConfig,
+    *,
+    with_right: bool | None = None,
+    matcher: str = "psmnet",
+    with_unlike: bool = True,
+    answer: Answer | None = None,
+) -> Method:
+    """Build the network of a weights file, given by its path or by name.
+
+    Args:
+        weights: the file; what it holds decides what is built.
+        config: how the matcher runs.
+        with_right: show it the real right view; by default only to a matcher, which needs it.
+        matcher: what matches the drawn view: psmnet (the weights' own), sgbm (OpenCV's), or that
+            of other weights, by name or file.
+        with_unlike: answer images unlike what the weights know too, as a measurement must.
+        answer: where depth of one image comes from, in place of what the weights say.
+
+    Raises:
+        InputError: a matcher alone is asked to do without the right view, or weights without a
+            matcher to look at it.
+    """
+    config = with_usable_precision(config)  # what is computed in is what is recorded
+    path = find_weights(weights)
+    kind = read_checkpoint(path).kind
+    is_shown = kind == "psmnet" if with_right is None else with_right
+    if kind == "psmnet" and not is_shown:
+        raise InputError(
+            f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
+            "synthesise the right view."
+        )
+    facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
+    if kind != "psmnet":
+        facts["sees"] = "both views" if is_shown else "left view"
+    if matcher == "sgbm":
+        facts["matcher"] += " with sgbm"
+        sgbm = SGBMConfig(with_filled_holes=True)
+        net = FakestereoNet.load(
+            path, matcher="sgbm", config=sgbm, answer="matched", with_unlike=with_unlike
+        )
+        return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
+    config = replace(config, device=own_device(config.device))
+    if matcher != "psmnet":
+        other = find_weights(matcher)
+        facts["matcher"] += f" with {other.stem}"
+        facts["matcher_sha256"] = file_sha256(other)
+        net = FakestereoNet.load(
+            path, matcher=other, config=config, answer="matched", with_unlike=with_unlike
+        )
+        name = f"{path.stem}-{other.stem}"
+        return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+    net = FakestereoNet.load(path, config=config, answer=answer, with_unlike=with_unlike)
+    if is_shown and net.matcher is None:
+        raise InputError(
+            f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
+            "weights with one, or sgbm."
+        )
+    name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
+    if answer is not None:
+        facts["answer"] = answer
+        name += f"-{answer}"
+    return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+
+
+def named_method(word: str, config: MatcherConfig) -> Method:
+    """Build the method of a word: weights by file or name, perhaps with ``both:`` and the like.
+
+    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
+    ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.
+    """
+    how, _, name = word.rpartition(":")
+    if how in get_args(Answer):
+        return weights_method(name, config, with_right=False, answer=cast("Answer", how))
+    if how == "both":
+        return weights_method(name, config, with_right=True)
+    if how in get_args(Speed):
+        method = weights_method(name, replace(config, speed=how), with_right=True)
+        return method._replace(name=f"{method.name}-{how}")
+    if how == "sgbm":
+        return weights_method(name, config, with_right=False, matcher="sgbm")
+    return weights_method(word, config)
+
+
+def sgbm_method(*, with_filled_holes: bool) -> Method:
+    """OpenCV's StereoSGBM with the settings of our tables."""
+    config = SGBMConfig(with_filled_holes=with_filled_holes)
+    net = FakestereoNet.load(matcher="sgbm", config=config)
+    name = "sgbm-filled" if with_filled_holes else "sgbm"
+    return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
+
+
+def floor_method(name: FloorName, training: Dataset) -> Method:
+    """Fit a floor to the truth of training frames."""
+    kinds = {"rows": RowDepthFloor, "nearest": NearestImageFloor}
+    names = "\n".join(frame.name for frame in training.frames)
+    settings = {
+        "matcher": f"floor: {name}",
+        "sees": "left view" if name == "nearest" else "no image",
+        "train": training.name,
+        "train_frames": len(training),
+        "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
+    }
+
+    def show(frames: Sequence[int]) -> Iterable[int]:
+        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
+
+    return Method(f"floor-{name}", kinds[name].fit(training, show), settings, with_right=False)
+
+
+def parse_bytes(text: str | None) -> int | None:
+    """Read a size such as ``1GB``, ``800MB`` or ``1500000`` (bytes); decimal units.
+
+    Raises:
+        InputError: not a number with such a unit.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMG]?B)?\s*", text, re.IGNORECASE)
+    if found is None:
+        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB or 800MB.")
+    return int(float(found[1]) * _UNITS[(found[2] or "").upper()])

@@ -1,0 +1,106 @@
+"""The pages of ``depthpose depth predict``, ``match`` and ``evaluate``."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from depthpose.core.run import environment
+from depthpose.depth.datasets import Dataset
+from depthpose.depth.evaluate import PROTOCOLS, frame_result
+from depthpose.depth.predictions import COLOR_RANGE_M, read_estimate
+from depthpose.depth.types import StereoInput
+from depthpose.report.choose import MOST_VIEWS, choose_ranked, share_views, spread_evenly
+from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.tables import Section, write_page
+
+PAGE = "report.html"
+_SAID_ABOVE = ("method", "sees", "weights", "protocol", "dataset")
+
+
+def write_depth_page(
+    out: Path,
+    names: Sequence[str],
+    read: Callable[[Sequence[str]], Iterator[StereoInput]],
+    failures: Sequence[str],
+    range_m: tuple[float, float] = COLOR_RANGE_M,
+) -> None:
+    """Write a page of some of the depth maps that a folder holds, and of what failed.
+
+    Args:
+        out: the folder.
+        names: of all that are there.
+        read: gives what some of them were made of, as far as that can still be read.
+        failures: why others are not there, a sentence each.
+        range_m: metres of the brightest and the darkest colour.
+    """
+    chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
+    pairs = list(read(chosen))
+    which = "all" if len(pairs) == len(names) else "spread evenly"
+    text = f"Shown: {len(pairs)} of {_count(len(names), 'depth map')} in this folder ({which})."
+    failed = [{"not estimated, because": reason} for reason in failures]
+    sections = [Section(title="What is here", text=text, rows=failed)]
+    for pair in pairs:
+        estimate = read_estimate(out, pair.name, pair.camera)
+        shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)
+        sections.append(depth_section(pair.name, shown))
+    page = out / PAGE
+    write_page(page, f"Depth of {_count(len(names), 'image')}", sections, environment())
+    print(f"the page: {page}")
+
+
+def frame_sections(
+    dataset: Dataset,
+    folders: Sequence[Path],
+    rows: Sequence[Sequence[dict[str, Any]]],
+    protocol: str,
+) -> list[Section]:
+    """Show the worst, the median and the best frame of each set of predictions.
+
+    Args:
+        dataset: as it was measured.
+        folders: of the predictions.
+        rows: of each folder's frames, as they were measured.
+        protocol: by which.
+    """
+    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
+    sections: list[Section] = []
+    for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
+        cap_m = of_folder[0].get("cap_m")
+        of_cap = [row for row in of_folder if row.get("cap_m") == cap_m]
+        column = "epe_px" if cap_m is None else "abs_rel"
+        for role, k in choose_ranked([row[column] for row in of_cap], most):
+            row = of_cap[k]
+            text = (
+                f"The {role} of {_count(len(of_cap), 'frame')} by {column}: "
+                f"{row[column]:.4f}{'' if cap_m is None else f', truth up to {cap_m:g} m'}."
+            )
+            title = f"{folder.name}: {row['frame']}, {role}"
+            index = places[row["frame"]]
+            section = _frame_section(dataset, index, folder, (protocol, cap_m), title, text)
+            own = {name: value for name, value in row.items() if name not in _SAID_ABOVE}
+            sections.append(replace(section, rows=[own]))
+    return sections
+
+
+def _frame_section(
+    dataset: Dataset,
+    index: int,
+    folder: Path,
+    how: tuple[str, float | None],
+    title: str,
+    text: str,
+) -> Section:
+    protocol, cap_m = how
+    found = frame_result(dataset, index, folder, protocol, cap_m)
+    error = DepthError(
+        error=found.error,
+        is_disparity=PROTOCOLS[protocol].truth == "disparity",
+        true_depth_m=found.true_depth_m,
+    )
+    pair = dataset.read_input(index)
+    return depth_section(title, DepthShown(pair=pair, estimate=found.estimate, error=error), text)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

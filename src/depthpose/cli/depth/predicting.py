@@ -1,0 +1,267 @@
+"""The work behind ``depthpose depth predict``."""
+
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+from tqdm import tqdm
+
+from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth.page import PAGE, write_depth_page
+from depthpose.core.camera import Camera, StereoRig, centred_camera, read_camera
+from depthpose.core.draw import draw_depth
+from depthpose.core.errors import InputError
+from depthpose.core.files import (
+    VIDEO_SUFFIXES,
+    image_size,
+    list_images,
+    read_image,
+    read_map,
+    read_video,
+    write_video,
+)
+from depthpose.core.run import claim_folder, claim_names, find_shard, refuse_among_inputs
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.predictions import (
+    ENDINGS,
+    has_cloud,
+    is_finished,
+    write_estimate,
+    write_estimate_cloud,
+)
+from depthpose.depth.types import StereoInput
+from depthpose.report.viewer import Viewer, open_viewer
+
+_VIDEO = ".color.mp4"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """What is known of the camera: all of it, or its focal length alone."""
+
+    camera: Camera | None
+    focal_px: float | None
+
+    def camera_of(self, image: Tensor) -> Camera:
+        """Make the camera of an image."""
+        if self.camera is not None:
+            return self.camera
+        assert self.focal_px is not None
+        return centred_camera((image.shape[2], image.shape[1]), self.focal_px)
+
+    def facts(self) -> dict[str, Any]:
+        """Give what is known as JSON values: it decides the results."""
+        return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """Which pictures and clouds are written beside the maps, and how many images go together."""
+
+    range_m: tuple[float, float]
+    with_cloud: bool
+    batch: int
+
+
+def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
+    """Read what the user knows of the camera; where its file says no size, that of an image.
+
+    Raises:
+        InputError: neither of the two is given, or both.
+    """
+    if (camera is None) == (focal_px is None):
+        raise InputError(
+            "metres from one image need its focal length: give --camera FILE, or --focal-px "
+            "(a phone's main camera has about 0.75 times the image's width)."
+        )
+    if focal_px is not None and not 1 < focal_px < 1e6:
+        raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
+    read = None if camera is None else read_camera(camera, _size_of(first))
+    if isinstance(read, StereoRig):
+        print("the camera's baseline is not looked at: one image has none", file=sys.stderr)
+    return Lens(camera=read, focal_px=focal_px)
+
+
+def find_sources(words: Sequence[str], out: Path) -> list[Path]:
+    """List images and videos.
+
+    Raises:
+        InputError: nothing there, two inputs whose results would have one name, or a folder of
+            inputs that is ``out`` too.
+    """
+    found: list[Path] = []
+    for word in words:
+        found += [Path(word)] if _is_video(Path(word)) else list_images(word)
+    stems = [path.stem for path in found]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
+    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in found
+              if _is_video(path) for stem in stems]  # fmt: skip
+    if (frame := next(filter(None, frames), None)) is not None:
+        raise InputError(
+            f"an input is called {frame[0]!r}, as a frame of a video would be, and so would their "
+            "results; rename one of the two"
+        )
+    refuse_among_inputs(out, words, found)
+    return found
+
+
+def predict_all(
+    sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
+) -> int:
+    """Predict what is not finished; an image that fails is named and stops no other."""
+    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
+    claim_folder(out, settings, [PAGE])
+    videos = [source.stem for source in sources if _is_video(source)]
+    endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
+    claim_names(out, {source.stem: source for source in sources}, endings, videos)
+    mine = [sources[k] for k in find_shard().share(len(sources))]
+    assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
+    with open_viewer(None if find_shard().rank else view) as viewer:
+        predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
+        images = {path.stem: path for path in mine if not _is_video(path)}
+        done = predictor.predict_images(images)
+        for path in filter(_is_video, mine):
+            done += predictor.predict_video(path)
+    failures = list(predictor.failures.values())
+    if failures and len(sources) == 1:
+        raise failures[0]
+    for failure in failures:
+        print(f"depthpose: failed: {failure}", file=sys.stderr)
+    print(f"{done} depth maps are in {out}")
+    if find_shard().rank == 0:
+        _write_page(sources, lens, out, look, [str(failure) for failure in failures])
+    return 1 if failures else 0
+
+
+def _write_page(
+    sources: list[Path], lens: Lens, out: Path, look: Look, failures: list[str]
+) -> None:
+    """Write the page of what is finished: other processes may still be at work."""
+    done = {source: _finished_names(source, out) for source in sources}
+
+    def read(names: Sequence[str]) -> Iterator[StereoInput]:
+        for source in sources:
+            wanted = [name for name in done[source] if name in names]
+            with suppress(InputError):
+                for name, image in _read_some(source, wanted):
+                    camera = lens.camera_of(image)
+                    yield StereoInput(name=name, left=image, right=None, camera=camera)
+
+    write_depth_page(out, [n for some in done.values() for n in some], read, failures, look.range_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictor:
+    """Images in, files out; what fails is remembered in ``failures``, by its name."""
+
+    lens: Lens
+    net: FakestereoNet
+    out: Path
+    look: Look
+    viewer: Viewer | None = None
+    failures: dict[str, InputError] = field(default_factory=dict)
+
+    def predict_images(self, sources: Mapping[str, Path]) -> int:
+        """Predict images, each with the name of its results; give how many are done."""
+        return len(self._predict(self._read(sources), len(sources), "images"))
+
+    def predict_video(self, source: Path) -> int:
+        """Predict a video's frames, and make a video of them; give how many are done."""
+        try:
+            video = read_video(source)
+            names = self._predict(iter(video), video.frames or None, source.name)
+            colors = _colors(names, self.out, self.look)
+            write_video(self.out / f"{source.stem}{_VIDEO}", colors, video.fps)
+        except InputError as error:
+            self.failures[source.name] = error
+            return 0
+        return len(names)
+
+    def _read(self, sources: Mapping[str, Path]) -> Iterator[tuple[str, Tensor]]:
+        for name, source in sources.items():
+            try:
+                yield name, read_image(source)
+            except InputError as error:
+                self.failures[name] = error
+
+    def _predict(
+        self, frames: Iterator[tuple[str, Tensor]], total: int | None, what: str
+    ) -> list[str]:
+        done: list[str] = []
+        with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:
+            while chunk := list(islice(frames, self.look.batch)):
+                done += self._predict_chunk([self._input(*frame) for frame in chunk])
+                bar.update(len(chunk))
+        return done
+
+    def _input(self, name: str, image: Tensor) -> StereoInput:
+        return StereoInput(name=name, left=image, right=None, camera=self.lens.camera_of(image))
+
+    def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
+        """Predict inputs together; where one of them is unusable, each alone."""
+        wanted = [given for given in inputs if not self._is_finished(given.name)]
+        try:
+            found = self.net.estimate_many(wanted)
+            for given, estimate in zip(wanted, found, strict=True):
+                if self.look.with_cloud:
+                    write_estimate_cloud(self.out, given, estimate)
+                write_estimate(self.out, given, estimate, self.look.range_m)
+                if estimate.warning:
+                    tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
+                if self.viewer is not None:
+                    self.viewer.show_depth(given, estimate)
+        except InputError as error:
+            if len(inputs) > 1:
+                return [name for given in inputs for name in self._predict_chunk([given])]
+            self.failures[inputs[0].name] = error
+            return []
+        return [given.name for given in inputs]
+
+    def _is_finished(self, name: str) -> bool:
+        is_drawn = not self.look.with_cloud or has_cloud(self.out, name)
+        return is_drawn and is_finished(self.out, name)
+
+
+def _size_of(source: Path) -> tuple[int, int]:
+    if not _is_video(source):
+        return image_size(source)
+    _, frame = next(iter(read_video(source)))
+    return frame.shape[2], frame.shape[1]
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def _finished_names(source: Path, out: Path) -> list[str]:
+    """List what is finished of an image, or of a video's frames."""
+    if not _is_video(source):
+        return [source.stem] if is_finished(out, source.stem) else []
+    frame = re.compile(re.escape(source.stem) + r"_\d{6}\.disparity_px\.npy")
+    found = sorted(path.name for path in out.iterdir() if frame.fullmatch(path.name))
+    return [name.removesuffix(".disparity_px.npy") for name in found]
+
+
+def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tensor]]:
+    """Read an image again, or some frames of a video, no further than to the last of them."""
+    if wanted and not _is_video(source):
+        yield source.stem, read_image(source)
+    elif wanted:
+        for name, image in read_video(source):
+            if name in wanted:
+                yield name, image
+            if name == wanted[-1]:
+                return
+
+
+def _colors(names: list[str], out: Path, look: Look) -> Iterator[Tensor]:
+    for name in names:
+        yield draw_depth(read_map(out / f"{name}.depth_m.npy"), *look.range_m)

@@ -1,0 +1,146 @@
+"""``depthpose depth train view|select|stereo|finetune``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from depthpose.cli.training import changed, progress_bar, say_trained
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+
+_LOOKED_AT = 20
+"""Held-out pairs of a folder, where nothing else is said."""
+
+
+def train(
+    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
+    out: Path,
+    config: Path | None = None,
+    data: tuple[str, ...] = (),
+    held_out: tuple[str, ...] = (),
+    generator: str | None = None,
+    matcher: str | None = None,
+    start: str | None = None,
+    encoder: str | None = None,
+    steps: int | None = None,
+    seed: int | None = None,
+    device: Literal["auto", "cpu"] | None = None,
+    precision: Literal["fp32", "bf16", "fp16"] | None = None,
+    resume: bool = False,
+    finish: bool = False,
+    view: str | None = None,
+) -> int:
+    """Train a generator, the matcher, or the first through the second, by stages.
+
+        view      the thesis's generator, which paints the right view; needs pairs
+        select    a generator that looks the right view up in the left image, and answers depth
+                  itself; needs pairs with truth
+        stereo    the matcher; needs pairs with truth
+        finetune  either generator through the frozen matcher; needs weights of both
+
+    A config holds every knob; the words below change what they name. The run folder keeps config,
+    metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
+    stopped the training, and ends with the weights of a run that nothing stopped. Several GPUs or
+    machines: 'accelerate launch -m depthpose depth train ...'.
+
+        depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
+
+    Args:
+        stage: what is trained: view, select, stereo or finetune.
+        out: the run folder.
+        config: YAML with what differs from the thesis's settings.
+        data: folders of pairs; they replace the config's.
+        held_out: folders of pairs that validation looks at, and none of which is learnt from; of
+            each 20, evenly taken, where the config says no other number.
+        generator: finetune: weights of the generator to begin with.
+        matcher: finetune: what matches the drawn view: weights with a matcher, by name or file,
+            which are not changed.
+        start: view, select, stereo: weights to begin with.
+        encoder: select: weights of the encoder to begin with, of 'depthpose weights import
+            efficientnet-lite0'.
+        steps: optimiser steps in place of the config's length.
+        seed: decides initial weights, order, augmentation and dropout.
+        device: auto takes what accelerate finds; cpu takes no GPU.
+        precision: arithmetic of the forward pass.
+        resume: go on from the state that OUT holds.
+        finish: make weights and card of the state that OUT holds, without another step; Ctrl-C
+            twice does the same while it trains.
+        view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
+    """
+    from depthpose.core.config import read_config
+    from depthpose.core.run import find_shard
+    from depthpose.depth.config import PairsConfig
+    from depthpose.depth.train import STAGES, Run
+
+    kind, run_stage = STAGES[stage]
+    chosen = kind() if config is None else read_config(config, kind)
+    loop = changed(chosen.loop, seed=seed, device=device, precision=precision)
+    if steps is not None:
+        loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    pairs = changed(chosen.pairs, folders=data or None)
+    if held_out:
+        looked_at = chosen.held_out or PairsConfig(
+            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
+        )
+        chosen = dataclasses.replace(
+            chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
+        )
+    words = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
+    knobs = {field.name: field.type for field in dataclasses.fields(kind)}
+    for word, value in words.items():
+        if value is not None and (
+            word not in knobs or (word in ("generator", "matcher") and stage != "finetune")
+        ):
+            raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
+    chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
+    with progress_bar(view) as on_step:
+        path = run_stage(chosen, Run(folder=out, resume=resume, finish=finish, on_step=on_step))
+    if find_shard().rank == 0:
+        say_trained(path)
+    return 0
+
+
+def calibrate(
+    weights: tyro.conf.Positional[str],
+    data: list[Path],
+    out: Path,
+    alarm_share: float = 0.01,
+    split: str | None = None,
+    device: str = "cpu",
+) -> int:
+    """Choose when one image is refused as unlike what weights know.
+
+    Their mean confidence is measured on images that they shall know; what lies below that of all
+    but a share of these is refused by 'depth predict'. Tensors stay as they are.
+
+        depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
+
+    Args:
+        weights: weights with a generator that selects, by name or file.
+        data: folders of such images: KITTI raw, object, 2012/2015, or plain folders of pairs.
+        out: the file of the calibrated weights.
+        alarm_share: share of these images that may be refused.
+        split: name or file of a split, for the first folder.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.run import refuse_to_replace
+    from depthpose.depth import unlike
+    from depthpose.depth.datasets import join_datasets, open_dataset
+    from depthpose.depth.estimator import FakestereoNet
+
+    refuse_to_replace(out)
+    path = find_weights(weights)
+    parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
+    dataset = join_datasets(parts)
+    net = FakestereoNet.load(path, config=MatcherConfig(device=device), with_unlike=True)
+    shown = tqdm(range(len(dataset)), unit=" images", disable=None)
+    known = unlike.measure_familiarity(net, map(dataset.read_input, shown))
+    least = unlike.calibrate(path, known, alarm_share, out)
+    print(f"{len(known)} images: mean confidence {min(known):.3f} to {max(known):.3f}")
+    print(f"refused below {least:.3f}; calibrated weights: {out}")
+    return 0

@@ -1,0 +1,117 @@
+"""Words of a command's ``--help``: what belongs into the place of a value, and what holds without.
+
+Types become words (``{None}|PATH`` is PATH), and a default that is nothing is not shown.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
+from difflib import get_close_matches
+from inspect import signature, unwrap
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+
+from depthpose.core.errors import InputError
+from depthpose.core.hub import find_weights, is_on_hub
+
+PATHS = frozenset({
+    *("images", "left", "right", "camera", "cloud", "depth", "mask", "bop", "data", "held_out"),
+    *("train", "evaluation", "path", "config", "cad", "csv", "predictions", "targets", "file"),
+    *("models", "kitti", "linemod", "results"),
+})  # fmt: skip
+"""Arguments of commands that name files or folders that are read."""
+WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})
+"""Arguments that name weights, by name or file."""
+_WORDS = ("psmnet", "sgbm", "nothing", "open3d")
+"""What they may say in place of weights."""
+_PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
+"""Before the name of weights: how they are used."""
+
+
+def refuse_missing(given: Mapping[str, object]) -> None:
+    """Refuse what a command would look for in vain.
+
+    Args:
+        given: the arguments of a command by name.
+
+    Raises:
+        InputError: a path or weights that are not there.
+    """
+    for name, value in given.items():
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if name in PATHS and isinstance(one, str | Path):
+                _refuse_path(str(one))
+            elif name in WEIGHTS and isinstance(one, str):
+                _refuse_weights(one)
+
+
+def _refuse_path(path: str) -> None:
+    if any(mark in path for mark in ("://", "*", "?", "[", "{")) or Path(path).exists():
+        return
+    wanted = Path(path)
+    beside = [p.name for p in wanted.parent.iterdir()] if wanted.parent.is_dir() else []
+    near = get_close_matches(wanted.name, beside, n=1)
+    hint = f"; did you mean {str(wanted.parent / near[0])!r}?" if near else "; check the path"
+    raise InputError(f"{path}: there is no such file or folder{hint}")
+
+
+def _refuse_weights(name: str) -> None:
+    for prefix in _PREFIXES:
+        name = name.removeprefix(prefix)
+    if name not in _WORDS and not is_on_hub(name):
+        find_weights(name)
+
+
+_OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+_OF_NAMES = {"max_memory": "SIZE", "device": "DEVICE", "view": "live|FILE.rrd", "out": "PATH"}
+_NOTHING = ("", "None")
+
+
+def in_words(metavar: str | None) -> Any:  # noqa: ANN401  tyro's own object
+    """Show an option with this in the place of its value; None: as tyro does."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint)
+
+
+def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Let a function that stands for a command look like it to tyro, with each option in words.
+
+    Groups of options, which are dataclasses, have words of their own.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    shape = signature(command)
+    for name, parameter in shape.parameters.items():
+        if not is_dataclass(parameter.default):
+            hints[name] = Annotated[hints[name], in_words(_metavar(name, hints[name]))]
+    worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
+
+    def dress(given: Callable[..., int]) -> Callable[..., int]:
+        function = unwrap(given)  # tyro looks behind what checks types in tests, and so do we
+        function.__doc__, function.__module__ = command.__doc__, command.__module__
+        function.__annotations__ = hints
+        vars(function)["__signature__"] = shape.replace(parameters=worded)
+        return function
+
+    return dress
+
+
+def _hint(default: str) -> str:
+    return "" if default in _NOTHING else f"(default: {default})"
+
+
+def _metavar(name: str, hint: Any) -> str | None:  # noqa: ANN401
+    """Name a value; None where tyro's own name will do: of positional arguments and flags."""
+    if get_origin(hint) is Annotated:
+        return None
+    if get_origin(hint) in (Union, UnionType):
+        (hint,) = (part for part in get_args(hint) if part is not NoneType)
+    if get_origin(hint) is Literal:
+        return f"{{{','.join(map(str, get_args(hint)))}}}"
+    if get_origin(hint) in (tuple, list):
+        parts = get_args(hint)
+        one = _metavar(name, parts[0])
+        return one and (f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([one] * len(parts)))
+    if hint is str and name in (*PATHS, *_OF_NAMES):
+        return _OF_NAMES.get(name, "PATH")
+    return "NAME|FILE" if hint is str and name in WEIGHTS else _OF_TYPES.get(hint)

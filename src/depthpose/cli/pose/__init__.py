@@ -1,0 +1,1 @@
+"""``depthpose pose ...``."""

@@ -1,0 +1,280 @@
+"""The work behind ``depthpose pose predict --engine ray``."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
+from depthpose.cli.pose.inputs import CLOUDS, bop_jobs, input_job, known_objects, object_named
+from depthpose.cli.pose.masks import find_masks
+from depthpose.cli.pose.methods import PoseMethod, pose_methods
+from depthpose.cli.pose.page import write_pose_page
+from depthpose.cli.pose.predicting import claim_bop, estimate_jobs, say_result, write_bop_files
+from depthpose.core.camera import Camera, read_camera
+from depthpose.core.config import config_to_dict
+from depthpose.core.engine import (
+    Done,
+    Files,
+    Function,
+    Item,
+    Job,
+    Sample,
+    is_url,
+    run_job,
+    shard_results,
+    stem,
+)
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, write_json
+from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.datasets import BopDataset, open_bop
+from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.predictions import Job as PoseJob
+from depthpose.pose.predictions import (
+    Prediction,
+    is_finished,
+    parse_prediction,
+    prediction_row,
+    write_predictions,
+)
+from depthpose.pose.types import PoseEstimate
+
+CLOUD_FILES = Files(roles=("cloud",), suffixes=CLOUDS)
+VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+ENDING = "pose.json"
+"""Of the one file of a result: an entry of ``poses.json``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseWork:
+    """Clouds, or depth images and masks, to poses or the reasons for none."""
+
+    weights: Weights
+    config: EstimateConfig
+    object: str
+    unit: Unit | None
+    camera: Camera | None
+    files: Files
+    batch: int
+    endings: Sequence[str] = (ENDING,)
+
+    def start(self) -> Function:
+        """Build the network."""
+        with self.weights.unpacked() as path:
+            (method,) = pose_methods([path], self.config)
+        return partial(_predict, method, self)
+
+
+def predict(
+    words: Sequence[str],
+    files: Files,
+    work: PoseWork,
+    camera: Path | None,
+    out: str,
+    options: EngineOptions,
+) -> int:
+    """Pose by an engine.
+
+    Args:
+        words: clouds, or depth images and masks, manifests or tar shards.
+        files: what an input is made of.
+        work: without the camera, and with the object that the user named.
+        camera: file of the depth images' camera.
+        out: folder of the results.
+        options: of the engine.
+    """
+    inputs = Inputs.find(words, files)
+    _refuse_other_masks(words, inputs)
+    with work.weights.unpacked() as path:
+        (method,) = pose_methods([path], replace(work.config, device="cpu"))
+    name = object_named(work.object or None, method)
+    known = None
+    with inputs.first() as first:
+        if camera is not None:
+            known = read_camera(camera, image_size(first[0]))
+    facts = {} if known is None else {"K": known.K.tolist()}
+    settings = {
+        **method.settings,
+        "estimate": config_to_dict(work.config),
+        "object": name,
+        "unit": work.unit,
+        **facts,
+    }
+    job = Job(
+        work=replace(work, object=name, camera=known),
+        items=inputs.items,
+        tars=inputs.tars,
+        out=out,
+        settings=settings,
+        form=options.shards,
+        block=options.block,
+    )
+    return run(job, options, "inputs")
+
+
+def _refuse_other_masks(words: Sequence[str], inputs: Inputs) -> None:
+    """Refuse two folders whose files are not called alike; one manifest pairs as it likes."""
+    for item in inputs.items if len(words) == 2 else ():
+        depth, mask = map(stem, item.files)
+        if depth != mask and len(inputs.items) > 1:
+            raise InputError(
+                f"{words[1]}: no mask called {depth!r}; the mask of a depth image bears its name"
+            )
+
+
+def _predict(method: PoseMethod, work: PoseWork, samples: Sequence[Sample], out: Path) -> list[str]:
+    jobs = [input_job(s.name, work.object, partial(_read, work, s)) for s in samples]
+    reasons: list[str] = []
+    for estimate in estimate_jobs(method, jobs):
+        prediction = Prediction(estimate=estimate)
+        write_json(out / f"{estimate.name}.{ENDING}", prediction_row(prediction))
+        reasons.append("" if is_finished(prediction) else estimate.reason)
+    return reasons
+
+
+def _read(work: PoseWork, sample: Sample) -> AnyInput:
+    if work.camera is None:
+        return cloud_input(sample.files[0], work.unit or "m", work.object, sample.name)
+    depth, mask = sample.files
+    return view_input(depth, mask, work.camera, work.object, sample.name, work.unit)
+
+
+NO_FILES = Files(roles=(), suffixes=())
+
+
+@dataclass(frozen=True, kw_only=True)
+class BopWork:
+    """Objects of a data set, by their names, to poses or the reasons for none.
+
+    Attributes:
+        folder: of the data set, which all workers see.
+        split: of it.
+        masks: ``truth``, ``predicted`` or a file of detections, which all workers see.
+        objects: numbers of the objects that the weights know.
+    """
+
+    weights: Weights
+    config: EstimateConfig
+    folder: str
+    split: str
+    masks: str
+    objects: tuple[int, ...]
+    batch: int
+    files: Files = NO_FILES
+    endings: Sequence[str] = (ENDING,)
+
+    def start(self) -> Function:
+        """Build the network and open the data set."""
+        with self.weights.unpacked() as path:
+            (method,) = pose_methods([path], self.config)
+        jobs = bop_jobs(*self.open(), method)
+        return partial(_predict_instances, method, {job.name: job for job in jobs})
+
+    def open(self) -> tuple[BopDataset, Any]:
+        """Give the data set and its masks."""
+        dataset = open_bop(Path(self.folder), self.split).of_objects(*self.objects)
+        return dataset, find_masks([self.masks], dataset, Path())[0]
+
+
+def predict_bop(
+    given: tuple[Path, str, str],
+    weights: Weights,
+    config: EstimateConfig,
+    batch: int,
+    out: str,
+    options: EngineOptions,
+) -> int:
+    """Pose the objects of a data set by an engine.
+
+    Args:
+        given: folder, split and masks of the data set.
+        weights: of a pose network.
+        config: of the estimator.
+        batch: inputs in one call of the network.
+        out: folder of the results.
+        options: of the engine.
+
+    Raises:
+        InputError: ``out`` is in a store, or the masks are yet to be found by a segmentation.
+    """
+    folder, split, masks = given
+    _refuse_what_is_not_shared(masks, out)
+    with weights.unpacked() as path:
+        (method,) = pose_methods([path], replace(config, device="cpu"))
+    work = BopWork(
+        weights=weights,
+        config=config,
+        folder=str(folder.resolve()),
+        split=split,
+        masks=masks if masks in ("truth", "predicted") else str(Path(masks).resolve()),
+        objects=tuple(known_objects(open_bop(folder, split), method)),
+        batch=batch,
+    )
+    dataset, shown = work.open()
+    jobs = bop_jobs(dataset, shown, method)
+    facts = {"dataset": folder.resolve().name, "split": split, "masks": shown.name}
+    settings = {**method.settings, "estimate": config_to_dict(config), **facts}
+    settings = {**settings, **shown.settings, "shards": options.shards}
+    claim_bop(Path(out), settings, dataset)
+    job = Job(
+        work=work,
+        items=[Item(one.name, ()) for one in jobs],
+        out=out,
+        settings=settings,
+        form=options.shards,
+        block=options.block,
+    )
+    predictions = _gather(run_job(job, options.build()), out, jobs)
+    write_predictions(Path(out), predictions)
+    write_bop_files(predictions, dataset, Path(out), method)
+    write_pose_page(Path(out), predictions, jobs, method, dataset)
+    return say_result(predictions, Path(out))
+
+
+def _refuse_what_is_not_shared(masks: str, out: str) -> None:
+    if is_url(out):
+        raise InputError(
+            f"--out {out}: poses of a data set come together in poses.json and BOP's csv, which "
+            "need a disk; give a folder, and copy it"
+        )
+    if masks not in ("truth", "predicted") and not masks.endswith(".json"):
+        raise InputError(
+            f"--masks {masks}: workers take masks that are there already; give truth, predicted, "
+            "or a file of BOP detections, such as 'pose evaluate --masks WEIGHTS' leaves"
+        )
+
+
+def _predict_instances(
+    method: PoseMethod, jobs: Mapping[str, PoseJob[Any]], samples: Sequence[Sample], out: Path
+) -> list[str]:
+    wanted = [jobs[sample.name] for sample in samples]
+    reasons: list[str] = []
+    for job, estimate in zip(wanted, estimate_jobs(method, wanted), strict=True):
+        spent = {**job.seconds, **estimate.seconds}
+        prediction = Prediction(estimate=replace(estimate, seconds=spent), place=job.place)
+        write_json(out / f"{job.name}.{ENDING}", prediction_row(prediction))
+        reasons.append("" if is_finished(prediction) else estimate.reason)
+    return reasons
+
+
+def _gather(every: Sequence[Done], out: str, jobs: Sequence[PoseJob[Any]]) -> list[Prediction]:
+    """Read all shards, in the order of the jobs."""
+    found: dict[str, Prediction] = {}
+    failed: dict[str, str] = {}
+    for done in every:
+        failed |= dict(done.failures)
+        for name, files in shard_results(out, done):
+            row = json.loads(files[ENDING])
+            found[name] = parse_prediction(row, f"{done.shard}: {name}")
+    return [found.get(job.name) or _unread(job, failed[job.name]) for job in jobs]
+
+
+def _unread(job: PoseJob[Any], reason: str) -> Prediction:
+    given = job.read()
+    estimate = PoseEstimate(name=job.name, object=given.object, status="unreadable", reason=reason)
+    return Prediction(estimate=estimate, place=job.place)

@@ -1,0 +1,189 @@
+"""The work behind ``depthpose pose evaluate``."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.pose.masks import distinct_names, of_dataset
+from depthpose.cli.pose.page import instance_sections
+from depthpose.core.checkpoint import file_sha256
+from depthpose.core.errors import InputError
+from depthpose.core.run import environment, read_settings
+from depthpose.pose.config import EvaluationConfig
+from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
+from depthpose.pose.evaluate import Evaluation, evaluate, of_targets, read_any
+from depthpose.report.tables import Section, plain_table, write_page, write_table
+
+HOW = (
+    "Success: ADD (ADD-S of a symmetric object) below 10 % of the diameter. Refused: no answer, or "
+    "no estimate at all; wrong: an answer that is no success. Both stay in every number. AUC: area "
+    "to 10 cm. ar, ar_vsd, ar_mssd, ar_mspd: BOP's average recalls. The row 'mean' counts each "
+    "object the same, 'all' each instance, as BOP does."
+)
+_SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",
+          "rotation_deg_median", "translation_m_median")  # fmt: skip
+"""Columns that are printed; the files hold all."""
+
+
+def open_instances(
+    bop: Path, split: str, objects: Sequence[str], targets: Path | None
+) -> BopDataset:
+    """Open what is to be measured, and say what it is."""
+    dataset = open_bop(bop, split)
+    if targets is not None:
+        dataset = of_targets(dataset, read_targets(targets))
+    if objects:
+        dataset = dataset.of_objects(*(int(o) if o.isdecimal() else o for o in objects))
+    names = ", ".join(model.name for model in dataset.objects.values())
+    print(f"{bop} {split}: {len(dataset)} instances, layout {dataset.layout}; objects: {names}")
+    return dataset
+
+
+def measure_all(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
+) -> Evaluation:
+    """Measure several folders or csv files of predictions as one table."""
+    return join(measure_each(dataset, predictions, config))
+
+
+def measure_each(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
+) -> list[Evaluation]:
+    """Measure folders or csv files of predictions one by one; each row says whose it is."""
+    found: list[Evaluation] = []
+    for path, who in zip(predictions, describe(predictions), strict=True):
+        _refuse_others(path, dataset)
+        result = evaluate(dataset, read_any(path), config, _show_progress)
+        short = {"method": who["method"], "masks": who["masks"]}
+        found.append(
+            Evaluation(
+                rows=[who | row for row in result.rows],
+                per_instance=[short | row for row in result.per_instance],
+                risk=[short | row for row in result.risk],
+            )
+        )
+    return found
+
+
+def join(each: Sequence[Evaluation]) -> Evaluation:
+    """Put the rows of several evaluations below each other."""
+    return Evaluation(
+        rows=[row for one in each for row in one.rows],
+        per_instance=[row for one in each for row in one.per_instance],
+        risk=[row for one in each for row in one.risk],
+    )
+
+
+def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
+    """Give columns that say whose predictions each of these are.
+
+    Methods of one name that lie in two folders are two, and bear the folders' names too.
+
+    Raises:
+        InputError: predictions are given twice.
+    """
+    found = [_describe_one(path) for path in predictions]
+    homes = [path.resolve().parent for path in predictions]
+    rows = Counter(
+        (home, who["method"], who["masks"]) for home, who in zip(homes, found, strict=True)
+    )
+    twice = [key for key, count in rows.items() if count > 1]
+    if twice:
+        home, method, masks = twice[0]
+        raise InputError(
+            f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their rows "
+            "would be one; give one of them, or rename it"
+        )
+    own = list({(home, who["method"]): None for home, who in zip(homes, found, strict=True)})
+    names = dict(zip(own, distinct_names(own), strict=True))
+    return [
+        {**who, "method": names[home, who["method"]]}
+        for home, who in zip(homes, found, strict=True)
+    ]
+
+
+def _refuse_others(path: Path, dataset: BopDataset) -> None:
+    """Refuse predictions whose record says that they are of another data set or split."""
+    settings = (read_settings(path) if path.is_dir() else None) or {}
+    for what, own in of_dataset(dataset).items():
+        theirs = settings.get(what, own)
+        if theirs != own:
+            raise InputError(
+                f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
+                f"those of this very {what}, or measure that one"
+            )
+
+
+def _describe_one(path: Path) -> dict[str, Any]:
+    settings = read_settings(path) if path.is_dir() else None
+    if settings is None:
+        # A file of others is its own fingerprint.
+        sha256 = "" if path.is_dir() else file_sha256(path)[:12]
+        return {"method": path.stem, "masks": "", "weights": "", "weights_sha256": sha256}
+    masks = settings.get("masks", "")
+    return {
+        "method": path.name.removesuffix(f"_{masks}"),
+        "masks": masks,
+        "weights": settings.get("weights", ""),
+        "weights_sha256": settings.get("weights_sha256", "")[:12],
+    }
+
+
+def success_by_masks(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Set the successes with each kind of masks side by side, a row a method and object."""
+    table: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        place = (row["method"], row["object"])
+        entry = table.setdefault(place, {"method": row["method"], "object": row["object"]})
+        entry[f"{row['masks'] or 'their'} masks"] = row["success"]
+    return list(table.values())
+
+
+def measure(
+    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
+) -> int:
+    """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
+    each = measure_each(dataset, predictions, config)
+    measured = join(each)
+    write_table(out, measured.rows)
+    write_details(measured, out)
+    sections = [
+        Section(title="Success by masks", text=HOW, rows=success_by_masks(measured.rows)),
+        Section(title="All numbers", rows=measured.rows),
+        *instance_sections(dataset, predictions, [one.per_instance for one in each]),
+        *detail_sections(measured),
+    ]
+    page = out / "report.html"
+    title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
+    write_page(page, title, sections, environment())
+    print(plain_table(measured.rows, _SHOWN))
+    print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
+    return 0
+
+
+def write_details(measured: Evaluation, out: Path) -> None:
+    """Write each instance's numbers, and the risk by coverage."""
+    write_table(out, measured.per_instance, name="instances")
+    if measured.risk:
+        write_table(out, measured.risk, name="risk")
+
+
+def detail_sections(measured: Evaluation) -> list[Section]:
+    """Make the parts of a page below its tables."""
+    failed = [row for row in measured.per_instance if not row["is_success"]]
+    sections = [
+        Section(
+            title="Risk by coverage",
+            text="How many answers are wrong if only the surest are given.",
+            rows=measured.risk,
+        ),
+        Section(title="Each instance that is no success", rows=failed),
+    ]
+    return [section for section in sections if section.rows]
+
+
+def _show_progress(instances: Sequence[Instance]) -> Iterable[Instance]:
+    return tqdm(instances, unit=" instances", disable=None)

@@ -1,0 +1,78 @@
+"""``depthpose pose predict`` of depth images without masks."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.pose.inputs import Unreadable
+from depthpose.cli.pose.methods import PoseMethod
+from depthpose.cli.pose.page import write_pose_page
+from depthpose.cli.pose.predicting import claim, say_result, write_files
+from depthpose.core.errors import InputError
+from depthpose.core.files import list_images
+from depthpose.core.run import find_shard, refuse_among_inputs
+from depthpose.pose.config import Unit
+from depthpose.pose.estimator.find import explained_mask, nothing_found
+from depthpose.pose.estimator.given import view_input
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.predictions import Job, Prediction, write_predictions
+from depthpose.pose.types import PoseEstimate, ViewInput
+
+
+def find_all(
+    method: PoseMethod,
+    depth: Path,
+    camera: Path,
+    objects: tuple[str, ...],
+    unit: Unit | None,
+    out: Path,
+) -> int:
+    """Find objects in every depth image, write the files of each, and give the exit code.
+
+    What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
+    entry, NAME, that says so.
+
+    Raises:
+        InputError: weights that take no clouds, several processes, or two images of one name.
+    """
+    if method.find is None:
+        raise InputError("--depth without --mask: these weights look at masked views; give --mask")
+    if find_shard().world > 1:
+        raise InputError("--depth without --mask is done by one process; give --mask, or start one")
+    depths = list_images(depth)
+    refuse_among_inputs(out, [depth], depths)
+    settings: dict[str, Any] = {**method.settings, "find": sorted(objects)}
+    settings |= {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
+    claim(out, settings, [], depth)
+    predictions: list[Prediction] = []
+    jobs: list[Job[Any]] = []
+    for path in tqdm(depths, disable=None, unit=" images"):
+        view = view_input(path, None, camera, objects[0], path.stem, unit)
+        for estimate in method.find(view, objects) or [
+            nothing_found(view.name, ", ".join(objects))
+        ]:
+            predictions.append(Prediction(estimate=estimate))
+            jobs.append(explained_job(Job(name=path.stem, read=lambda v=view: v), estimate, method))
+    claim(out, settings, jobs, depth)
+    write_predictions(out, predictions)
+    shown = [k for k, p in enumerate(predictions) if p.estimate.is_ok]
+    answers, own = [predictions[k] for k in shown], [jobs[k] for k in shown]
+    write_files(answers, own, out, method)
+    write_pose_page(out, answers, own, method)
+    return say_result(predictions, out)
+
+
+def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
+    """Take what was found in a whole depth image as if a mask had shown it."""
+    model = next((m for m in method.models if m.name == estimate.object), None)
+
+    def read() -> AnyInput | Unreadable:
+        view, pose = job.read(), estimate.camera_from_model
+        if model is None or pose is None or not isinstance(view, ViewInput):
+            return view
+        mask = explained_mask(view, pose, model)
+        return replace(view, name=estimate.name, mask=mask, object=model.name)
+
+    return replace(job, name=estimate.name, read=read)

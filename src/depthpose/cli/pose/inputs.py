@@ -1,0 +1,182 @@
+"""What ``depthpose pose predict`` is given: clouds, depth images, data sets, as jobs."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from depthpose.cli.pose.masks import Masks
+from depthpose.cli.pose.methods import PoseMethod, match_names
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import list_images
+from depthpose.core.run import refuse_among_inputs
+from depthpose.pose.config import Unit
+from depthpose.pose.datasets import BopDataset
+from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.predictions import Job, Place
+
+CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unreadable:
+    """An input that could not be read, in the place of what it would have been."""
+
+    name: str
+    object: str
+    reason: str
+
+
+def object_named(name: str | None, method: PoseMethod) -> str:
+    """Give the object that is meant.
+
+    Raises:
+        InputError: none of that name, or several and none is named.
+    """
+    known = [model.name for model in method.models]
+    if name is None and len(known) > 1:
+        raise InputError(f"the weights know {', '.join(known)}; say which by --object")
+    if name is not None and name not in known:
+        raise InputError(
+            f"--object {name}: the weights do not know it; {nearest_name(name, known)}"
+        )
+    return known[0] if name is None else name
+
+
+def cloud_jobs(word: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
+    """Take a cloud, or every one of a folder.
+
+    Raises:
+        InputError: there is none, two of one name, or the folder is ``out`` too.
+    """
+    if word.is_dir():
+        files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
+    else:
+        files = [word]
+    if not files:
+        raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
+    _refuse_one_name(files)
+    refuse_among_inputs(out, [word], files)
+    return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+
+
+def view_jobs(
+    given: tuple[Path, Path, Path], object: str, unit: Unit | None, out: Path
+) -> list[Job[Any]]:
+    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
+
+    Raises:
+        InputError: there is none, two have one name, a depth image has no mask, or a folder is
+            ``out`` too.
+    """
+    depth, mask, camera = given
+    depths, pictures = list_images(depth), _list_masks(mask)
+    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
+    _refuse_one_name(depths)
+    _refuse_one_name(pictures)
+    masks = {path.stem: path for path in pictures}
+    if len(depths) == len(masks) == 1 and not depth.is_dir():
+        masks = {depths[0].stem: next(iter(masks.values()))}
+    lost = [path.stem for path in depths if path.stem not in masks]
+    if lost:
+        raise InputError(
+            f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
+        )
+    return [
+        input_job(
+            p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit)
+        )
+        for p in depths
+    ]
+
+
+def frame_jobs(
+    depth: Path, camera: Path, object: str, unit: Unit | None, out: Path
+) -> list[Job[Any]]:
+    """Take whole depth images, without masks.
+
+    Raises:
+        InputError: there is none, two have one name, or the folder is ``out`` too.
+    """
+    depths = list_images(depth)
+    refuse_among_inputs(out, [depth], depths)
+    _refuse_one_name(depths)
+    return [
+        input_job(p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit))
+        for p in depths
+    ]
+
+
+def _list_masks(mask: Path) -> list[Path]:
+    """List mask pictures, or files of run lengths where there are such."""
+    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []
+    return runs or list_images(mask)
+
+
+def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
+    """Number the objects of a data set that the weights know; say which are left out.
+
+    Raises:
+        InputError: they know none.
+    """
+    numbers = {model.number for model in method.models}
+    words = {model.name for model in method.models}
+    there = sorted({instance.object_id for instance in dataset.instances})
+    known = [n for n in there if n in numbers or dataset.objects[n].name in words]
+    left = sorted(set(there) - set(known))
+    if not known:
+        raise InputError(
+            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(words)}; "
+            "give weights of its objects"
+        )
+    if left:
+        print(f"left out, as the weights do not know them: objects {left}", file=sys.stderr)
+    return known
+
+
+def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:
+    """Take the instances of a data set by some masks.
+
+    Raises:
+        InputError: the weights do not know an object of it.
+    """
+    names = match_names(dataset, method.models)
+    jobs = masks.jobs(names)
+    return [_safe(job, names[job.place.object_id]) for job in jobs if job.place is not None]
+
+
+def input_job(
+    name: str,
+    object: str,
+    read: Any,  # noqa: ANN401  any reader
+    place: Place | None = None,
+) -> Job[Any]:
+    """Take one input; one that cannot be read stops no other."""
+    return _safe(Job(name=name, read=read, place=place), object)
+
+
+def _safe(job: Job[Any], object: str) -> Job[Any]:
+    """Let an input that cannot be read stop no other."""
+
+    def read() -> AnyInput | Unreadable:
+        try:
+            return job.read()
+        except InputError as error:
+            return Unreadable(name=job.name, object=object, reason=str(error))
+
+    return replace(job, read=read)
+
+
+def _refuse_one_name(files: Sequence[Path]) -> None:
+    """Results bear the names of their inputs, without the suffix."""
+    first: dict[str, Path] = {}
+    for path in files:
+        other = first.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
+                "results; rename one, or move it to another folder"
+            )

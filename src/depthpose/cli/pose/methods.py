@@ -1,0 +1,154 @@
+"""Methods of the pose room by their words, and what they predict of a data set."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.pose.masks import Masks, distinct_names, of_dataset
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.datasets import BopDataset
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.predictions import (
+    predict,
+    read_predictions,
+    results_name,
+    write_bop_results,
+)
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.weights import read_pose_weights
+
+REGISTRATION = "open3d"
+"""The word for Open3D's features, RANSAC and ICP, where weights are named."""
+_SAME_DIAMETER = 0.05
+
+EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseMethod:
+    """An estimator, what to call it, the objects it knows, and what decides its results.
+
+    Attributes:
+        takes_clouds: whether it can do without a depth image.
+        find: gives the poses of named objects in a view without a mask; None: it cannot.
+        track: follows a named object through frames; None: it cannot.
+    """
+
+    name: str
+    estimate_many: EstimateMany
+    takes_clouds: bool
+    models: Sequence[ObjectModel]
+    settings: Mapping[str, Any]
+    find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
+    track: Callable[[Iterable[AnyInput], str], Iterator[PoseEstimate]] | None = None
+
+
+def pose_methods(
+    words: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
+) -> list[PoseMethod]:
+    """Build the estimators of weights files of any kinds, given by their paths or by names.
+
+    Files of one name are told apart by the folders that they lie in.
+
+    Args:
+        words: paths or names; the word ``open3d`` is registration, which has no weights.
+        config: of the estimators that have weights.
+        models: what registration looks for.
+
+    Raises:
+        InputError: there are no such weights, they pose nothing, or are given twice.
+        MissingExtraError: registration is asked for, and Open3D is not installed.
+    """
+    paths = [None if word == REGISTRATION else find_weights(word) for word in words]
+    names = distinct_names([(p.parent, p.stem) if p else (None, REGISTRATION) for p in paths])
+    return [
+        _method(path, name, config) if path else _registration(name, models)
+        for path, name in zip(paths, names, strict=True)
+    ]
+
+
+def _registration(name: str, models: Sequence[ObjectModel]) -> PoseMethod:
+    if not models:
+        raise InputError(
+            f"{REGISTRATION}: it looks for the models of a data set; give --bop to 'pose evaluate'"
+        )
+    return PoseMethod(
+        name=name,
+        estimate_many=FpfhEstimator(models).estimate_many,
+        takes_clouds=False,
+        models=models,
+        settings={"kind": "registration", "fpfh": config_to_dict(FpfhConfig())},
+    )
+
+
+def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+    found = read_pose_weights(path)
+    say_terms(found.facts)
+    is_regressor = isinstance(found.network, DepthImageNet)
+    net = DepthImageRegressor(found, config) if is_regressor else GeoPoseNet(found, config)
+    suffix = "" if config.voting.method == "ransac" else "-least-squares"
+    suffix += "" if config.with_icp else "-without-icp"
+    facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
+    facts |= {"weights_sha256": file_sha256(path)}
+    return PoseMethod(
+        name=name + suffix,
+        estimate_many=net.estimate_many,
+        takes_clouds=not is_regressor,
+        models=found.models,
+        settings={**facts, "estimate": config_to_dict(config)},
+        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
+        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
+    )
+
+
+def predict_all(
+    dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
+) -> Path:
+    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv.
+
+    Returns:
+        The folder of the predictions.
+    """
+    jobs = masks.jobs(match_names(dataset, method.models))
+    home = out / "predictions" / f"{method.name}_{masks.name}"
+    settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
+    written = predict(method.estimate_many, jobs, home, settings, batch)
+    label = f"{method.name}, {masks.name} masks"
+    for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
+        pass
+    write_bop_results(home / results_name(dataset), read_predictions(home))
+    return home
+
+
+def match_names(dataset: BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
+    """Find what a method calls each object of a data set: by its name, else by its number.
+
+    Raises:
+        InputError: the method does not know an object, or means another one of that number.
+    """
+    by_name = {model.name: model for model in models}
+    by_number = {model.number: model for model in models}
+    names: dict[int, str] = {}
+    for number, own in dataset.objects.items():
+        model = by_name.get(own.name) or by_number.get(number)
+        if model is None:
+            known = ", ".join(f"{m.name} ({m.number})" for m in models)
+            raise InputError(
+                f"object {number} ({own.name}) is none of those the weights know: {known}. Leave "
+                "it out by --objects"
+            )
+        if abs(model.diameter_m / own.diameter_m - 1) > _SAME_DIAMETER:
+            raise InputError(
+                f"object {number} ({own.name}) is {own.diameter_m:.4f} m across, but the weights' "
+                f"{model.name} is {model.diameter_m:.4f} m: another object, or another unit"
+            )
+        names[number] = model.name
+    return names

@@ -1,0 +1,61 @@
+"""``depthpose pose track``."""
+
+from pathlib import Path
+
+from depthpose.core.errors import InputError
+from depthpose.pose.config import EstimateConfig, Unit
+
+
+def track(
+    out: Path,
+    weights: str = "parts",
+    depth: Path | None = None,
+    camera: Path | None = None,
+    cloud: Path | None = None,
+    bop: Path | None = None,
+    split: str = "test",
+    object: str | None = None,
+    unit: Unit | None = None,
+    device: str = "cpu",
+) -> int:
+    """Follow a known object through depth images, clouds or the scenes of a data set.
+
+    Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
+    contradicts the pose the object is looked for anew in that frame; where it is not found either,
+    the frame is lost, and the next is searched. poses.json says of each frame which of the three it
+    was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
+    their names, and a rerun begins anew.
+
+        depthpose pose track --depth frames --camera cam.json --object mug --out out
+        depthpose pose track --bop lm --split test --weights linemod.safetensors --out out
+
+    Args:
+        out: folder for the results.
+        weights: of a pose network, by name or file ('depthpose weights list').
+        depth: folder of 16-bit PNG files, whole images without masks.
+        camera: of the depth images; a JSON file, as for 'pose predict'.
+        cloud: folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of
+            what is about it too. A lost object is found in clouds of it alone.
+        bop: folder of a data set in BOP's layout; every object of each scene is followed that the
+            weights know, or --object alone.
+        split: of the data set.
+        object: which of the objects that the weights know.
+        unit: of the clouds, metres by default; of depth images, where their camera says none.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from depthpose.cli.pose.methods import pose_methods
+    from depthpose.cli.pose.tracking import track_bop, track_folder
+    from depthpose.core.run import find_shard
+
+    if sum(given is not None for given in (depth, cloud, bop)) != 1:
+        raise InputError("give one of --depth with --camera, --cloud and --bop")
+    if depth is not None and camera is None:
+        raise InputError("--depth needs --camera beside it")
+    if find_shard().world > 1:
+        raise InputError("a sequence is followed by one process; start one")
+    (method,) = pose_methods([weights], EstimateConfig(device=device))
+    if method.track is None:
+        raise InputError(f"--weights {weights}: these look at masked views; give weights that vote")
+    if bop is not None:
+        return track_bop(method, (bop, split, object), out)
+    return track_folder(method, (depth, camera, cloud), object, unit, out)

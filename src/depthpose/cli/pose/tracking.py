@@ -1,0 +1,130 @@
+"""The work behind ``depthpose pose track``: one object through the frames of a sequence."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from depthpose.cli.pose import inputs, predicting
+from depthpose.cli.pose.finding import explained_job
+from depthpose.cli.pose.inputs import Unreadable
+from depthpose.cli.pose.methods import PoseMethod, match_names
+from depthpose.cli.pose.page import write_pose_page
+from depthpose.core.files import read_depth_png
+from depthpose.pose.config import Unit
+from depthpose.pose.datasets import BopDataset, Instance, open_bop
+from depthpose.pose.predictions import Job, Prediction, place_of, write_predictions
+from depthpose.pose.types import PoseEstimate, ViewInput
+
+
+def track_folder(
+    method: PoseMethod,
+    given: tuple[Path | None, Path | None, Path | None],
+    object: str | None,
+    unit: Unit | None,
+    out: Path,
+) -> int:
+    """Follow one object through depth images with a camera, or clouds; give the exit code."""
+    depth, camera, cloud = given
+    name = inputs.object_named(object, method)
+    settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
+    if cloud is not None:
+        jobs = inputs.cloud_jobs(cloud, unit or "m", name, out)
+    else:
+        assert depth is not None
+        assert camera is not None
+        jobs = inputs.frame_jobs(depth, camera, name, unit, out)
+        settings |= {"camera": str(camera.resolve())}
+    predicting.claim(out, settings, jobs, cloud or depth or out)
+    predictions = list(_followed(method, jobs, name))
+    write_predictions(out, predictions)
+    shown = _shown(predictions, jobs, method)
+    predicting.write_files(predictions, shown, out, method)
+    write_pose_page(out, predictions, shown, method)
+    return _say(predictions, out)
+
+
+def track_bop(method: PoseMethod, given: tuple[Path, str, str | None], out: Path) -> int:
+    """Follow each known object of each scene, or one; give the exit code."""
+    folder, split, object = given
+    dataset = open_bop(folder, split)
+    wanted = inputs.known_objects(dataset, method) if object is None else [object]
+    dataset = dataset.of_objects(*wanted)
+    names = match_names(dataset, method.models)
+    about = {"dataset": dataset.folder.resolve().name, "split": split}
+    settings = {**method.settings, **about, "track": sorted(names.values())}
+    predicting.claim_bop(out, settings, dataset)
+    predictions: list[Prediction] = []
+    jobs: list[Job[Any]] = []
+    for name, own in _sequences(dataset, names):
+        predictions += _followed(method, own, name)
+        jobs += own
+    write_predictions(out, predictions)
+    predicting.write_bop_files(predictions, dataset, out, method)
+    write_pose_page(out, predictions, _shown(predictions, jobs, method), method, dataset)
+    return _say(predictions, out)
+
+
+def _sequences(dataset: BopDataset, names: dict[int, str]) -> Iterator[tuple[str, list[Job[Any]]]]:
+    """Give the frames of each object of each scene, in the order of their images."""
+    frames: dict[tuple[int, int], dict[int, Instance]] = {}
+    for one in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
+        frames.setdefault((one.scene_id, one.object_id), {}).setdefault(one.image_id, one)
+    for (_, number), images in sorted(frames.items()):
+        name = names[number]
+        yield name, [_frame_job(one, name) for one in images.values()]
+
+
+def _frame_job(one: Instance, name: str) -> Job[Any]:
+    return inputs.input_job(one.name, name, partial(_whole_view, one, name), place_of(one))
+
+
+def _whole_view(instance: Instance, name: str) -> ViewInput:
+    """Give the depth image of an instance without its mask."""
+    depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
+    return ViewInput(
+        name=instance.name,
+        depth_m=depth_m,
+        mask=torch.ones_like(depth_m, dtype=torch.bool),
+        K=instance.K,
+        object=name,
+    )
+
+
+def _followed(method: PoseMethod, jobs: Sequence[Job[Any]], name: str) -> Iterator[Prediction]:
+    """Follow an object; a frame that cannot be read is passed by."""
+    lost: dict[str, PoseEstimate] = {}
+
+    def readable() -> Iterator[Any]:
+        for job in tqdm(jobs, disable=None, unit=" frames"):
+            given = job.read()
+            if isinstance(given, Unreadable):
+                lost[job.name] = predicting.unread(given)
+            else:
+                yield given
+
+    assert method.track is not None
+    found = {estimate.name: estimate for estimate in method.track(readable(), name)}
+    for job in jobs:
+        estimate = found.get(job.name) or lost[job.name]
+        yield Prediction(estimate=estimate, place=job.place)
+
+
+def _shown(
+    predictions: Sequence[Prediction], jobs: Sequence[Job[Any]], method: PoseMethod
+) -> list[Job[Any]]:
+    """Give of each frame what the pose explains."""
+    pairs = zip(predictions, jobs, strict=True)
+    return [explained_job(job, prediction.estimate, method) for prediction, job in pairs]
+
+
+def _say(predictions: list[Prediction], out: Path) -> int:
+    """Print what became of the frames beside what 'pose predict' says."""
+    code = predicting.say_result(predictions, out)
+    kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
+    print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
+    return code

@@ -1,0 +1,131 @@
+"""``depthpose reproduce`` and ``depthpose figure``."""
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+
+TableNumber = Literal["2.1", "2.2", "2.3"]
+FigureNumber = Literal["2-1", "2-5"]
+
+
+def reproduce(
+    table: tyro.conf.Positional[TableNumber],
+    kitti: Path,
+    out: Path,
+    weights: tuple[str, ...] = (),
+    matcher: Literal["sgbm"] | None = None,
+    beside: tuple[str, ...] = ("default",),
+    train: tuple[Path, ...] = (),
+    train_without: tuple[str, ...] = (),
+    protocol: str = "eigen-raw",
+    cap: tuple[float, ...] = (80.0, 50.0),
+    split: str = "eigen-test",
+    pictures: int = 3,
+    device: str = "cpu",
+    precision: Literal["fp32", "bf16"] = "fp32",
+    max_memory: str | None = None,
+) -> int:
+    """Make a table of the thesis again, from data on disk to published rows, ours and difference.
+
+    2.1: depth from one image. 2.2: depth from the real stereo pair. 2.3: depth from one image
+    without and with fine-tuning: give two weights, in this order. Writes rows.json, rows.csv,
+    table.md, report.md and report.html (with the frames of figures 2-1 and 2-5), and says protocol,
+    weights, settings and environment. A rerun measures without predicting anew.
+
+        depthpose reproduce 2.1 --kitti /data/kitti --weights apart.safetensors --out out/table-2.1
+
+    Args:
+        table: number in the thesis.
+        kitti: KITTI raw with LiDAR; or any folder that 'depth evaluate' takes, with --split all.
+        out: folder for all that is written.
+        weights: weights files; 2.2 takes a stereo matcher's too.
+        matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
+        beside: tables 2.1 and 2.3: weights of another method, a row each beside the thesis's; by
+            default those that ship, whose generator selects. '--beside' without a name: none.
+        train: training folders: adds the two floors (best depth of each row, nearest image).
+        train_without: names of training frames to keep out.
+        protocol: how prediction and truth are compared; eigen-raw is the thesis's.
+        cap: metres beyond which truth does not count.
+        split: eigen-test (697 frames), another split, a file of frames, or 'all' that is there.
+        pictures: how many frames the page shows.
+        device: cpu, cuda, cuda:1, ...
+        precision: fp32 or bf16.
+        max_memory: bound on the memory of activations, such as 1GB.
+    """
+    from depthpose.cli.depth import evaluating, methods
+    from depthpose.cli.thesis import depth_tables as reproducing
+    from depthpose.depth.evaluate import find_protocol
+    from depthpose.thesis.depth_tables import find_table
+
+    published = find_table(table)
+    rule = find_protocol(protocol)
+    if rule.truth == "disparity":
+        raise InputError(f"--protocol {protocol}: measures disparity, and the tables hold depth.")
+    reproducing.refuse_wrong_count(published, weights, matcher)
+    dataset = evaluating.open_frames(kitti, None if split == "all" else split)
+    memory = methods.parse_bytes(max_memory)
+    config = MatcherConfig(device=device, precision=precision, max_memory_bytes=memory)
+    chosen = reproducing.own_methods(published, weights, matcher, config)
+    names = {method.name for _, method in chosen}
+    if not published.with_right:
+        others = [methods.weights_method(name, config, with_right=False) for name in beside]
+        chosen += [("", other) for other in others if other.name not in names]
+    if train:
+        training = evaluating.open_training(train, train_without)
+        floors = [methods.floor_method(name, training) for name in ("rows", "nearest")]
+        # A floor looks at no right view, but is measured on the frames of the other rows.
+        chosen += [("", floor._replace(with_right=published.with_right)) for floor in floors]
+    order = reproducing.Order(
+        table=published,
+        dataset=dataset,
+        protocol=protocol,
+        caps_m=cap,
+        pictures=pictures,
+    )
+    return reproducing.reproduce_table(order, chosen, out)
+
+
+def figure(
+    figure: tyro.conf.Positional[FigureNumber],
+    kitti: Path,
+    weights: str,
+    out: Path,
+    frames: tuple[str, ...] = (),
+    number: int | None = None,
+    split: str | None = None,
+    device: str = "cpu",
+    max_memory: str | None = None,
+) -> int:
+    """Draw a figure of the thesis from your frames and weights.
+
+    2-1, one frame: left, real right, synthesised right, depth from left and synthesised right,
+    depth from the real pair, LiDAR. 2-5, a column a frame: left, real right, predicted depth,
+    predicted right, LiDAR. Colours mean the same metres in every panel. Writes figure-2-1.png or
+    figure-2-5.png, and report.html with each panel and its caption.
+
+        depthpose figure 2-5 --kitti /data/kitti --weights W.safetensors --out out/figure-2-5
+
+    Args:
+        figure: number in the thesis.
+        kitti: KITTI raw, or any folder of pairs.
+        weights: weights that synthesise the right view (2-5 takes a stereo matcher's too).
+        out: folder for the figure.
+        frames: names of frames; by default some from all over the folder.
+        number: how many frames where none is named: 1 for figure 2-1 and 4 for 2-5.
+        split: choose among the frames of a split, such as eigen-test.
+        device: cpu, cuda, cuda:1, ...
+        max_memory: bound on the memory of activations, such as 1GB.
+    """
+    from depthpose.cli.depth import evaluating, methods
+    from depthpose.cli.thesis import depth_tables as reproducing
+
+    dataset = evaluating.open_frames(kitti, split)
+    count = number or (1 if figure == "2-1" else 4)
+    chosen = reproducing.choose_frames(dataset, frames, count)
+    config = MatcherConfig(device=device, max_memory_bytes=methods.parse_bytes(max_memory))
+    method = methods.weights_method(weights, config, with_right=False if figure == "2-1" else None)
+    return reproducing.write_figure(figure, dataset, chosen, method, out)

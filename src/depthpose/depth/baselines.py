@@ -1,0 +1,190 @@
+"""What can be said without looking closely: two floors that every method must stay above.
+
+A street scene seen from a car is mostly road below and far things above, so one depth a row is far
+from a bad guess, and the depth of the training image that looks most alike is a better one. What a
+network scores above these two is what it has learnt to see.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.nn import functional as F
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image
+from depthpose.depth.datasets import Dataset, known_truths, read_known_depth, shrink
+from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+_CANONICAL_FOCAL_PX = 721.5377
+"""Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
+_ROWS = 1443
+_NEAR_M, _FAR_M, _STEPS = 1.0, 80.0, 4096
+
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
+class RowDepthFloor:
+    """The best constant depth of each image row: it sees the camera and not the image.
+
+    A row is counted by its slope ``(v - cy) / fy``, not by its number: the road at one slope is
+    equally far in every camera of one mounting height, whatever its focal length or crop.
+
+    Attributes:
+        depth_m: one depth a row of the canonical camera, the principal point in the middle.
+    """
+
+    def __init__(self, depth_m: Float64[np.ndarray, " rows"]) -> None:
+        self.depth_m = depth_m
+
+    @classmethod
+    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "RowDepthFloor":
+        """Find for each row the constant c that minimises the mean of ``|c - t| / t``.
+
+        That is the median of the true depths t weighted by 1 / t (nearest first, where half of the
+        weight is reached). Each frame counts the same. Depths are counted in steps of 0.1 %, so
+        that any number of frames fits in memory. Rows without truth get what lies between their
+        neighbours, in inverse depth, and beyond the last row with truth its value.
+
+        Raises:
+            InputError: no frame has both truth and a rig.
+        """
+        weight = np.zeros((_ROWS, _STEPS))
+        for index in progress(range(len(dataset))):
+            known_m, rig = read_known_depth(dataset, index), dataset.read_rig(index)
+            if known_m is not None and rig is not None:
+                weight += _count(known_m, rig)
+        has_truth = weight.sum(1) > 0
+        if not has_truth.any():
+            raise _nothing_to_learn(dataset)
+        reached = weight.cumsum(1) >= weight.sum(1, keepdims=True) / 2
+        median_m = _step_m(reached.argmax(1))
+        rows = np.arange(_ROWS)
+        return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
+
+    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+        """Give every pixel the depth of its row.
+
+        Raises:
+            InputError: the input has no rig.
+        """
+        rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
+        row = _canonical_row(np.arange(height), rig)
+        inverse = np.interp(row, np.arange(_ROWS), 1 / self.depth_m)
+        depth_m = torch.from_numpy(1 / inverse).float()[:, None].expand(height, width)
+        return _estimate(depth_m.contiguous(), rig)
+
+
+class NearestImageFloor:
+    """The depth of the training image that looks most alike.
+
+    Images are compared as colour thumbnails of 24 x 8 cells, by correlation. The truth of the
+    nearest one is sparse and is filled in a pyramid: inverse depth is averaged over ever larger
+    cells, and a pixel without truth takes the smallest cell that has any. It is then brought to
+    the size of the input, and to its focal length: what looks alike through a lens twice as long
+    is twice as far.
+    """
+
+    def __init__(self, dataset: Dataset, indices: list[int], looks: Float[Tensor, "n d"]) -> None:
+        self.dataset, self.indices, self.looks = dataset, indices, looks
+
+    @classmethod
+    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageFloor":
+        """Look at every training image that has truth and a rig.
+
+        Raises:
+            InputError: none has.
+        """
+        frames = dataset.frames
+        indices = [i for i, frame in enumerate(frames) if frame.calibration and known_truths(frame)]
+        if not indices:
+            raise _nothing_to_learn(dataset)
+        looks = [_look(read_image(frames[indices[k]].left)) for k in progress(range(len(indices)))]
+        return cls(dataset, indices, torch.stack(looks))
+
+    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+        """Give the left image the depth of its nearest training image.
+
+        Raises:
+            InputError: the input has no rig.
+        """
+        rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
+        nearest = self.indices[int((self.looks @ _look(pair.left)).argmax())]
+        known_m, other = read_known_depth(self.dataset, nearest), self.dataset.read_rig(nearest)
+        assert known_m is not None  # `fit` chose frames that have both
+        assert other is not None
+        inverse = fill_by_pyramid(1 / known_m)
+        inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
+        return _estimate(_focal_share(rig) / _focal_share(other) / inverse, rig)
+
+
+def fill_by_pyramid(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Fill NaN with the mean of the smallest cell (2, 4, 8, ... pixels) around it that has values.
+
+    All stays NaN where there is no value at all.
+    """
+    is_known = torch.isfinite(values)
+    if bool(is_known.all()) or values.shape == (1, 1):
+        return values
+    padded = F.pad(torch.stack([values.nan_to_num(0.0), is_known.to(values.dtype)]),
+                   (0, values.shape[1] % 2, 0, values.shape[0] % 2))  # fmt: skip
+    total, count = F.avg_pool2d(padded, 2)
+    coarse = fill_by_pyramid(torch.where(count > 0, total / count, torch.nan))
+    fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    return torch.where(is_known, values, fine[: values.shape[0], : values.shape[1]])
+
+
+def _count(known_m: Float[Tensor, "h w"], rig: StereoRig) -> Float64[np.ndarray, "rows steps"]:
+    """Weigh each true depth of a frame by its inverse, into its row and its step of depth."""
+    true_m = known_m.double().numpy()
+    v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
+    true_m = true_m[v, u]
+    row = np.rint(_canonical_row(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+    step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
+    flat = row * _STEPS + step.astype(np.int64)
+    share = 1 / true_m / max(len(true_m), 1)
+    return np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
+
+
+def _step_m(step: np.ndarray) -> Float64[np.ndarray, "..."]:
+    """Depth in the middle of a step."""
+    return _NEAR_M * (_FAR_M / _NEAR_M) ** ((step + 0.5) / _STEPS)
+
+
+def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"]:
+    slope = (v - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
+
+
+def _look(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
+    cells = shrink(image, 8, 24).flatten()
+    centred = cells - cells.mean()
+    return centred / centred.norm().clamp(min=1e-9)
+
+
+def _focal_share(camera: Camera) -> float:
+    return float(camera.K[0, 0]) / camera.width
+
+
+def _estimate(depth_m: Float[Tensor, "h w"], rig: StereoRig) -> DepthEstimate:
+    return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
+
+
+def _rig_of(pair: StereoInput) -> StereoRig:
+    if not isinstance(pair.camera, StereoRig):
+        raise InputError(
+            f"{pair.name}: has no rig, and a floor is measured as disparity; give a camera with "
+            "baseline_m"
+        )
+    return pair.camera
+
+
+def _nothing_to_learn(dataset: Dataset) -> InputError:
+    return InputError(
+        f"{dataset.name}: none of its {len(dataset)} frames has both truth and calibration; give "
+        "--train a folder with lidar_depth, disp_occ or LiDAR scans"
+    )

@@ -1,0 +1,26 @@
+"""KITTI, Middlebury and plain folders of pairs: disk to samples, splits, the check of a folder."""
+
+from depthpose.depth.datasets.calibration import KittiCalibration as KittiCalibration
+from depthpose.depth.datasets.calibration import project_lidar as project_lidar
+from depthpose.depth.datasets.check import check_dataset as check_dataset
+from depthpose.depth.datasets.dataset import Dataset as Dataset
+from depthpose.depth.datasets.dataset import join_datasets as join_datasets
+from depthpose.depth.datasets.dataset import open_dataset as open_dataset
+from depthpose.depth.datasets.dataset import read_known_depth as read_known_depth
+from depthpose.depth.datasets.duplicates import DUPLICATE_LIKENESS as DUPLICATE_LIKENESS
+from depthpose.depth.datasets.duplicates import Duplicate as Duplicate
+from depthpose.depth.datasets.duplicates import find_duplicates as find_duplicates
+from depthpose.depth.datasets.duplicates import likeness_matrix as likeness_matrix
+from depthpose.depth.datasets.duplicates import shrink as shrink
+from depthpose.depth.datasets.frames import Frame as Frame
+from depthpose.depth.datasets.frames import has_lidar as has_lidar
+from depthpose.depth.datasets.frames import kitti_calibration as kitti_calibration
+from depthpose.depth.datasets.frames import known_truths as known_truths
+from depthpose.depth.datasets.frames import lidar_truth as lidar_truth
+from depthpose.depth.datasets.frames import read_disparity as read_disparity
+from depthpose.depth.datasets.packed import pack_frames as pack_frames
+from depthpose.depth.datasets.splits import Split as Split
+from depthpose.depth.datasets.splits import read_split as read_split
+from depthpose.depth.datasets.writer import RawFrame as RawFrame
+from depthpose.depth.datasets.writer import has_raw_frame as has_raw_frame
+from depthpose.depth.datasets.writer import write_raw_frame as write_raw_frame

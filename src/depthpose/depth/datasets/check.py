@@ -1,0 +1,181 @@
+"""The check of a folder before hours of work: everything wrong, a line each."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import image_size, read_depth_png, read_image, read_points_bin
+from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
+from depthpose.depth.datasets.frames import Frame, frame_rig, kitti_calibration, read_disparity
+from depthpose.depth.datasets.layouts import find_frames
+from depthpose.depth.datasets.splits import read_split
+
+_MAX_BASELINE_M = 10
+_MAX_DEPTH_M = 200
+"""KITTI's LiDAR sees 120 m."""
+
+
+def check_dataset(
+    folder: Path,
+    split: str | Path | None = None,
+    *,
+    with_decoding: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> CheckReport:
+    """Look at every file of a dataset.
+
+    Args:
+        folder: the dataset's folder, in any layout that ``open_dataset`` knows.
+        split: look only at these frames, and name those that are missing.
+        with_decoding: decode every image in full; else only headers and sizes are looked at.
+        progress: called with the number of frames done and of all frames.
+
+    Raises:
+        InputError: no such folder, or no layout that is known.
+    """
+    folder = Path(folder)
+    layout, frames = find_frames(folder)
+    found: list[Problem] = []
+    if split is not None:
+        chosen = read_split(split)
+        here = {frame.name: frame for frame in frames}
+        found += [
+            Problem(path=folder, kind="missing", message=f"frame {name} of {chosen.name}")
+            for name in chosen.names
+            if name not in here
+        ]
+        frames = [here[name] for name in chosen.names if name in here]
+    found += [*_same_names(frames), *_mixed_formats(folder, frames), *_lone_right_views(frames)]
+    for done, frame in enumerate(frames, 1):
+        found += _check_frame(frame, with_decoding=with_decoding)
+        if progress is not None:
+            progress(done, len(frames))
+    return make_report(layout, _count(frames), found)
+
+
+def _count(frames: list[Frame]) -> dict[str, int]:
+    parts = {"right views": ("right",), "calibrations": ("calibration",),
+             "LiDAR scans": ("velodyne", "scan"), "depth maps": ("depth",),
+             "disparity maps": ("disparity",)}  # fmt: skip
+    counts = {"frames": len(frames)}
+    return counts | {
+        what: sum(any(getattr(frame, part) for part in names) for frame in frames)
+        for what, names in parts.items()
+    }
+
+
+def _same_names(frames: list[Frame]) -> Iterator[Problem]:
+    seen: dict[str, Path] = {}
+    for frame in frames:
+        if frame.name in seen:
+            message = f"has the same name as {seen[frame.name]}; rename one"
+            yield Problem(path=frame.left, kind="mismatch", message=message)
+        seen[frame.name] = frame.left
+
+
+def _mixed_formats(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
+    """Compression changes what networks predict, so a mixture is worth knowing."""
+    views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
+    kinds = {"JPEG" if path.suffix.lower() in (".jpg", ".jpeg") else "PNG" for path in views}
+    if len(kinds) > 1:
+        yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
+
+
+def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
+    # The folders are listed, not the frames: a split leaves many pairs out on purpose.
+    folders = {(f.left.parent, f.right.parent) for f in frames if f.right is not None}
+    for left, right in sorted(folders):
+        stems = {path.stem for path in left.iterdir()}
+        for path in sorted(right.iterdir()):
+            is_view = path.suffix.lower() in (".png", ".jpg", ".jpeg") and path.name[0] != "."
+            if is_view and left != right and path.stem not in stems:
+                yield Problem(path=path, kind="missing", message="has no left view")
+
+
+def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
+    size = None
+    for path in (frame.left, frame.right):
+        if path is None:
+            yield Problem(path=frame.left, kind="note", message="has no right view")
+            continue
+        problem, found = _look_at_image(path, with_decoding=with_decoding)
+        if problem is not None:
+            yield problem
+        elif size is not None and found != size:
+            message = f"is {_show(found)}, but its left image is {_show(size)}"
+            yield Problem(path=path, kind="mismatch", message=message)
+        size = size or found
+    yield from _check_calibration(frame)
+    if frame.velodyne is not None:
+        yield from _check_scan(frame.velodyne)
+    for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
+        if path is not None and size is not None:
+            yield from _check_truth(path, size, is_depth=path in (frame.scan, frame.depth))
+
+
+def _look_at_image(
+    path: Path, *, with_decoding: bool
+) -> tuple[Problem | None, tuple[int, int] | None]:
+    try:
+        if with_decoding:
+            _, height, width = read_image(path).shape
+            return None, (width, height)
+        return None, image_size(path)
+    except InputError as error:
+        return unreadable(path, error), None
+
+
+def _check_calibration(frame: Frame) -> Iterator[Problem]:
+    if frame.calibration is None and frame.velodyne is not None:
+        message = "has no calibration, so its scan cannot be projected"
+        yield Problem(path=frame.left, kind="missing", message=message)
+        return
+    if frame.calibration is None:
+        message = "has no calibration: disparity only, no metres"
+        yield Problem(path=frame.left, kind="note", message=message)
+        return
+    try:
+        rig = frame_rig(frame)
+        if rig is not None and rig.baseline_m >= _MAX_BASELINE_M:
+            message = f"gives a baseline of {rig.baseline_m:g} m; is it in metres?"
+            yield Problem(path=frame.calibration, kind="mismatch", message=message)
+        if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
+            message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
+            yield Problem(path=frame.calibration, kind="missing", message=message)
+    except InputError as error:
+        yield unreadable(frame.calibration, error)
+
+
+def _check_scan(path: Path) -> Iterator[Problem]:
+    try:
+        points = read_points_bin(path)
+    except InputError as error:
+        yield unreadable(path, error)
+        return
+    if len(points) == 0:
+        yield Problem(path=path, kind="empty", message="holds no LiDAR point")
+
+
+def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
+    try:
+        truth = read_depth_png(path) if is_depth else read_disparity(path)
+    except InputError as error:
+        yield unreadable(path, error)
+        return
+    height, width = truth.shape
+    if (width, height) != size:
+        message = f"is {width}x{height}, but its left image is {_show(size)}"
+        yield Problem(path=path, kind="mismatch", message=message)
+    if not bool(torch.isfinite(truth).any()):
+        yield Problem(path=path, kind="empty", message="holds no value")
+    largest = float(truth.nan_to_num(0.0).max())
+    limit, unit = (_MAX_DEPTH_M, "m") if is_depth else (width, "px")
+    if largest > limit:
+        message = f"holds {largest:g} {unit}, beyond {limit} {unit}; is its unit 1/256?"
+        yield Problem(path=path, kind="mismatch", message=message)
+
+
+def _show(size: tuple[int, int] | None) -> str:
+    return "unreadable" if size is None else f"{size[0]}x{size[1]}"

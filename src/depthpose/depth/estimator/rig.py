@@ -1,0 +1,152 @@
+"""To the rig that a generator imitates, or a matcher was trained at, and back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
+from depthpose.depth.config import (
+    Answer,
+    GeneratorConfig,
+    MatcherConfig,
+    SelectionConfig,
+    SGBMConfig,
+)
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    disparity_from_depth,
+    resize_image,
+    resized_map,
+    resized_match,
+)
+from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
+from depthpose.depth.synthesis import SelectionGenerator
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.weights import DepthWeights
+
+SKY_M = 10_000.0
+"""What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
+
+
+def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
+    """Make the camera of an image brought to ``focal_px``, its axis through the middle."""
+    rows, columns = size
+    K = torch.tensor(
+        [[focal_px, 0, (columns - 1) / 2], [0, focal_px, (rows - 1) / 2], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    return Camera(width=columns, height=rows, K=K)
+
+
+def from_virtual(
+    image: StereoInput,
+    rig: GeneratorConfig | SelectionConfig,
+    match: Match,
+    right: Float[Tensor, "3 _ _"],
+    is_sky: Bool[Tensor, "_ _"] | None,
+) -> DepthEstimate:
+    """Bring what was found at the virtual rig back to the image."""
+    camera = image.camera
+    assert camera is not None
+    height, width = image.left.shape[1:]
+    seen = resized_match(match, height, width)
+    imitated = StereoRig(width=width, height=height, K=camera.K, baseline_m=rig.virtual_baseline_m)
+    depth_m = depth_from_disparity(seen.disparity_px, imitated)
+    disparity_px = seen.disparity_px
+    if is_sky is not None:
+        share = resized_map(is_sky.float(), height, width)
+        is_sky = share > 0.5
+        depth_m = torch.where(is_sky, SKY_M, depth_m)
+        sky_px = float(camera.K[0, 0]) * rig.virtual_baseline_m / SKY_M
+        disparity_px = torch.where(is_sky, sky_px, disparity_px)
+    if isinstance(camera, StereoRig):
+        disparity_px = disparity_from_depth(depth_m, camera)
+    return DepthEstimate(
+        depth_m=depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m),
+        disparity_px=disparity_px,
+        confidence=seen.confidence,
+        right=resize_image(right, height, width),
+        is_sky=is_sky,
+        seen=image,
+    )
+
+
+def join_matches(one: Match, other: Match) -> Match:
+    """Take the mean of two disparities in the logarithm, weighed by their confidence.
+
+    Where ``other`` has no answer, or no confidence, ``one`` stands.
+    """
+    assert one.confidence is not None
+    weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
+    weight = torch.where(other.disparity_px > 0, weight, 0.0)
+    share = weight / (weight + one.confidence).clamp(min=1e-6)
+    logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
+    log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)
+    return Match(disparity_px=log_px.exp(), confidence=torch.lerp(one.confidence, weight, share))
+
+
+def set_answer(found: DepthWeights | None, answer: Answer) -> None:
+    """Let depth of one image come from elsewhere than the weights say.
+
+    Raises:
+        InputError: the generator has no disparity of its own, or there is none.
+    """
+    generator = None if found is None else found.generator
+    if isinstance(generator, SelectionGenerator):
+        generator.config = replace(generator.config, answer=answer)
+    elif generator is None or answer != generator.config.answer:
+        raise InputError(
+            f"answer is {answer!r}, which takes the weights of a generator that selects; leave it "
+            "away: these have none, or one that paints, whose views a matcher reads."
+        )
+
+
+def choose_matcher(
+    weights: str | Path | None,
+    found: DepthWeights | None,
+    matcher: str | Path | Matcher | None,
+    own: DepthWeights | None,
+    config: MatcherConfig | SGBMConfig | None,
+) -> Matcher | None:
+    """Take the matcher that was named, or that of the weights; None where one image needs none.
+
+    Args:
+        weights: as the user named them.
+        found: what they hold.
+        matcher: as the user named it.
+        own: what weights of a matcher alone hold.
+        config: how the matcher runs.
+
+    Raises:
+        InputError: there is none, or one of another kind than the config.
+    """
+    run = config if isinstance(config, MatcherConfig) else MatcherConfig()
+    if isinstance(config, SGBMConfig) and matcher != "sgbm":
+        raise InputError(
+            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
+        )
+    if matcher == "sgbm":
+        if found is not None and found.generator is None:
+            raise InputError(
+                f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of a "
+                "matcher. Leave one of the two away."
+            )
+        return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
+    if matcher is not None and not isinstance(matcher, str | Path):
+        return matcher
+    holder = found if own is None else own
+    if holder is not None and holder.matcher is not None:
+        return PSMNetMatcher(holder.matcher, run)
+    generator = None if found is None else found.generator
+    if matcher is None and generator is not None and generator.config.answer == "own":
+        return None
+    raise InputError(
+        f"weights is {None if weights is None else str(weights)!r} and matcher is "
+        f"{None if matcher is None else str(matcher)!r}: there is no matcher in that. Give "
+        "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and a "
+        "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
+    )

@@ -1,0 +1,302 @@
+"""The road: what it is like, how it curves and climbs, and the ground beside it.
+
+Everything is laid out along a straight street first, at (x to the right, y down, s ahead) with the
+camera's car at x = s = 0, and then bent as a whole.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from depthpose.depth.synthetic.materials import Color, Number, Surface
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder
+
+Place = Literal["city", "suburb", "avenue", "rural", "forest"]
+PLACES: dict[Place, float] = {
+    "city": 0.2, "suburb": 0.28, "avenue": 0.26, "rural": 0.14, "forest": 0.12
+}  # fmt: skip
+"""Kinds of places, and how often each is met."""
+
+BEHIND_M = 14.0
+AHEAD_M = 420.0
+"""How far the ground reaches."""
+
+_WIDE_M = 400.0
+"""How far it reaches to the sides, so that nothing but hills is seen beyond."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideStreet:
+    """A street that joins.
+
+    Attributes:
+        s_m: where, along the road.
+        half_m: half its width.
+        sides: 1 right, -1 left.
+    """
+
+    s_m: Number
+    half_m: float
+    sides: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Road:
+    """The plan of a road.
+
+    Attributes:
+        place: what kind of place it runs through.
+        left_m: x of its left edge.
+        right_m: x of its right edge.
+        lanes: how many there are.
+        parking_m: width of the strip for parked cars, on the left and on the right.
+        walk_m: width of the pavement; 0: none.
+        curb_m: how much higher the pavement is.
+        verge_m: width of the grass between road and pavement.
+        side_streets: streets that join.
+        centre: table of the centre line: s, x, y, z [m] and heading [rad].
+    """
+
+    place: Place
+    left_m: Number
+    right_m: float
+    lanes: int
+    parking_m: tuple[Number, Number]
+    walk_m: Number
+    curb_m: float
+    verge_m: Number
+    side_streets: tuple[SideStreet, ...]
+    centre: Float64[np.ndarray, "n 5"]
+
+    @property
+    def lane_m(self) -> float:
+        """Width of a lane."""
+        return (self.right_m - self.left_m - sum(self.parking_m)) / self.lanes
+
+    def edge_m(self, side: int) -> float:
+        """Give x of the edge on one side."""
+        return self.right_m if side > 0 else self.left_m
+
+    def plot_m(self, side: int) -> float:
+        """Give x where the ground behind pavement and verge begins."""
+        return self.edge_m(side) + side * (self.verge_m + self.walk_m)
+
+    def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
+        """Whether a side street joins here."""
+        return any(
+            side in street.sides and abs(s_m - street.s_m) < street.half_m + margin_m
+            for street in self.side_streets
+        )
+
+
+def draw_road(rng: np.random.Generator) -> Road:
+    """Draw the plan of a road, with the camera's car somewhere in one of its right lanes."""
+    names = list(PLACES)
+    place = names[rng.choice(len(names), p=list(PLACES.values()))]
+    lanes = {"avenue": int(rng.integers(3, 6)), "city": int(rng.integers(2, 4))}.get(place, 2)
+    lane_m = rng.uniform(2.7, 3.7) + 0.2 * (place == "avenue")
+    parking = rng.uniform(1.9, 2.3, 2) * (
+        rng.random(2) < {"city": 0.6, "suburb": 0.45}.get(place, 0.0)
+    )
+    width_m = lanes * lane_m + parking.sum()
+    lane = lanes - 1 - int(rng.random() < 0.35 and lanes > 2)
+    right_m = (lanes - lane - 0.5) * lane_m + parking[1] + rng.normal(0, 0.3)
+    if lanes == 2 and rng.random() < 0.12:  # a narrow street without lanes, driven in the middle
+        right_m = width_m / 2 + rng.normal(0, 0.4)
+    has_walk = place in ("city", "suburb") or (place == "avenue" and rng.random() < 0.7)
+    return Road(
+        place=place,
+        left_m=float(right_m - width_m),
+        right_m=float(right_m),
+        lanes=lanes,
+        parking_m=(float(parking[0]), float(parking[1])),
+        walk_m=rng.uniform(1.4, 4.0) if has_walk else 0.0,
+        curb_m=rng.uniform(0.06, 0.15) if has_walk else 0.0,
+        verge_m=rng.uniform(1, 5) if place == "avenue" else 0.0,
+        side_streets=_draw_side_streets(rng, place),
+        centre=_draw_centre(rng, place),
+    )
+
+
+def _draw_side_streets(rng: np.random.Generator, place: Place) -> tuple[SideStreet, ...]:
+    often = {"city": 0.7, "suburb": 0.65, "avenue": 0.6}.get(place, 0.2)
+    streets, s = [], rng.uniform(4, 40)
+    while rng.random() < often and s < 110:
+        sides = ((1,), (-1,), (-1, 1))[rng.choice(3, p=[0.3, 0.3, 0.4])]
+        streets.append(SideStreet(s_m=s, half_m=rng.uniform(2.8, 6), sides=sides))
+        s += rng.uniform(25, 60)
+    return tuple(streets)
+
+
+def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, "n 5"]:
+    """Integrate curvature and slope; at the car the road is level and leads ahead."""
+    s = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
+    curvature = np.zeros_like(s)
+    is_bent = rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65)
+    if is_bent:
+        start = rng.uniform(-5, 45)
+        for _ in range(3):
+            radius = rng.uniform(45, 400) * rng.choice([-1, 1])
+            length = min(rng.uniform(15, 70), 0.9 * abs(radius))
+            ramp = np.clip((s - start) / 12, 0, 1) * np.clip((start + length - s) / 12, 0, 1)
+            curvature += ramp / radius
+            start += length + rng.uniform(0, 60)
+    slope = np.zeros_like(s)
+    if rng.random() < 0.55:
+        for _ in range(3):
+            where, width = rng.uniform(10, 160), rng.uniform(15, 50)
+            slope += rng.normal(0, 0.022) * (1 + np.tanh((s - where) / width)) / 2
+        slope -= np.interp(0.0, s, slope)
+    heading = np.cumsum(curvature)
+    heading -= np.interp(0.0, s, heading)
+    x, z, y = np.cumsum(np.sin(heading)), np.cumsum(np.cos(heading)), -np.cumsum(slope)
+    at_car = [np.interp(0.0, s, values) for values in (x, y, z)]
+    return np.stack([s, x - at_car[0], y - at_car[1], z - at_car[2], heading], 1)
+
+
+def bend(mesh: Mesh, road: Road) -> Mesh:
+    """Carry what was laid out along the straight street to the real one."""
+    points = mesh.corners.reshape(-1, 3)
+    curvature = np.gradient(road.centre[:, 4], road.centre[:, 0])
+    table = np.column_stack([road.centre, curvature]).astype(np.float32)
+    # The table has a row a metre.
+    place = np.clip(points[:, 2] - table[0, 0], 0, len(table) - 1.001)
+    row = place.astype(np.int64)
+    share = (place - row)[:, None]
+    here = table[row] * (1 - share) + table[row + 1] * share
+    x, y, z, heading, curvature = here[:, 1:].T
+    # On the inside of a curve nothing may lie beyond its centre: the ground would fold.
+    inward = np.clip(points[:, 0] * curvature, 0, None)
+    across = points[:, 0] / (1 + inward**4) ** 0.25
+    cos, sin = np.cos(heading), np.sin(heading)
+    bent = np.stack([x + across * cos, y + points[:, 1], z - across * sin], 1)
+    normals = mesh.normals.reshape(-1, 3)
+    turned = np.stack(
+        [normals[:, 0] * cos + normals[:, 2] * sin, normals[:, 1],
+         normals[:, 2] * cos - normals[:, 0] * sin], 1)  # fmt: skip
+    shape = mesh.corners.shape
+    return replace(
+        mesh,
+        corners=bent.reshape(shape).astype(np.float32),
+        normals=turned.reshape(shape).astype(np.float32),
+    )
+
+
+def add_ground(builder: MeshBuilder, rng: np.random.Generator, road: Road) -> None:
+    """Add the carriageway, pavements, verges and the land beside."""
+    asphalt = _asphalt(rng)
+    variants = [int(v) for v in rng.integers(0, 6, 4)]
+    grey, green = rng.uniform(0.6, 1.2), rng.uniform(0.75, 1.4)
+    warm = 1 + 0.2 * rng.normal()
+    walk = Surface(
+        "pavement", (0.2 * grey, 0.19 * grey, 0.18 * grey), rng.uniform(1.6, 3.2), variants[1]
+    )
+    grass = Surface("grass", (0.075 * green * warm, 0.088 * green, 0.02 * green), 3.0, variants[2])
+    builder.begin_thing()
+    _strip(builder, (road.left_m, road.right_m), (0.0, 0.0), asphalt, _stations(road, 0))
+    land = walk if road.place == "city" and rng.random() < 0.7 else grass
+    for side in (-1, 1):
+        for stations, is_street in _pieces(road, side):
+            builder.begin_thing()
+            if is_street:
+                far = road.edge_m(side) + side * _WIDE_M
+                _strip(builder, (road.edge_m(side), far), (0.0, 0.0), asphalt, stations)
+            else:
+                _side_strips(builder, rng, road, side, (walk, grass, land, stations))
+
+
+def _asphalt(rng: np.random.Generator) -> Surface:
+    light = rng.uniform(0.7, 1.45)
+    color: Color = (0.105 * light, 0.105 * light, 0.107 * light)
+    return Surface("road", color, 3.0, int(rng.integers(4)))
+
+
+def _side_strips(
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    road: Road,
+    side: int,
+    stuff: tuple[Surface, Surface, Surface, Float64[np.ndarray, " n"]],
+) -> None:
+    """From the road's edge outwards: kerb, verge, pavement, land."""
+    walk, grass, land, stations = stuff
+    x, high = road.edge_m(side), -road.curb_m
+    curb = Surface("curb", (0.3, 0.29, 0.28), 1.0)
+    strip = lambda width, heights, surface: _strip(  # noqa: E731
+        builder, (x, x + side * width), heights, surface, stations
+    )
+    if road.curb_m:
+        strip(0.0, (0.0, high), curb)
+        strip(0.15, (high, high), curb)
+        x += side * 0.15
+    else:
+        strip(rng.uniform(0.3, 1.2), (0.0, 0.02), Surface("dirt", (0.2, 0.165, 0.12), 2.0))
+        x += side * 0.3
+    if road.verge_m:
+        strip(road.verge_m, (high, high), grass)
+        x += side * road.verge_m
+    if road.walk_m:
+        strip(road.walk_m, (high, high), walk)
+        x += side * road.walk_m
+    rise = rng.normal(0, 0.8) if road.place in ("rural", "forest") else rng.normal(0, 0.1)
+    strip(8.0, (high, high - 0.3 * rise), land)
+    x += side * 8
+    strip(_WIDE_M, (high - 0.3 * rise, high - 3 * rise), land)
+    edge = road.edge_m(side)
+    profile = [(edge, high), (x - side * 8, high), (x, high - 0.3 * rise),
+               (x + side * _WIDE_M, high - 3 * rise)]  # fmt: skip
+    for s in (stations[0], stations[-1]):
+        _add_bank(builder, profile, float(s), curb if road.curb_m else land)
+
+
+def _add_bank(
+    builder: MeshBuilder, profile: list[tuple[Number, Number]], s: Number, surface: Surface
+) -> None:
+    """Close the step between the land and a side street at y = 0, which one would see through."""
+    faces = [
+        [(x, y, s), (other_x, other_y, s), (other_x, 0.0, s), (x, 0.0, s)]
+        for (x, y), (other_x, other_y) in pairwise(profile)
+    ]
+    corners = np.array(faces, np.float32)
+    builder.quads(corners, corners[..., :2], surface)
+
+
+def _stations(road: Road, side: int) -> Float64[np.ndarray, " n"]:
+    cuts = [
+        street.s_m + sign * street.half_m
+        for street in road.side_streets
+        if side in street.sides
+        for sign in (-1, 1)
+    ]
+    even = [np.arange(-BEHIND_M, 60, 4), np.arange(60, 150, 10), np.arange(150, AHEAD_M + 1, 30)]
+    return np.unique(np.concatenate([*even, cuts]))
+
+
+def _pieces(road: Road, side: int) -> list[tuple[Float64[np.ndarray, " n"], bool]]:
+    """Stretches of one side between and across its side streets; whether each is a street."""
+    stations = _stations(road, side)
+    middle = (stations[1:] + stations[:-1]) / 2
+    is_street = np.array([road.is_side_street(float(s), side) for s in middle])
+    starts = [0, *(np.flatnonzero(is_street[1:] != is_street[:-1]) + 1), len(is_street)]
+    return [(stations[a : b + 1], bool(is_street[a])) for a, b in pairwise(starts)]
+
+
+def _strip(
+    builder: MeshBuilder,
+    x_m: tuple[Number, Number],
+    y_m: tuple[Number, Number],
+    surface: Surface,
+    stations: Float[np.ndarray, " n"],
+) -> None:
+    """Add a band along the road; its texture lies in road coordinates (x, s)."""
+    start, stop = stations[:-1], stations[1:]
+    is_wall = x_m[0] == x_m[1]
+    u = (y_m[0], y_m[1]) if is_wall else x_m
+    corner = lambda i, s: np.stack([0 * s + x_m[i], 0 * s + y_m[i], s], 1)  # noqa: E731
+    place = lambda i, s: np.stack([0 * s + u[i], s], 1)  # noqa: E731
+    turns = ((0, start), (1, start), (1, stop), (0, stop))
+    faces = np.stack([corner(i, s) for i, s in turns], 1)
+    builder.quads(faces, np.stack([place(i, s) for i, s in turns], 1), surface)

@@ -1,0 +1,287 @@
+"""One made street: its mesh, its light and where the camera is mounted."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from depthpose.core.camera import StereoRig, crop_camera, resize_camera
+from depthpose.depth.config import StreetsConfig
+from depthpose.depth.synthetic.materials import Surface
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder
+from depthpose.depth.synthetic.road import Place, Road, add_ground, bend, draw_road
+from depthpose.depth.synthetic.roadside import add_roadside
+from depthpose.depth.synthetic.traffic import add_traffic
+
+Vector = Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Weather:
+    """What lights a scene.
+
+    Attributes:
+        sun: unit vector towards the sun, in the world's frame (y down).
+        sun_color: linear light of the sun; small where clouds hide it.
+        zenith: light of the sky overhead.
+        horizon: light of the sky low down.
+        is_overcast: no shadows are cast.
+        cloud: 0 a clear sky, 1 covered.
+        haze_m: distance at which two thirds of the light are the haze's.
+        shift: where clouds and unevenness lie in their textures.
+    """
+
+    sun: Vector
+    sun_color: Vector
+    zenith: Vector
+    horizon: Vector
+    is_overcast: bool
+    cloud: float
+    haze_m: float
+    shift: tuple[float, float]
+
+
+def draw_weather(rng: np.random.Generator) -> Weather:
+    """Draw a day: mostly sun, as where KITTI was recorded, else overcast; sometimes hazy."""
+    is_overcast = bool(rng.random() < 0.25)
+    height = np.deg2rad(rng.uniform(12, 62))
+    turn = rng.uniform(0, 2 * np.pi)
+    sun = np.array([np.cos(height) * np.sin(turn), -np.sin(height), np.cos(height) * np.cos(turn)])
+    low = np.clip((height - 0.2) / 0.6, 0, 1)
+    strength = rng.uniform(0, 0.2) if is_overcast else rng.uniform(3.2, 5.0)
+    sky = rng.uniform(0.8, 1.5) * (1.2 if is_overcast else 1.0)
+    blue = np.array([0.85, 0.9, 1.0]) if is_overcast else np.array([0.13, 0.33, 0.85])
+    pale = np.array([0.95, 0.98, 1.0]) if is_overcast else np.array([0.42, 0.68, 1.05])
+    glare = 1.0 if is_overcast else max(1.0, float(np.exp(rng.uniform(-0.5, 1.3))))
+    haze = rng.uniform(220, 600) if rng.random() < 0.12 else rng.uniform(600, 4000)
+    return Weather(
+        sun=sun,
+        sun_color=np.array([1.0, 0.78 + 0.18 * low, 0.55 + 0.36 * low]) * strength,
+        zenith=blue * sky * glare**0.5,
+        # The more it glares, the whiter it is.
+        horizon=(pale / glare + (1 - 1 / glare)) * sky * glare,
+        is_overcast=is_overcast,
+        cloud=float(rng.uniform(0.3, 1)) if is_overcast else float(rng.uniform(0, 1)) ** 2,
+        haze_m=float(haze),
+        shift=(float(rng.random()), float(rng.random())),
+    )
+
+
+_HILLS_M = 900.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Markings:
+    """Paint on the road, in its own coordinates (x across, s along) [m].
+
+    Attributes:
+        lines: along the road, a row each: x, half width, period and length of the dashes (equal
+            where the line is whole).
+        bars: across it, a row each: s, half length, first and last x, and 1 where it is striped.
+        brightness: of the paint.
+        wheel_tracks: x of the left lane's left edge, and the width of the lanes.
+    """
+
+    lines: Float64[np.ndarray, "n 4"]
+    bars: Float64[np.ndarray, "m 5"]
+    brightness: float
+    wheel_tracks: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StreetScene:
+    """A made street, in the frame of its left camera (x right, y down, z forward) [m].
+
+    Attributes:
+        mesh: everything that is seen, but the sky.
+        markings: paint on the road.
+        weather: the light, in the world's frame.
+        camera_from_world: rotation of the camera.
+        place: what kind of place it is.
+    """
+
+    mesh: Mesh
+    markings: Markings
+    weather: Weather
+    camera_from_world: Float64[np.ndarray, "3 3"]
+    place: Place | Literal["clutter"]
+
+
+def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
+    """Make the street that belongs to ``seed``.
+
+    Args:
+        seed: any whole numbers.
+        mount_height_m: height of the cameras above the road, some centimetres more or less.
+    """
+    rng = np.random.default_rng([71, *seed])
+    road = draw_road(rng)
+    builder = MeshBuilder()
+    add_ground(builder, rng, road)
+    add_roadside(builder, rng, road)
+    add_traffic(builder, rng, road)
+    street = bend(builder.finish(), road)
+    hills = MeshBuilder()
+    _add_hills(hills, rng)
+    mesh = _join_far(street, hills.finish())
+    rotation, position = _mount(rng, mount_height_m)
+    return StreetScene(
+        mesh=_seen_from(mesh, rotation, position),
+        markings=_draw_markings(rng, road),
+        weather=draw_weather(rng),
+        camera_from_world=rotation,
+        place=road.place,
+    )
+
+
+def _mount(
+    rng: np.random.Generator, height_m: float
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """How the camera stands: near level, now and then turned off the road's direction."""
+    pitch, roll = rng.normal(0, 0.012), rng.normal(0, 0.009)
+    yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
+    c, s = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
+    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
+    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
+    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+    position = np.array([rng.normal(0, 0.05), -height_m + rng.normal(0, 0.04), 0.0])
+    return about_z @ about_x @ about_y, position
+
+
+def _seen_from(
+    mesh: Mesh, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
+) -> Mesh:
+    turn = rotation.T.astype(np.float32)
+    corners = (mesh.corners - position.astype(np.float32)) @ turn
+    moved = replace(mesh, corners=corners, normals=mesh.normals @ turn)
+    # What is far behind casts no shadow that is seen.
+    kept = corners[:, :, 2].max(1) > -12
+    return moved.part(kept)
+
+
+def _join_far(street: Mesh, hills: Mesh) -> Mesh:
+    thing = hills.thing + street.thing.max() + 1
+    both = {
+        name: (getattr(street, name), getattr(hills, name)) for name in Mesh.__dataclass_fields__
+    }
+    both["thing"] = (street.thing, thing)
+    return Mesh(**{name: np.concatenate(parts) for name, parts in both.items()})
+
+
+def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
+    """A ring of far hills or woods."""
+    angle = np.linspace(-1.35, 1.35, 120)
+    wave = np.zeros_like(angle)
+    for often in (3, 7, 17, 43):
+        wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
+    height = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
+    x, z = _HILLS_M * np.sin(angle), _HILLS_M * np.cos(angle)
+    low = np.stack([x, 0 * x + 90, z], 1)
+    high = np.stack([x, -height, z], 1)
+    along = np.arange(len(angle)) * 12.0
+    under, over = np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1)
+    faces, uv = (
+        np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1) for a, b in ((low, high), (under, over))
+    )
+    surface = Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2)))
+    builder.quads(faces, uv, surface)
+
+
+def _draw_markings(rng: np.random.Generator, road: Road) -> Markings:
+    is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
+    dash, half = rng.uniform(2, 6), rng.uniform(0.05, 0.08)
+    period = dash * rng.uniform(2, 3)
+    first = road.left_m + road.parking_m[0]
+    lines = []
+    for k in range(road.lanes + 1) if is_marked else ():
+        is_edge = k in (0, road.lanes)
+        is_whole = is_edge or (k == road.lanes // 2 and rng.random() < 0.3)
+        inset = 0.15 * ((k == 0) - (k == road.lanes)) if is_edge else 0.0
+        if is_edge and road.curb_m and rng.random() < 0.7:
+            continue
+        x = first + k * road.lane_m + inset
+        lines.append((x, half, period, period if is_whole else dash))
+    return Markings(
+        lines=np.array(lines, float).reshape(-1, 4),
+        bars=_draw_bars(rng, road),
+        brightness=rng.uniform(0.4, 0.75),
+        wheel_tracks=(first, road.lane_m),
+    )
+
+
+def _draw_bars(rng: np.random.Generator, road: Road) -> Float64[np.ndarray, "m 5"]:
+    """Stop lines and zebra crossings before side streets, and dashed lines across their mouths."""
+    bars = []
+    for street in road.side_streets:
+        start = street.s_m - street.half_m
+        if rng.random() < 0.4:
+            bars.append((start - 3.5, 1.5, road.left_m, road.right_m, 1.0))
+        if rng.random() < 0.4:
+            middle = (road.left_m + road.right_m) / 2
+            bars.append((start - 6, 0.2, middle, road.right_m, 0.0))
+    return np.array(bars, float).reshape(-1, 5)
+
+
+KITTI_RIGS = (
+    (1242, 375, 721.5377, 609.5593, 172.8540, 0.5327),
+    (1224, 370, 707.0493, 604.0814, 180.5066, 0.5373),
+    (1238, 374, 718.3351, 600.3891, 181.5122, 0.5301),
+    (1226, 370, 707.0912, 601.8873, 183.1104, 0.5371),
+    (1241, 376, 718.8560, 607.1928, 185.2157, 0.5372),
+)
+"""Width, height, focal length, principal point [px] and baseline [m] of the five recording days."""
+
+_KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
+"""Nearly all benchmarks are of the first day."""
+
+
+def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
+    """Give the rig of a frame and the height of its mount [m], without drawing the frame."""
+    return draw_rig(np.random.default_rng([72, config.seed, index]), config)
+
+
+def rig_number(config: StreetsConfig, index: int) -> int:
+    """Say which of KITTI's rigs a frame has, where ``config.rigs`` knows no others.
+
+    Rigs cannot be told apart by their size: small pictures of two of them are of one.
+    """
+    full = replace(config, scale=1.0, crop=None)
+    width = street_rig(full, index)[0].width
+    return next(n for n, rig in enumerate(KITTI_RIGS) if rig[0] == width)
+
+
+def kitti_rig(number: int = 0) -> StereoRig:
+    """Give the rig of one of KITTI's five recording days, as published."""
+    width, height, focal_px, cx, cy, baseline_m = KITTI_RIGS[number]
+    K = torch.tensor([[focal_px, 0, cx], [0, focal_px, cy], [0, 0, 1]], dtype=torch.float64)
+    return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)
+
+
+def draw_rig(rng: np.random.Generator, config: StreetsConfig) -> tuple[StereoRig, float]:
+    """Draw the rig of a frame, scaled and cropped as asked, and the height of its mount [m]."""
+    is_kitti = config.rigs == "kitti" or rng.random() < 0.5
+    if is_kitti:
+        rig, mount_m = kitti_rig(int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))), 1.65
+    else:
+        rig, mount_m = _other_rig(rng), rng.uniform(1.1, 2.2)
+    width, height = (max(1, round(side * config.scale)) for side in (rig.width, rig.height))
+    rig = resize_camera(rig, width, height)
+    if config.crop is None:
+        return rig, mount_m
+    rows, columns = min(config.crop[0], height), min(config.crop[1], width)
+    left = int(rng.integers(width - columns + 1))
+    top = int(rng.integers(height - rows + 1))
+    return crop_camera(rig, left, top, columns, rows), mount_m
+
+
+def _other_rig(rng: np.random.Generator) -> StereoRig:
+    width = int(rng.integers(900, 1600))
+    height = int(width / rng.uniform(1.6, 3.3))
+    focal_px = width * rng.uniform(0.45, 1.1)
+    ratio = 1 + rng.normal(0, 0.004)
+    cx, cy = width * (0.5 + rng.normal(0, 0.015)), height * (0.5 + rng.normal(0, 0.03))
+    K = torch.tensor([[focal_px, 0, cx], [0, focal_px * ratio, cy], [0, 0, 1]], dtype=torch.float64)
+    baseline_m = float(np.exp(rng.uniform(np.log(0.12), np.log(0.8))))
+    return StereoRig(width=width, height=height, K=K, baseline_m=baseline_m)

@@ -1,0 +1,333 @@
+"""Textures that repeat without seams, made from noise, and their pyramid.
+
+A texture modulates a surface's colour, so its mean is about 1. They depend on nothing but this
+file: they are made once a process and shared by every scene.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Int
+from torch import Tensor
+
+from depthpose.depth.synthetic.materials import FIRST_LAYER, LAYERS, MATERIALS, Number
+
+SIDE_PX = 256
+LEVELS = 9
+"""From 256 pixels down to 1."""
+
+Plane = Float[np.ndarray, "256 256"]
+Picture = Float[np.ndarray, "256 256 3"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Textures:
+    """Every texture at every size.
+
+    Attributes:
+        texels: all in one list, a level after the other.
+        starts: where each level begins.
+        clouds: a field of noise for clouds.
+        stains: a field of noise for unevenness over metres.
+    """
+
+    texels: Float16[Tensor, "n 3"]
+    starts: Int[Tensor, " levels"]
+    clouds: Float[Tensor, "256 256"]
+    stains: Float[Tensor, "256 256"]
+
+
+@cache
+def textures() -> Textures:
+    """Make all textures: a second, once a process."""
+    rng = np.random.default_rng(5)
+    stack = np.ones((LAYERS, SIDE_PX, SIDE_PX, 3), np.float32)
+    for name, material in MATERIALS.items():
+        for variant in range(material.variants):
+            stack[FIRST_LAYER[name] + variant] = _PAINTERS[name](_Noise(rng), variant)
+    level, levels = np.clip(stack, 0.02, 3), []
+    for _ in range(LEVELS):
+        levels.append(level.reshape(-1, 3))
+        half = level.shape[1] // 2
+        if half:
+            level = level.reshape(LAYERS, half, 2, half, 2, 3).mean((2, 4))
+    starts = np.cumsum([0, *(len(texels) for texels in levels[:-1])])
+    return Textures(
+        texels=torch.from_numpy(np.concatenate(levels).astype(np.float16)),
+        starts=torch.from_numpy(starts),
+        clouds=torch.from_numpy(_Noise(rng).smooth(2.6, (1, 100))),
+        stains=torch.from_numpy(_Noise(rng).smooth(2.0, (1, 64))),
+    )
+
+
+def sample_texture(
+    textures: Textures,
+    layer: Int[Tensor, " n"],
+    uv: Float[Tensor, "n 2"],
+    level: Float[Tensor, " n"],
+) -> Float[Tensor, "n 3"]:
+    """Look textures up, bilinearly in the nearest level.
+
+    Args:
+        textures: all of them.
+        layer: which texture.
+        uv: where, in tiles.
+        level: 0 the largest picture, 1 the one of half its size, ...
+    """
+    whole = level.round().clamp(0, LEVELS - 1).long()
+    side = SIDE_PX >> whole
+    place = uv * side[:, None] - 0.5
+    low = place.floor()
+    share = place - low
+    column, row = low.long().unbind(1)
+    mask = side - 1  # sides are powers of two
+    start = textures.starts.to(layer.device)[whole] + layer * side * side
+    left, right = column & mask, (column + 1) & mask
+    above, below = start + (row & mask) * side, start + ((row + 1) & mask) * side
+    texels = textures.texels
+    corners = (
+        texels.index_select(0, index).float()
+        for index in (above + left, above + right, below + left, below + right)
+    )
+    a, b, c, d = corners
+    across, down = share[:, :1], share[:, 1:]
+    top, bottom = torch.lerp(a, b, across), torch.lerp(c, d, across)
+    return torch.lerp(top, bottom, down)
+
+
+class _Noise:
+    """Seamless fields of noise with a mean of 0 and a deviation of 1."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def smooth(
+        self, fall: Number, band: tuple[Number, Number], stretch: tuple[Number, Number] = (1, 1)
+    ) -> Plane:
+        """Noise whose power falls with the frequency; ``stretch`` > 1 makes it finer in y, x."""
+        fy = np.fft.fftfreq(SIDE_PX)[:, None] * SIDE_PX / stretch[0]
+        fx = np.fft.rfftfreq(SIDE_PX)[None] * SIDE_PX / stretch[1]
+        often = np.hypot(fx, fy)
+        is_in = (often >= band[0]) & (often <= band[1])
+        strength = np.where(is_in, 1 / np.maximum(often, 1) ** (fall / 2 + 0.5), 0)
+        turn = np.exp(2j * np.pi * self.rng.random(strength.shape))
+        field = np.fft.irfft2(strength * turn, s=(SIDE_PX, SIDE_PX))
+        return (field / field.std()).astype(np.float32)
+
+    def rough(self) -> Plane:
+        """Coarse and fine together."""
+        return self.smooth(1.6, (1, 128))
+
+    def fine(self) -> Plane:
+        """Grains."""
+        return self.smooth(0.3, (24, 128))
+
+    def broad(self) -> Plane:
+        """Patches."""
+        return self.smooth(2.4, (1, 20))
+
+    def bricks(
+        self, rows: int, columns: int, joint: Number, spread: Number
+    ) -> tuple[Plane, Picture, Plane]:
+        """A bond: 1 on the bricks and 0 in the joints, a shade for each, the height in its row."""
+        y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
+        row = np.floor(y * rows).astype(int)
+        across = x * columns + 0.5 * (row % 2)
+        column = np.floor(across).astype(int) % columns
+        in_row, in_column = (y * rows) % 1, across % 1
+        edge = np.minimum(
+            np.minimum(in_column, 1 - in_column) * rows / columns, np.minimum(in_row, 1 - in_row)
+        )
+        is_brick = np.clip((edge - joint / 2) / (joint * 0.6), 0, 1)
+        shade = 1 + spread * self.rng.normal(size=(rows, columns, 1))
+        shade = shade + 0.3 * spread * self.rng.normal(size=(rows, columns, 3))
+        return is_brick, shade[row, column].astype(np.float32), in_row
+
+
+def _grey(plane: Plane) -> Picture:
+    return np.repeat(plane[..., None], 3, 2)
+
+
+def _road(noise: _Noise, variant: int) -> Picture:
+    cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1) * np.clip(
+        noise.broad() - 0.4 * variant % 1, 0, 1
+    )
+    rough, fine, broad = noise.rough(), noise.fine(), noise.broad()
+    return _grey(1 + (0.24 + 0.05 * variant) * fine + 0.14 * rough + 0.06 * broad - 0.6 * cracks)
+
+
+def _pavement(noise: _Noise, variant: int) -> Picture:
+    rows, columns = ((4, 4), (12, 6), (8, 8))[variant]
+    is_slab, shade, _ = noise.bricks(rows, columns, 0.05, 0.07)
+    return shade * _grey((1 + 0.08 * noise.rough() + 0.14 * noise.fine()) * (0.55 + 0.45 * is_slab))
+
+
+def _grass(noise: _Noise, variant: int) -> Picture:
+    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+    dry = 0.14 + 0.1 * variant
+    red = 1 + 0.34 * fine + 0.26 * rough + dry * broad
+    green = 1 + 0.32 * fine + 0.24 * rough + 0.4 * dry * broad
+    return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
+
+
+def _dirt(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.2 * noise.rough() + 0.18 * noise.fine() + 0.12 * noise.broad())
+
+
+def _brick(noise: _Noise, variant: int) -> Picture:
+    is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
+    wall = shade * _grey(1 + 0.1 * noise.fine() + 0.08 * noise.rough())
+    joint = _grey(1.3 + 0.08 * noise.fine()) * np.array([0.9, 1.3, 1.5])
+    return np.where(is_brick[..., None] > 0.5, wall, joint) * _grey(1 + 0.1 * noise.broad())
+
+
+def _plaster(noise: _Noise, variant: int) -> Picture:
+    streaks = np.clip(noise.smooth(2.2, (1, 60), (0.25, 1)) - 0.6, 0, 2)
+    fine, rough, broad = noise.fine(), noise.rough(), noise.broad()
+    return _grey(1 + 0.05 * fine + 0.06 * rough + 0.07 * broad - (0.06 + 0.06 * variant) * streaks)
+
+
+def _stone(noise: _Noise, variant: int) -> Picture:
+    rows, columns = ((8, 5), (6, 3), (12, 6))[variant]
+    is_stone, shade, _ = noise.bricks(rows, columns, 0.06, 0.14)
+    return shade * _grey(
+        (1 + 0.09 * noise.fine() + 0.12 * noise.rough()) * (0.55 + 0.45 * is_stone)
+    )
+
+
+def _concrete(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.07 * noise.fine() + 0.09 * noise.rough() + 0.08 * noise.broad())
+
+
+def _roof(noise: _Noise, variant: int) -> Picture:
+    _, shade, in_row = noise.bricks((14, 20, 10)[variant], 12, 0.04, 0.13)
+    return shade * _grey((0.55 + 0.65 * in_row) * (1 + 0.09 * noise.fine() + 0.1 * noise.broad()))
+
+
+def _bark(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.38 * noise.smooth(1.2, (4, 128), (0.18, 1)) + 0.12 * noise.fine())
+
+
+def _leaf(noise: _Noise, _variant: int) -> Picture:
+    """Light and dark clumps: a ball covered with it looks like foliage, not like a ball."""
+    fine, rough = noise.fine(), noise.rough()
+    clumps = np.clip(1 + 0.55 * noise.smooth(0.8, (6, 60)) + 0.2 * fine, 0.1, 2.5)
+    return np.stack([clumps + 0.15 * rough, clumps + 0.1 * rough, clumps], 2)
+
+
+def _wood(noise: _Noise, variant: int) -> Picture:
+    is_board, shade, _ = noise.bricks(1, 6, 0.03 * variant + 1e-3, 0.08)
+    grain = 0.2 * noise.smooth(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.fine()
+    return shade * _grey((1 + grain) * (0.5 + 0.5 * is_board))
+
+
+def _metal(noise: _Noise, variant: int) -> Picture:
+    return _grey(1 + 0.06 * noise.fine() + (0.08 + 0.1 * variant) * noise.broad())
+
+
+def _paint(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.03 * noise.broad() + 0.012 * noise.fine())
+
+
+def _side(noise: _Noise, variant: int) -> Picture:
+    """A car's flank from rear (u = 0) to front, sill (v = 0) to roof: doors, handles, a strip."""
+    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
+    picture = 1 + 0.04 * noise.broad() + 0.1 * np.clip((y - 0.2) * 2, -0.5, 0.6)
+    gap = lambda where, width: np.clip(1 - np.abs(x - where) / width, 0, 1)  # noqa: E731
+    is_door = (y > 0.16) & (y < 0.62)
+    for where in ((0.3, 0.5, 0.7), (0.34, 0.68), (0.28, 0.49, 0.72))[variant]:
+        picture -= 0.8 * gap(where, 0.006) * is_door
+        handle = (np.abs(x - where - 0.04) < 0.018) & (np.abs(y - 0.52) < 0.01)
+        picture[handle] = 0.35
+    picture[np.abs(y - 0.34) < 0.012 * (variant > 0)] *= 0.55
+    picture[y < 0.15] *= 0.3
+    dirt = np.clip((0.32 - y) * 3, 0, 1) * (0.5 + 0.3 * noise.rough())
+    return _grey(picture * (1 - 0.35 * dirt))
+
+
+def _glass(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.15 * noise.broad())
+
+
+def _pane(noise: _Noise, variant: int) -> Picture:
+    """Curtains, blinds, or the dark of a room."""
+    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
+    curtain = np.clip(np.abs(x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(x * 90))
+    blind = 0.35 * np.sign(np.sin(y * np.pi * 40)) * (y > (0.2, 0.55, 2)[variant])
+    return _grey(0.75 + 0.4 * y + 0.15 * noise.broad() + curtain * (variant != 1) + blind)
+
+
+def _tyre(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.2 * noise.fine() + 0.15 * noise.rough())
+
+
+def _wheel(_noise: _Noise, variant: int) -> Picture:
+    y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX - 0.5
+    turn, out = np.arctan2(y, x), np.hypot(x, y)
+    spokes = np.cos(turn * (5, 7)[variant]) > -0.1
+    return _grey(np.where((spokes | (out > 0.42) | (out < 0.12)), 1.1, 0.15).astype(np.float32))
+
+
+def _plate(noise: _Noise, _variant: int) -> Picture:
+    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
+    for k in range(7):
+        x = 22 + k * 31
+        picture[10:50, x : x + int(noise.rng.integers(8, 22))] = 0.08
+    picture[:, :14] = (0.1, 0.2, 0.9)
+    return picture
+
+
+def _lamp(noise: _Noise, _variant: int) -> Picture:
+    x = np.arange(SIDE_PX, dtype=np.float32)[None] / SIDE_PX
+    return _grey(1 + 0.15 * np.sign(np.sin(x * 40 * np.pi)) + 0 * noise.broad())
+
+
+def _sign(noise: _Noise, variant: int) -> Picture:
+    """Dark figures on a light ground: bars, arrows, words."""
+    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
+    rng = noise.rng
+    color = np.array([(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)])[
+        variant % 4
+    ]
+    for _ in range((3, 5, 8, 14, 24, 4)[variant]):
+        width, height = rng.integers(10, 110), rng.integers(8, 60)
+        x, y = rng.integers(30, 220 - width // 2), rng.integers(30, 220 - height // 2)
+        picture[y : y + height, x : x + width] = color * rng.uniform(0.5, 1.2)
+    return picture
+
+
+def _poster(noise: _Noise, _variant: int) -> Picture:
+    picture = np.ones((SIDE_PX, SIDE_PX, 3), np.float32)
+    rng = noise.rng
+    for _ in range(50):
+        width, height = rng.integers(6, 90), rng.integers(4, 60)
+        x, y = rng.integers(0, SIDE_PX, 2)
+        picture[y : y + height, x : x + width] = rng.uniform(0.05, 1.4, 3)
+    return picture
+
+
+def _cloth(noise: _Noise, variant: int) -> Picture:
+    x = np.arange(SIDE_PX, dtype=np.float32)[None] / SIDE_PX
+    stripes = np.sign(np.sin(x * 2 * np.pi * 6)) * (0, 0.18, 0, 0.3)[variant]
+    folds = noise.smooth(2.0, (2, 30), (0.4, 1))
+    return _grey(1 + 0.16 * folds + 0.07 * noise.fine() + stripes)
+
+
+def _skin(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.06 * noise.broad())
+
+
+def _hills(noise: _Noise, _variant: int) -> Picture:
+    return _grey(1 + 0.4 * noise.smooth(1.0, (16, 128)) + 0.15 * noise.broad())
+
+
+_PAINTERS = {
+    "road": _road, "pavement": _pavement, "grass": _grass, "dirt": _dirt, "curb": _dirt,
+    "brick": _brick, "plaster": _plaster, "stone": _stone, "concrete": _concrete, "roof": _roof,
+    "bark": _bark, "leaf": _leaf, "wood": _wood, "metal": _metal, "paint": _paint, "side": _side,
+    "glass": _glass, "pane": _pane, "tyre": _tyre, "wheel": _wheel, "plate": _plate,
+    "lamp": _lamp, "sign": _sign, "poster": _poster, "cloth": _cloth, "skin": _skin,
+    "hills": _hills,
+}  # fmt: skip

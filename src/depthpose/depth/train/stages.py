@@ -1,0 +1,207 @@
+"""Stage 2: the matcher from pairs with truth."""
+
+from collections.abc import Callable, Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.draw import draw_disparity
+from depthpose.core.loop import Evidence, Turn, make_adam
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.losses import (
+    adversarial_loss,
+    discriminator_loss,
+    disparity_loss,
+    heads_loss,
+    l1_loss,
+    valid_disparity,
+)
+from depthpose.depth.stereo import PSMNet
+from depthpose.depth.stereo.psmnet_matcher import normalise, pad_top_right
+from depthpose.depth.synthesis import Generator, UNetGenerator, make_discriminator
+from depthpose.depth.synthesis.synthesiser import draw_right
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
+from depthpose.depth.train.pairs import TrainingPairs
+
+
+class StereoTask:
+    """Smooth L1 on the three heads (eq. 2.6)."""
+
+    def __init__(
+        self, matcher: PSMNet, config: StereoTraining, held_out: TrainingPairs | None
+    ) -> None:
+        self.config, self.held_out = config, held_out
+        self.matcher = matcher.train()
+        self.modules: dict[str, nn.Module] = {"matcher": matcher}
+        self.optimizers = {"matcher": (make_adam(matcher.parameters(), config.adam), config.adam)}
+
+    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+        """One turn: match and compare."""
+        heads = self.matcher(normalise(batch.left), normalise(batch.right))
+        reach = self.matcher.config.max_disparity_px
+        heads = tuple(head.float() for head in heads)
+        loss = heads_loss(heads, batch.left_px, reach, with_sky=self.config.with_sky)
+        yield Turn("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
+
+    def validate(self) -> Evidence:
+        """Match held-out pairs: mean error and the share of bad pixels; the first as a picture."""
+        if self.held_out is None:
+            return Evidence()
+        self.matcher.eval()
+        evidence = held_out_evidence(self.matcher, self.held_out)
+        self.matcher.train()
+        return evidence
+
+
+def held_out_evidence(
+    matcher: PSMNet, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
+) -> Evidence:
+    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws."""
+    errors, bad, pictures = [], [], {}
+    for index in range(len(held_out)):
+        pair = held_out.read(index)
+        right = pair.right if draw is None else draw(pair.left)
+        found = match_whole(matcher, pair.left, right)
+        is_known = valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
+        if index == 0:
+            views = [pair.left, right, draw_disparity(found)]
+            pictures["left_right_disparity"] = torch.cat(views, 1)
+        if not bool(is_known.any()):
+            continue
+        error = (found - pair.left_px)[is_known].abs()
+        errors.append(float(error.mean()))
+        is_bad = (error > 3) & (error > 0.05 * pair.left_px[is_known])
+        bad.append(float(is_bad.float().mean()))
+    count = max(len(errors), 1)
+    numbers = {"held_out/epe_px": sum(errors) / count, "held_out/d1": sum(bad) / count}
+    return Evidence(numbers=numbers, pictures=pictures)
+
+
+@torch.no_grad()
+def match_whole(
+    matcher: PSMNet, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"]
+) -> Float[Tensor, "h w"]:
+    """Match one pair of any size with the network as it stands."""
+    device = next(matcher.parameters()).device
+    height, width = left.shape[-2:]
+    least = matcher.config.min_side_px
+    padded = [pad_top_right(normalise(v.to(device)), least)[None] for v in (left, right)]
+    return matcher(*padded)[-1][0, -height:, :width].float().cpu()
+
+
+@torch.no_grad()
+def mean_error_px(
+    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], max_px: int
+) -> Float[Tensor, ""]:
+    """Mean absolute disparity error over the pixels with truth [px]."""
+    is_valid = valid_disparity(truth_px, max_px)
+    error = torch.where(is_valid, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
+    return error.sum() / is_valid.sum().clamp(min=1)
+
+
+class ViewTask:
+    """cGAN + lambda L1 (eq. 2.3): the discriminator's turn, then the generator's."""
+
+    def __init__(
+        self, generator: UNetGenerator, config: ViewTraining, held_out: TrainingPairs | None
+    ) -> None:
+        self.config, self.held_out = config, held_out
+        self.generator = generator.train()
+        self.modules: dict[str, nn.Module] = {"generator": generator}
+        self.optimizers = {
+            "generator": (
+                make_adam(generator.parameters(), config.generator_adam),
+                config.generator_adam,
+            )
+        }
+        if config.discriminator != "none":
+            judge = make_discriminator(config.discriminator, config.discriminator_width)
+            self.modules["discriminator"] = judge.train()
+            self.optimizers["discriminator"] = (
+                make_adam(judge.parameters(), config.discriminator_adam),
+                config.discriminator_adam,
+            )
+
+    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+        """Draw once; the discriminator learns from it, then judges it anew."""
+        left, right = 2 * batch.left - 1, 2 * batch.right - 1
+        drawn = self.generator(left)
+        l1 = l1_loss(drawn, right)
+        if self.config.discriminator == "none":
+            yield Turn("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
+            return
+        judge, mode = self.modules["discriminator"], self.config.gan_mode
+        judged = discriminator_loss(judge(left, right), judge(left, drawn.detach()), mode)
+        yield Turn("discriminator", judged, {})
+        fooled = adversarial_loss(judge(left, drawn), mode, is_real=True)
+        loss = fooled + self.config.l1_weight * l1
+        yield Turn("generator", loss, {"l1": l1.detach(), "adversarial": fooled.detach()})
+
+    @torch.no_grad()
+    def validate(self) -> Evidence:
+        """Draw held-out right views: L1 and PSNR, and the first as a picture."""
+        if self.held_out is None:
+            return Evidence()
+        self.generator.eval()
+        errors, squares, pictures = [], [], {}
+        for index in range(len(self.held_out)):
+            pair = self.held_out.read(index)
+            device = next(self.generator.parameters()).device
+            drawn = draw_right(self.generator, pair.left[None].to(device))[0].cpu()
+            errors.append(float((drawn - pair.right).abs().mean()))
+            squares.append(float((drawn - pair.right).square().mean()))
+            if index == 0:
+                pictures["left_right_drawn"] = torch.cat([pair.left, pair.right, drawn], 1)
+        self.generator.train()
+        mean = sum(errors) / len(errors)
+        psnr = sum(-10 * torch.log10(torch.tensor(s)).item() for s in squares) / len(squares)
+        return Evidence(numbers={"held_out/l1": mean, "held_out/psnr": psnr}, pictures=pictures)
+
+
+class FinetuneTask:
+    """Smooth L1 of the final disparity map moves the generator alone (thesis, 2.5.3).
+
+    The matcher keeps its weights and its batch norm statistics: it stays in eval mode.
+    """
+
+    def __init__(
+        self,
+        generator: Generator,
+        matcher: PSMNet,
+        config: FinetuneTraining,
+        held_out: TrainingPairs | None,
+    ) -> None:
+        self.config, self.held_out = config, held_out
+        self.generator = generator.train()
+        self.matcher = matcher.eval().requires_grad_(False)
+        self.modules: dict[str, nn.Module] = {"generator": generator, "matcher": matcher}
+        self.optimizers = {
+            "generator": (make_adam(generator.parameters(), config.adam), config.adam)
+        }
+
+    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+        """One turn: draw, match, compare with the truth."""
+        drawn = draw_right(self.generator, batch.left)
+        (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
+        reach = self.matcher.config.max_disparity_px
+        found_px = found_px.float()
+        loss = disparity_loss(found_px, batch.left_px, reach)
+        l1 = l1_loss(2 * drawn, 2 * batch.right)
+        facts = {"epe": mean_error_px(found_px, batch.left_px, reach), "l1": l1.detach()}
+        yield Turn("generator", loss + self.config.l1_weight * l1, facts)
+
+    @torch.no_grad()
+    def validate(self) -> Evidence:
+        """Depth of held-out left images; the first drawn view as a picture."""
+        if self.held_out is None:
+            return Evidence()
+        self.generator.eval()
+        device = next(self.generator.parameters()).device
+
+        def draw(left: Tensor) -> Tensor:
+            return draw_right(self.generator, left[None].to(device))[0].cpu()
+
+        evidence = held_out_evidence(self.matcher, self.held_out, draw)
+        self.generator.train()
+        return evidence

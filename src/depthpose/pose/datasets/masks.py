@@ -1,0 +1,206 @@
+"""Masks of one object: pictures, and COCO's run lengths in JSON."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_json, write_json
+from depthpose.core.files.images import MAX_PIXELS, opened_image
+from depthpose.pose.datasets.parse import integer, number, read_rows
+
+Runs = tuple[tuple[int, ...], int, int]
+"""Run lengths, height and width."""
+_MOST_BITS = 40
+"""Of a run length in text: no image has as many pixels."""
+
+
+def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
+    """Read a mask image of any kind, where what is not black is the object, or run lengths.
+
+    A ``.json`` file holds COCO's run lengths (``size`` and ``counts``, compressed or not), an
+    annotation or a detection with such a ``segmentation``, or a list of one of these.
+
+    Raises:
+        InputError: it is missing, no picture, or not of one mask.
+    """
+    if path.suffix.lower() == ".json":
+        return _read_json_mask(path)
+    with opened_image(path) as image:
+        values = np.asarray(image.convert("RGB") if image.mode == "P" else image)
+        if values.ndim == 3 and values.shape[2] in (2, 4):
+            values = values[:, :, :-1]  # opaque black is not the object
+    is_object = values != 0
+    return torch.from_numpy(is_object if is_object.ndim == 2 else is_object.any(-1))
+
+
+def _read_json_mask(path: Path) -> Bool[Tensor, "h w"]:
+    content = read_json(path)
+    entries = content if isinstance(content, list) else [content]
+    if len(entries) != 1:
+        raise InputError(
+            f"{path}: holds {len(entries)} masks, where one is needed; leave one there, or name a "
+            "list of BOP detections by --masks, beside --bop"
+        )
+    (entry,) = entries
+    return mask_from_rle(entry, str(path))
+
+
+def mask_from_rle(entry: object, source: str) -> Bool[Tensor, "h w"]:
+    """Decode COCO's run lengths, or what has them as ``segmentation``.
+
+    Raises:
+        InputError: there are none, or they do not add up to their size.
+    """
+    if isinstance(entry, Mapping) and "segmentation" in entry:
+        entry = entry["segmentation"]
+    return decode_rle(*read_runs(entry, source))
+
+
+def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
+    """Turn run lengths, column by column and beginning with the background, into a mask."""
+    values = np.arange(len(counts)) % 2 == 1
+    flat = np.repeat(values, counts)
+    return torch.from_numpy(flat.reshape(width, height).T.copy())
+
+
+def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
+    """Turn a mask into run lengths and its size."""
+    flat = mask.cpu().numpy().T.reshape(-1)
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    runs = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
+    starts_on_object = flat.size > 0 and bool(flat[0])
+    return tuple([0, *runs] if starts_on_object else runs), mask.shape[0], mask.shape[1]
+
+
+def read_runs(entry: object, source: str) -> Runs:
+    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded.
+
+    Raises:
+        InputError: there are none, or they do not add up to the size.
+    """
+    what = f"{source}: the segmentation is no run lengths"
+    if isinstance(entry, list) and entry:
+        raise InputError(
+            f"{source}: the segmentation is a polygon; turn it into run lengths by pycocotools "
+            "(annToRLE), or draw it into a mask image"
+        )
+    if not isinstance(entry, Mapping) or "counts" not in entry:
+        raise InputError(f'{what}; write {{"size": [height, width], "counts": [...]}}')
+    size, counts = entry.get("size"), entry["counts"]
+    if not _is_list_of_counts(size) or len(size) != 2 or 0 in size:
+        raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
+    height, width = size
+    text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
+    runs = _decompress(text, what) if isinstance(text, str) else text
+    if not _is_list_of_counts(runs) or sum(runs) != height * width or height * width > MAX_PIXELS:
+        raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
+    return tuple(runs), height, width
+
+
+def _is_list_of_counts(value: object) -> TypeGuard[list[int]]:
+    return isinstance(value, list) and all(type(v) is int and v >= 0 for v in value)
+
+
+def _decompress(text: str, what: str) -> list[int]:
+    """Undo COCO's text form: five bits a character, runs as differences from the last but one."""
+    runs: list[int] = []
+    value = shift = 0
+    for character in text:
+        bits = ord(character) - 48
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if shift > _MOST_BITS:
+            raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return runs
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detection:
+    """One predicted object.
+
+    Attributes:
+        scene_id: number of the scene.
+        image_id: number of the image.
+        object_id: which object (``category_id``).
+        score: how sure.
+        segmentation: run lengths as in the file, checked.
+        seconds: what the image took, where it is said.
+    """
+
+    scene_id: int
+    image_id: int
+    object_id: int
+    score: float
+    segmentation: Runs
+    seconds: float | None = None
+
+    @property
+    def mask(self) -> Bool[Tensor, "h w"]:
+        """The object's pixels."""
+        return decode_rle(*self.segmentation)
+
+
+def read_detections(path: str | Path) -> list[Detection]:
+    """Read a file of detections; run lengths compressed or not.
+
+    Raises:
+        InputError: it is missing or damaged, or an entry has no mask.
+    """
+    path = Path(path)
+    return [_read(row, f"{path}: entry {i}") for i, row in enumerate(read_rows(path))]
+
+
+def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
+    """Write detections as BOP shares them, run lengths as plain numbers.
+
+    Raises:
+        InputError: the disk refuses.
+    """
+    write_json(Path(path), [_row(detection) for detection in detections])
+
+
+def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
+    """Left, top, width and height; BOP writes -1 four times where there is nothing."""
+    rows, columns = mask.nonzero(as_tuple=True)
+    if len(rows) == 0:
+        return [-1] * 4
+    left, top = int(columns.min()), int(rows.min())
+    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]
+
+
+def _row(detection: Detection) -> dict[str, Any]:
+    counts, height, width = detection.segmentation
+    return {
+        "scene_id": detection.scene_id,
+        "image_id": detection.image_id,
+        "category_id": detection.object_id,
+        "score": detection.score,
+        "bbox": mask_box(detection.mask),
+        "segmentation": {"size": [height, width], "counts": list(counts)},
+        "time": -1.0 if detection.seconds is None else detection.seconds,
+    }
+
+
+def _read(row: dict[str, Any], source: str) -> Detection:
+    seconds = number(row, "time", -1.0, source)
+    return Detection(
+        scene_id=integer(row, "scene_id", source),
+        image_id=integer(row, "image_id", source),
+        object_id=integer(row, "category_id", source),
+        score=number(row, "score", None, source),
+        segmentation=read_runs(row.get("segmentation"), source),
+        seconds=seconds if seconds >= 0 else None,
+    )

@@ -1,0 +1,189 @@
+"""Whole frames: several objects on a table, with a picture, depth and masks."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from depthpose.core.errors import InputError
+from depthpose.core.loop import ticket_generator
+from depthpose.core.render import Raster, rasterize
+from depthpose.core.rigid import Rigid
+from depthpose.pose.augment import measure, random_rotation, uniform, whole
+from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets import BopFrame, BopObject
+from depthpose.pose.synthetic.solids import (
+    Placed,
+    Solid,
+    backdrop,
+    random_clutter,
+    random_light,
+    shade,
+    solid_of,
+    table_of,
+)
+from depthpose.pose.types import ObjectModel
+
+_TRIES = 30
+_FRAMES_SEED = 0xF4A3E5
+
+
+def make_frames(
+    models: Sequence[ObjectModel], config: ObjectsConfig, number: int, first: int = 0
+) -> Iterator[BopFrame]:
+    """Make frames of several objects on a table, as BOP lays them out.
+
+    Frame i is a function of the seed and i alone. A frame shows each object once at most; poses
+    and depths are exact, sensor errors lie over the depth alone.
+
+    Args:
+        models: the objects; their numbers become ``obj_id``.
+        config: camera, sensor, and how many objects and other things there are.
+        number: how many frames.
+        first: number of the first.
+
+    Raises:
+        InputError: no model, two of one number, or a camera that would stand in an object.
+    """
+    if not models:
+        raise InputError("there is no object to show; give one model at least")
+    numbers = [model.number for model in models]
+    twice = sorted({n for n in numbers if numbers.count(n) > 1})
+    if twice:
+        raise InputError(f"two models have the number {twice[0]}; it is their name in the frames")
+    widest_m = max(model.diameter_m for model in models)
+    if config.distance_m[0] < 2 * widest_m:
+        raise InputError(
+            f"distance_m begins at {config.distance_m[0]:g} m, but the largest object is "
+            f"{widest_m:.3g} m wide and would fill the image; begin at {3 * widest_m:.2g}"
+        )
+    solids = [solid_of(model) for model in models]
+    for index in range(first, first + number):
+        yield _make_frame(solids, config, index)
+
+
+def _make_frame(solids: Sequence[Solid], config: ObjectsConfig, index: int) -> BopFrame:
+    generator = ticket_generator(index, config.seed + _FRAMES_SEED)
+    world = _arranged(solids, config, generator)
+    camera_from_world = _viewpoint(config, generator)
+    placed = [
+        Placed(solid=solid, camera_from_model=camera_from_world @ pose) for solid, pose in world
+    ]
+    K = _intrinsics(config)
+    width, height = config.image_px
+    corners = [_corners(thing) for thing in placed]
+    raster = rasterize(torch.cat(corners), K, width, height)
+    owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
+    seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
+    rgb = _picture(placed, raster, K, generator)
+    focal_px = (config.focal_px[0], config.focal_px[0])
+    depth_m = measure(raster.depth_m, focal_px, config.sensor, generator)
+    objects = [
+        _annotated(thing, corners[i], seen == i, K)
+        for i, thing in enumerate(placed)
+        if thing.solid.number is not None
+    ]
+    shown = [thing for thing in objects if bool(thing.silhouette.any())]
+    return BopFrame(number=index, K=K, depth_m=depth_m, objects=shown, rgb=rgb)
+
+
+def _arranged(
+    solids: Sequence[Solid], config: ObjectsConfig, generator: torch.Generator
+) -> list[tuple[Solid, Rigid]]:
+    """Lay things on the table, none in another, in the table's frame (z up)."""
+    low, high = (min(n, len(solids)) for n in config.frame_objects)
+    order = torch.randperm(len(solids), generator=generator)
+    chosen = [solids[i] for i in order[: low + whole(generator, high - low + 1)].tolist()]
+    low, high = config.frame_clutter
+    chosen += [random_clutter(generator) for _ in range(low + whole(generator, high - low + 1))]
+    floor = Rigid(torch.eye(3), torch.zeros(3))
+    placed: list[tuple[Solid, Rigid]] = []
+    circles: list[tuple[float, float, float]] = []
+    for solid in chosen:
+        pose, circle = _free_place(solid, circles, generator)
+        if pose is not None:
+            placed.append((solid, pose))
+            circles.append(circle)
+    return [*placed, (table_of(uniform(generator, 0.8, 3.0), generator), floor)]
+
+
+def _free_place(
+    solid: Solid, circles: Sequence[tuple[float, float, float]], generator: torch.Generator
+) -> tuple[Rigid | None, tuple[float, float, float]]:
+    R = random_rotation(generator).float()
+    corners = solid.triangles_m.reshape(-1, 3) @ R.mT
+    middle = (corners.amin(0) + corners.amax(0)) / 2
+    radius_m = float((corners - middle)[:, :2].norm(dim=1).max())
+    for attempt in range(_TRIES):
+        reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
+        x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
+        if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
+            shift = torch.tensor([x - float(middle[0]), y - float(middle[1]),
+                                  -float(corners[:, 2].min())])  # fmt: skip
+            return Rigid(R, shift), (x, y, radius_m)
+    return None, (0.0, 0.0, 0.0)
+
+
+def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
+    """Look down at about the middle of the table, from 25 to 85 degrees above it."""
+    up, around = math.radians(uniform(generator, 25.0, 85.0)), uniform(generator, 0.0, 2 * math.pi)
+    distance_m = uniform(generator, *config.distance_m)
+    flat = math.cos(up)
+    eye = [flat * math.cos(around), flat * math.sin(around), math.sin(up)]
+    forward = -torch.tensor(eye)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0
+    )
+    R = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    roll = uniform(generator, -0.3, 0.3)
+    c, s = math.cos(roll), math.sin(roll)
+    R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
+    target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
+    return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))
+
+
+def _intrinsics(config: ObjectsConfig) -> Float[Tensor, "3 3"]:
+    (fx, fy), (cx, cy) = config.focal_px, config.centre_px
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _corners(thing: Placed) -> Float[Tensor, "n 3 3"]:
+    return thing.camera_from_model.apply(thing.solid.triangles_m)
+
+
+def _annotated(
+    thing: Placed, corners: Float[Tensor, "n 3 3"], visible: Bool[Tensor, "h w"], K: Tensor
+) -> BopObject:
+    assert thing.solid.number is not None
+    height, width = visible.shape
+    alone = rasterize(corners, K, width, height, with_barycentric=False)
+    return BopObject(
+        number=thing.solid.number,
+        camera_from_model=thing.camera_from_model,
+        visible=visible,
+        silhouette=alone.depth_m.isfinite(),
+    )
+
+
+def _picture(
+    placed: Sequence[Placed], raster: Raster, K: Tensor, generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    height, width = raster.depth_m.shape
+    image = backdrop(height, width, generator)
+    table_up = placed[-1].camera_from_model.R[:, 2]
+    light = random_light(table_up, generator)
+    image[:, raster.primitive >= 0] = shade(placed, raster, K, light).mT
+    return _exposed(image, generator)
+
+
+def _exposed(image: Float[Tensor, "3 h w"], generator: torch.Generator) -> Float[Tensor, "3 h w"]:
+    """Blur a little, tint, expose, add noise, and bring linear light to sRGB's curve."""
+    blur = uniform(generator, 0.0, 0.3)
+    near = torch.nn.functional.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
+    image = torch.lerp(image, near, blur)
+    tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
+    gain = math.exp(uniform(generator, -0.8, 0.2))
+    noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
+    return (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)

@@ -1,0 +1,121 @@
+"""What is not a known object and may be taken for it: models to be seen in its place."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.augment import random_rotation, uniform, whole
+from depthpose.pose.mesh import make_model
+from depthpose.pose.synthetic.parts import PARTS, make_part
+from depthpose.pose.types import ObjectModel
+
+NegativeKind = Literal[
+    "another object", "scaled", "mirrored", "blob", "plate", "box or cylinder", "ball", "hand"
+]
+"""What a negative is."""
+SCALES = (0.8, 0.9, 1.1, 1.2)
+"""Of a scaled copy."""
+_SIZES = (0.5, 1.1)
+"""Of what has no model, in diameters of the object that is asked for."""
+
+
+def negative_of(
+    model: ObjectModel,
+    kind: NegativeKind,
+    others: Sequence[ObjectModel],
+    generator: torch.Generator,
+    scale: float | None = None,
+) -> ObjectModel:
+    """Make something that is not an object, and bears its name.
+
+    Args:
+        model: the object that will be asked for.
+        kind: of negative.
+        others: objects of which another one is taken; where there is none, one of our parts.
+        generator: of the chance.
+        scale: of a scaled copy; None: one of :data:`SCALES`.
+    """
+    if kind == "another object":
+        known = [other for other in others if other.name != model.name]
+        if not known:
+            known = [make_part(name) for name in PARTS if name != model.name]
+        return dataclasses.replace(known[whole(generator, len(known))], name=model.name)
+    if kind == "scaled":
+        return scaled(model, scale or SCALES[whole(generator, len(SCALES))])
+    return mirrored(model) if kind == "mirrored" else _solid(model, kind, generator)
+
+
+def scaled(model: ObjectModel, times: float) -> ObjectModel:
+    """Make an object so many times as large."""
+    return dataclasses.replace(
+        model,
+        vertices_m=times * model.vertices_m,
+        keypoints_m=times * model.keypoints_m,
+        diameter_m=times * model.diameter_m,
+    )
+
+
+def mirrored(model: ObjectModel) -> ObjectModel:
+    """Mirror an object across the plane through the origin that x is normal to."""
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    return dataclasses.replace(
+        model,
+        vertices_m=model.vertices_m * flip,
+        normals=model.normals * flip,
+        keypoints_m=model.keypoints_m * flip,
+        faces=model.faces.flip(-1),
+    )
+
+
+def _solid(model: ObjectModel, kind: NegativeKind, generator: torch.Generator) -> ObjectModel:
+    import trimesh
+
+    mesh: Any
+    size_m = model.diameter_m * uniform(generator, *_SIZES)
+    flat, thin = uniform(generator, 0.3, 1.0), uniform(generator, 0.3, 1.0)
+    match kind:
+        case "plate":
+            mesh = trimesh.creation.box((size_m, flat * size_m, 0.01 * size_m))
+        case "ball":
+            mesh = trimesh.creation.icosphere(3, 0.5 * size_m)
+        case "blob":
+            mesh = trimesh.creation.icosphere(3, 0.5 * size_m)
+            mesh.vertices *= _bumps(torch.tensor(mesh.vertices), generator).numpy()
+        case "hand":
+            mesh = _hand(size_m, generator)
+        case _ if whole(generator, 2):
+            mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
+        case _:
+            mesh = trimesh.creation.cylinder(0.5 * flat * size_m, size_m, 32)
+    vertices_m, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
+    return make_model(vertices_m, faces, name=model.name, number=model.number)
+
+
+def _bumps(points: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Give a factor for the radius at each point, by a few waves over the directions."""
+    way = torch.nn.functional.normalize(points.double(), dim=-1)
+    waves = 2 * torch.randn(6, 3, generator=generator).double()
+    phases = 2 * math.pi * torch.rand(6, generator=generator).double()
+    return 1 + 0.12 * (way @ waves.T + phases).sin().sum(-1, keepdim=True)
+
+
+def _hand(size_m: float, generator: torch.Generator) -> Any:  # noqa: ANN401  trimesh's types
+    """Make a bunch of capsules: a palm and five fingers that bend."""
+    import trimesh
+
+    palm = trimesh.creation.box((0.45 * size_m, 0.45 * size_m, 0.14 * size_m))
+    pieces = [palm]
+    for k in range(5):
+        length = size_m * uniform(generator, 0.25, 0.5)
+        finger = trimesh.creation.capsule(length, size_m * uniform(generator, 0.04, 0.07))
+        spread = random_rotation(generator)
+        near = torch.eye(3) + 0.6 * (spread - torch.eye(3))
+        u, _, vh = torch.linalg.svd(near)
+        at = torch.tensor([0.1 * (k - 2), 0.2, 0.0]) * size_m
+        pose = Rigid((u @ vh).double(), at.double())
+        pieces.append(finger.apply_transform(pose.matrix().numpy()))
+    return trimesh.util.concatenate(pieces)

@@ -1,0 +1,201 @@
+"""Depth on a page: picture, depth, confidence, right view, error, and the cloud that turns."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.camera import Camera, StereoRig, back_project
+from depthpose.core.draw import (
+    depth_scale,
+    draw_depth,
+    draw_disparity,
+    draw_error_points,
+    draw_points,
+    draw_share,
+    rising_scale,
+)
+from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud
+from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.report.scene import Layer, Scene, colored_points
+from depthpose.report.tables import Drawing, Section
+
+WORST_PX = 4.0
+"""Of disparity: the brightest colour of an error."""
+WORST_SHARE = 0.3
+"""Of depth, as a share of the truth."""
+
+_SPARSE = 0.25
+"""Below this share of known pixels, LiDAR's, points are grown to be seen."""
+_RADIUS_PX = 2
+_TRUE = (0.1, 0.8, 0.2)
+_TRUE_POINTS = 20_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthError:
+    """How far an estimate is from the truth, pixel by pixel; NaN where nothing is compared.
+
+    Attributes:
+        error: pixels of disparity, or depth as a share of the truth.
+        is_disparity: which of the two.
+        true_depth_m: the truth, to be shown too; None: it is not.
+    """
+
+    error: Float[Tensor, "h w"]
+    is_disparity: bool
+    true_depth_m: Float[Tensor, "h w"] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthShown:
+    """An estimate as a page shows it.
+
+    Attributes:
+        pair: what was seen.
+        estimate: what was made of it.
+        range_m: metres of the brightest and the darkest colour.
+        error: where the truth is known.
+    """
+
+    pair: StereoInput
+    estimate: DepthEstimate
+    range_m: tuple[float, float] = COLOR_RANGE_M
+    error: DepthError | None = None
+
+
+def depth_section(
+    title: str, shown: DepthShown, text: str = "", *, with_image: bool = True
+) -> Section:
+    """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D."""
+    seen = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
+    own = [_map_drawing(shown), *_error_drawings(shown), *_other_drawings(shown.estimate)]
+    return Section(
+        title=title,
+        text=text,
+        facts=depth_facts(shown.pair, shown.estimate),
+        pictures=[*seen, *own],
+        scenes=_scenes(title, shown),
+    )
+
+
+def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> list[tuple[str, str]]:
+    """Say the sizes and the metres of an estimate.
+
+    Args:
+        pair: what was seen.
+        found: what was made of it.
+        focal: words behind the focal length.
+    """
+    camera, depth_m = pair.camera, found.depth_m
+    height, width = pair.left.shape[1:]
+    facts = [("size", f"{width} x {height} px")]
+    if isinstance(camera, Camera):
+        facts.append(("focal length", f"{float(camera.K[0, 0]):.1f} px{focal}"))
+    if pair.right is not None and isinstance(camera, StereoRig):
+        facts.append(("baseline", f"{camera.baseline_m:g} m"))
+    if depth_m is not None:
+        known_m = depth_m[depth_m.isfinite()]
+        facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
+        if found.is_sky is not None:
+            facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
+        if len(known_m):
+            low, middle, high = (float(f(known_m)) for f in (torch.min, torch.median, torch.max))
+            facts.append(("nearest, middle, farthest", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
+    if found.warning:
+        facts.insert(0, ("warning", found.warning))
+    if found.confidence is not None:
+        facts.append(("mean confidence", f"{float(found.confidence.nanmean()):.2f}"))
+    return facts
+
+
+def said_grey(found: DepthEstimate) -> str:
+    """Say what grey is in the picture of an estimate."""
+    return "grey: none" if found.is_sky is None else "grey: sky or no answer"
+
+
+def depth_scene(
+    pair: StereoInput, found: DepthEstimate, far_m: float, caption: str = "The cloud"
+) -> Scene:
+    """Show the points nearer than ``far_m`` in the colours of the image."""
+    return Scene(
+        caption=f"{caption} up to {far_m:g} m, in the camera's frame",
+        layers=[Layer(name="points", shape=estimate_cloud(pair, found, far_m))],
+    )
+
+
+def _map_drawing(shown: DepthShown) -> Drawing:
+    found = shown.estimate
+    if found.depth_m is None:
+        return Drawing(
+            image=draw_disparity(found.disparity_px),
+            caption=f"estimated disparity, large (near) bright; {said_grey(found)}",
+            scale=rising_scale("disparity [px]", 96.0, has_more=True),
+        )
+    return Drawing(
+        image=draw_depth(found.depth_m, *shown.range_m),
+        caption=f"estimated depth, near bright and far dark; {said_grey(found)}",
+        scale=depth_scale(*shown.range_m),
+    )
+
+
+def _other_drawings(found: DepthEstimate) -> list[Drawing]:
+    drawings: list[Drawing] = []
+    if found.confidence is not None:
+        drawings.append(
+            Drawing(
+                image=draw_share(1 - found.confidence),
+                caption="confidence: bright is sure, dark a guess",
+                scale=rising_scale("confidence", 1.0),
+            )
+        )
+    if found.right is not None:
+        drawings.append(Drawing(image=found.right, caption="right view as drawn"))
+    return drawings
+
+
+def _error_drawings(shown: DepthShown) -> list[Drawing]:
+    """Draw the truth where it is to be shown, and the error."""
+    if shown.error is None:
+        return []
+    error, left, true_m = shown.error, shown.pair.left, shown.error.true_depth_m
+    is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE
+    where = "over the dimmed image" if is_sparse else "grey: not compared"
+    top = WORST_PX if error.is_disparity else WORST_SHARE
+    what = "disparity error" if error.is_disparity else "depth error as a share of the truth"
+    bar = ("disparity error [px]", top) if error.is_disparity else ("depth error [%]", 100 * top)
+    image = (
+        draw_error_points(left, error.error, top, _RADIUS_PX)
+        if is_sparse
+        else draw_share(1 - error.error / top)
+    )
+    caption = f"{what}: dark is right, bright is wrong; {where}"
+    drawing = Drawing(image=image, caption=caption, scale=rising_scale(*bar, has_more=True))
+    if true_m is None:
+        return [drawing]
+    near_m, far_m = shown.range_m
+    truth = (
+        draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
+        if is_sparse
+        else draw_depth(true_m, near_m, far_m)
+    )
+    bar = depth_scale(near_m, far_m)
+    return [Drawing(image=truth, caption=f"true depth; {where}", scale=bar), drawing]
+
+
+def _scenes(title: str, shown: DepthShown) -> list[Scene]:
+    """Show the cloud where there are metres, and the true points in green."""
+    camera = shown.pair.camera
+    if shown.estimate.depth_m is None or camera is None:
+        return []
+    far_m = shown.range_m[1]
+    scene = depth_scene(shown.pair, shown.estimate, far_m, f"{title}: the cloud")
+    if shown.error is None or shown.error.true_depth_m is None:
+        return [scene]
+    true_m = back_project(shown.error.true_depth_m, camera.K).reshape(-1, 3).float()
+    true_m = true_m[true_m.isfinite().all(-1) & (true_m[:, 2] <= far_m)]
+    true_m = take_evenly(true_m, _TRUE_POINTS)
+    layer = Layer(name="true points", shape=colored_points(true_m, _TRUE))
+    return [Scene(caption=f"{scene.caption}; the truth in green", layers=[*scene.layers, layer])]

@@ -1,0 +1,1 @@
+"""The thesis's printed tables and figures, and ours joined to them."""

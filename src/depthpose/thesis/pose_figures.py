@@ -1,0 +1,247 @@
+"""Figure 3-2: what the network makes of each point, as a colour, on the posed cloud."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.draw import draw_lines
+from depthpose.core.errors import InputError
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.prepare import AnyInput, Refusal, prepare_cloud
+from depthpose.pose.mesh import sample_surface
+from depthpose.pose.network import ResUNet
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.types import ObjectModel
+
+_GAP_PX = 8
+
+# Spectral of ColorBrewer (Brewer, 2003): red over yellow to blue.
+_SPECTRAL = (
+    (158, 1, 66), (213, 62, 79), (244, 109, 67), (253, 174, 97), (254, 224, 139), (255, 255, 191),
+    (230, 245, 152), (171, 221, 164), (102, 194, 165), (50, 136, 189), (94, 79, 162),
+)  # fmt: skip
+
+
+def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+    """Colour numbers from 0 (red) over the middle (yellow) to 1 (blue)."""
+    anchors = torch.tensor(_SPECTRAL, dtype=torch.float32) / 255
+    position = share.float().clamp(0, 1) * (len(anchors) - 1)
+    below = position.long().clamp(max=len(anchors) - 2)
+    return torch.lerp(anchors[below], anchors[below + 1], (position - below)[:, None])
+
+
+def blank(height: int, width: int) -> Float[Tensor, "3 h w"]:
+    """Give an empty white picture."""
+    return torch.ones(3, height, width)
+
+
+def arrange_grid(
+    pictures: Sequence[Float[Tensor, "3 _ _"]], columns: int
+) -> Float[Tensor, "3 h w"]:
+    """Lay pictures out in rows on white, each in a cell as large as the largest.
+
+    Raises:
+        InputError: there is no picture.
+    """
+    if not pictures:
+        raise InputError("a figure of no picture cannot be arranged; give one at least.")
+    height = max(picture.shape[1] for picture in pictures)
+    width = max(picture.shape[2] for picture in pictures)
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    grid = blank(rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX)
+    for k, picture in enumerate(pictures):
+        top, left = (k // columns) * (height + _GAP_PX), (k % columns) * (width + _GAP_PX)
+        grid[:, top : top + picture.shape[1], left : left + picture.shape[2]] = picture
+    return grid
+
+
+def draw_discs(
+    image: Float[Tensor, "3 h w"],
+    places: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
+    radius_px: float,
+) -> Float[Tensor, "3 h w"]:
+    """Draw points as discs.
+
+    Args:
+        image: what they are drawn on; it is not changed.
+        places: (u, v) in pixels, and the distance: near ones cover far ones.
+        colors: RGB in [0, 1].
+        radius_px: of each disc.
+    """
+    height, width = image.shape[1:]
+    reach = int(radius_px) + 1
+    steps = torch.cartesian_prod(*[torch.arange(-reach, reach + 1)] * 2)
+    steps = steps[steps.double().norm(dim=1) <= radius_px]
+    order = places[:, 2].argsort(descending=True, stable=True)
+    cells = places[order, None, :2].round().long() + steps
+    u, v = cells.unbind(-1)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    # Of the discs that cover a pixel the last in this order, the nearest, is seen.
+    rank = torch.arange(len(order))[:, None].expand_as(u)
+    seen = torch.full((height * width,), -1)
+    seen.scatter_reduce_(0, (v * width + u)[inside], rank[inside], "amax")
+    drawn = image.flatten(1).clone()
+    is_drawn = seen >= 0
+    drawn[:, is_drawn] = colors[order][seen[is_drawn]].to(image).T
+    return drawn.view_as(image)
+
+
+_SURFACE = 4000
+_MARGIN = 1.08
+_TURN_RAD, _TILT_RAD = math.radians(35), math.radians(20)
+"""From where models are looked at: from the side and somewhat from above."""
+
+
+@torch.inference_mode()
+def seen_points(
+    net: GeoPoseNet, given: AnyInput
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
+    """Give the points that the network sees of an input, and its features of them.
+
+    Returns:
+        Points in the camera frame, and the features before the last layer; None where the input
+        cannot be posed.
+
+    Raises:
+        InputError: the weights are of another kind.
+    """
+    network = net.weights.network
+    if not isinstance(network, ResUNet):
+        raise InputError("figure 3-2 shows features of the sparse network; give weights of it")
+    model = next(m for m in net.weights.models if m.name == given.object)
+    prepared = prepare_cloud(given, model, net.weights.cloud, net.config)
+    if isinstance(prepared, Refusal):
+        return None
+    grid = prepared.voxels
+    rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
+    voxels = Voxels.from_points(rows, grid.features)
+    return prepared.points_m, network.point_features(voxels).float()
+
+
+def draw_features(
+    points_m: Float[Tensor, "n 3"],
+    share: Float[Tensor, " n"],
+    model: ObjectModel,
+    size_px: int = 400,
+) -> Float[Tensor, "3 size size"]:
+    """Draw a cloud in the frame of its model, which is black.
+
+    Looked at along parallel lines from the side that the cloud was seen from, so that the model
+    does not hide it; the model's z axis is up.
+
+    Args:
+        points_m: in the model frame.
+        share: 0..1 for each point: its colour in the Spectral scale.
+        model: the object.
+        size_px: side of the picture.
+    """
+    surface_m = sample_surface(model, _SURFACE)[0].double()
+    middle_m = (surface_m.amin(0) + surface_m.amax(0)) / 2
+    view = _view_of(points_m.double() - middle_m)
+    scale = size_px / (_MARGIN * model.diameter_m)
+    image = blank(size_px, size_px)
+    black = torch.zeros(len(surface_m), 3)
+    image = draw_discs(image, _places(surface_m - middle_m, view, scale, size_px), black, 1.0)
+    places = _places(points_m.double() - middle_m, view, scale, size_px)
+    return draw_discs(image, places, spectral(share), max(2.0, size_px / 110))
+
+
+def _view_of(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+    """Rows: right, down and forward of a view from the side where the points lie."""
+    out = points.mean(0)
+    azimuth = math.atan2(float(out[1]), float(out[0])) + _TURN_RAD
+    level = math.hypot(float(out[0]), float(out[1]))
+    tilt = math.atan2(float(out[2]), level) * 0.5 + _TILT_RAD
+    forward = -torch.tensor([
+        math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt),
+    ], dtype=torch.float64)  # fmt: skip
+    right = torch.tensor([-math.sin(azimuth), math.cos(azimuth), 0.0], dtype=torch.float64)
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
+def _places(
+    points: Float[Tensor, "n 3"], view: Float[Tensor, "3 3"], scale: float, size_px: int
+) -> Float[Tensor, "n 3"]:
+    seen = points @ view.T * scale
+    return seen + torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
+
+
+_ARROWS = 220
+_ARROW_PX = 22.0
+_HEAD = 0.35
+_YELLOW, _RED, _INK = (0.95, 0.75, 0.0), (0.85, 0.05, 0.05), (0.15, 0.25, 0.55)
+
+
+def draw_field(
+    points_m: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    true_m: Float[Tensor, "3"],
+    voted_m: Float[Tensor, "3"] | None = None,
+    size_px: int = 480,
+) -> Float[Tensor, "3 size size"]:
+    """Draw directions of some points; a yellow star at the true keypoint, a red cross at the voted.
+
+    An arrow is as long as its direction lies in the plane: one that points away from the viewer is
+    short. The part that is shown holds the cloud and both keypoints.
+
+    Args:
+        points_m: in the camera frame.
+        directions: of unit length, one a point.
+        true_m: the keypoint, in the camera frame.
+        voted_m: what the directions were said to meet at.
+        size_px: side of the picture.
+    """
+    marks = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
+    plane = points_m.double()[:, :2]
+    everything = torch.cat([plane, marks])
+    low, high = everything.amin(0), everything.amax(0)
+    scale = (size_px - 3 * _ARROW_PX) / float((high - low).max().clamp(min=1e-9))
+    middle = (low + high) / 2
+
+    def place(xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+        return (xy - middle) * scale + size_px / 2
+
+    chosen = take_evenly(torch.arange(len(plane)), _ARROWS)
+    starts = place(plane[chosen])
+    image = _draw_arrows(blank(size_px, size_px), starts, directions.double()[chosen, :2])
+    image = _draw_star(image, place(marks[:1])[0])
+    return image if voted_m is None else _draw_cross(image, place(marks[1:])[0])
+
+
+def _draw_arrows(
+    image: Float[Tensor, "3 h w"], starts: Float[Tensor, "m 2"], ways: Float[Tensor, "m 2"]
+) -> Float[Tensor, "3 h w"]:
+    shafts = _ARROW_PX * ways
+    tips = starts + shafts
+    lines = [torch.stack([starts, tips], 1)]
+    for side in (-1.0, 1.0):
+        across = side * torch.stack([-shafts[:, 1], shafts[:, 0]], 1)
+        lines.append(torch.stack([tips, tips - _HEAD * shafts + 0.5 * _HEAD * across], 1))
+    return draw_lines(image, torch.cat(lines), _INK, width_px=1)
+
+
+def _draw_star(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[Tensor, "3 h w"]:
+    angle = torch.arange(10, dtype=torch.float64) * torch.pi / 5 - torch.pi / 2
+    reach = torch.where(torch.arange(10) % 2 == 0, 12.0, 5.0).double()
+    tips = at + torch.stack([angle.cos(), angle.sin()], 1) * reach[:, None]
+    # Filled by spokes: a star is small.
+    steps = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None, None]
+    rim = (tips[None] * (1 - steps) + tips.roll(-1, 0)[None] * steps).flatten(0, 1)
+    spokes = torch.stack([at.expand_as(rim), rim], 1)
+    image = draw_lines(image, spokes, _YELLOW, width_px=2)
+    return draw_lines(image, torch.stack([tips, tips.roll(-1, 0)], 1), (0.0, 0.0, 0.0), width_px=1)
+
+
+def _draw_cross(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[Tensor, "3 h w"]:
+    arms = torch.tensor([[[-9.0, -9], [9, 9]], [[-9, 9], [9, -9]]], dtype=torch.float64)
+    white = draw_lines(image, at + arms * 1.2, (1.0, 1.0, 1.0), width_px=6)
+    return draw_discs(
+        draw_lines(white, at + arms, _RED, width_px=4),
+        torch.tensor([[float(at[0]), float(at[1]), 0.0]]), torch.tensor([_RED]), 2.0,
+    )  # fmt: skip
