@@ -8,13 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from depthpose.cli.help import in_words
+import tyro
+
+from depthpose.cli.help import group
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
     from depthpose.core.engine import Done, Files, Item, Job, RayEngine
 
 
+@group
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Where the work is done."""
@@ -24,9 +27,9 @@ class EngineOptions:
     many results to a shard, OUT/shards/*.tar or *.parquet, listed in OUT/manifest.csv; inputs and
     OUT may be URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest
     (*.parquet, *.csv)."""
-    address: Annotated[str | None, in_words("HOST:PORT")] = None
+    address: str | None = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
-    workers: Annotated[int | None, in_words("N")] = None
+    workers: int | None = None
     """at most; by default as many as the cluster has room for."""
     worker_cpus: float = 1.0
     """cores that each worker asks for."""
@@ -68,6 +71,9 @@ class EngineOptions:
             worker_cpus=self.worker_cpus,
             worker_gpus=self.worker_gpus,
         )
+
+
+Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 @dataclass(frozen=True, kw_only=True)

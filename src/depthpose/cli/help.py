@@ -9,7 +9,16 @@ from difflib import get_close_matches
 from inspect import signature, unwrap
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tyro
 
@@ -40,6 +49,8 @@ def refuse_missing(given: Mapping[str, object]) -> None:
         InputError: a path or weights that are not there.
     """
     for name, value in given.items():
+        if is_dataclass(value):  # a group of options
+            refuse_missing(vars(value))
         for one in value if isinstance(value, list | tuple) else [value]:
             if name in PATHS and isinstance(one, str | Path):
                 _refuse_path(str(one))
@@ -65,13 +76,23 @@ def _refuse_weights(name: str) -> None:
 
 
 _OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
-_OF_NAMES = {"max_memory": "SIZE", "device": "DEVICE", "view": "live|FILE.rrd", "out": "PATH"}
+_OF_NAMES = {"max_memory": "SIZE", "device": "DEVICE", "view": "live|FILE.rrd", "out": "PATH",
+             "address": "HOST:PORT"}  # fmt: skip
 _NOTHING = ("", "None")
+Group = TypeVar("Group")
 
 
 def in_words(metavar: str | None) -> Any:  # noqa: ANN401  tyro's own object
     """Show an option with this in the place of its value; None: as tyro does."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint)
+
+
+def group(options: type[Group]) -> type[Group]:
+    """Show each field of a group of options, a dataclass, with its type in words."""
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        if name in options.__annotations__:
+            options.__annotations__[name] = Annotated[hint, in_words(_metavar(name, hint))]
+    return options
 
 
 def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], Callable[..., int]]:
@@ -102,8 +123,8 @@ def _hint(default: str) -> str:
 
 def _metavar(name: str, hint: Any) -> str | None:  # noqa: ANN401
     """Name a value; None where tyro's own name will do: of positional arguments and flags."""
-    if get_origin(hint) is Annotated:
-        return None
+    if get_origin(hint) is Annotated:  # described elsewhere, or positional
+        return _OF_NAMES.get(name) if name in _OF_NAMES and get_args(hint)[0] is str else None
     if get_origin(hint) in (Union, UnionType):
         (hint,) = (part for part in get_args(hint) if part is not NoneType)
     if get_origin(hint) is Literal:

@@ -1,6 +1,5 @@
-"""What the trainings of both kinds share: the words that change a config, and progress."""
+"""Progress of trainings, and what they leave."""
 
-import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,11 +13,6 @@ def say_trained(path: Path) -> None:
     print(f"trained weights: {path}")
     card = path.with_suffix(".md")
     print(card.read_text() if card.is_file() else "", end="")
-
-
-def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
-    """Give a config with other values; None leaves a knob as it is."""
-    return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
 
 
 @contextmanager

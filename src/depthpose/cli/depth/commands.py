@@ -1,16 +1,15 @@
 """``depthpose depth ...``."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
-from depthpose.cli.engine import EngineOptions, Weights
+from depthpose.cli.engine import Engine, EngineOptions, Weights
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, FloorName, MatcherConfig, Speed
 
 Precision = Literal["fp32", "bf16"]
-Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 def predict(

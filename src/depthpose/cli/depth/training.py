@@ -6,7 +6,8 @@ from typing import Literal
 
 import tyro
 
-from depthpose.cli.training import changed, progress_bar, say_trained
+from depthpose.cli.options import Training, TrainingOptions, changed
+from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
@@ -24,13 +25,7 @@ def train(
     matcher: str | None = None,
     start: str | None = None,
     encoder: str | None = None,
-    steps: int | None = None,
-    seed: int | None = None,
-    device: Literal["auto", "cpu"] | None = None,
-    precision: Literal["fp32", "bf16", "fp16"] | None = None,
-    resume: bool = False,
-    finish: bool = False,
-    view: str | None = None,
+    training: Training = TrainingOptions(),  # noqa: B008  frozen
 ) -> int:
     """Train a generator, the matcher, or the first through the second, by stages.
 
@@ -60,14 +55,6 @@ def train(
         start: view, select, stereo: weights to begin with.
         encoder: select: weights of the encoder to begin with, of 'depthpose weights import
             efficientnet-lite0'.
-        steps: optimiser steps in place of the config's length.
-        seed: decides initial weights, order, augmentation and dropout.
-        device: auto takes what accelerate finds; cpu takes no GPU.
-        precision: arithmetic of the forward pass.
-        resume: go on from the state that OUT holds.
-        finish: make weights and card of the state that OUT holds, without another step; Ctrl-C
-            twice does the same while it trains.
-        view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -76,9 +63,7 @@ def train(
 
     kind, run_stage = STAGES[stage]
     chosen = kind() if config is None else read_config(config, kind)
-    loop = changed(chosen.loop, seed=seed, device=device, precision=precision)
-    if steps is not None:
-        loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    loop = training.applied(chosen.loop)
     pairs = changed(chosen.pairs, folders=data or None)
     if held_out:
         looked_at = chosen.held_out or PairsConfig(
@@ -95,8 +80,9 @@ def train(
         ):
             raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
     chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
-    with progress_bar(view) as on_step:
-        path = run_stage(chosen, Run(folder=out, resume=resume, finish=finish, on_step=on_step))
+    with progress_bar(training.view) as on_step:
+        run = Run(folder=out, resume=training.resume, finish=training.finish, on_step=on_step)
+        path = run_stage(chosen, run)
     if find_shard().rank == 0:
         say_trained(path)
     return 0

@@ -1,11 +1,10 @@
 """``depthpose pose ...``."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
-
-from depthpose.cli.engine import EngineOptions, Weights
+from depthpose.cli.engine import Engine, EngineOptions, Weights
+from depthpose.cli.options import Voting, voting_config
 from depthpose.core.errors import InputError
 from depthpose.pose.config import (
     DiameterTable,
@@ -13,17 +12,7 @@ from depthpose.pose.config import (
     EvaluationConfig,
     SymmetryRule,
     Unit,
-    VotingConfig,
-    VotingMethod,
 )
-
-Voting = Literal["ransac", "least-squares"]
-Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
-
-
-def voting_method(word: Voting) -> VotingMethod:
-    """Give the method of a word, which a shell takes without quotes."""
-    return "least squares" if word == "least-squares" else "ransac"
 
 
 def predict(
@@ -97,7 +86,7 @@ def predict(
 
     _refuse_mixture(cloud, depth, bop)
     config = EstimateConfig(
-        voting=VotingConfig(method=voting_method(voting), hypotheses=hypotheses),
+        voting=voting_config(voting, hypotheses),
         with_icp=icp,
         up_to_symmetry=up_to_symmetry,
         device=own_device(device),
@@ -199,9 +188,7 @@ def evaluate(
     dataset = evaluating.open_instances(bop, split, objects, targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
     claim_folder(out, {"command": "pose evaluate"}, files)
-    config = EstimateConfig(
-        voting=VotingConfig(method=voting_method(voting)), with_icp=icp, device=device
-    )
+    config = EstimateConfig(voting=voting_config(voting), with_icp=icp, device=device)
     methods = pose_methods(weights, config, tuple(dataset.objects.values()))
     shown = find_masks(masks, dataset, out, device) if methods else []
     paths = [predict_all(dataset, method, one, out) for method in methods for one in shown]

@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 import tyro
 
-from depthpose.cli.training import changed, progress_bar, say_trained
+from depthpose.cli.options import Training, TrainingOptions, changed
+from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 
 _START = "parts"
@@ -26,14 +27,8 @@ def train(
     data: str | None = None,
     what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose",
     start: str | None = None,
-    steps: int | None = None,
     workers: int | None = None,
-    seed: int | None = None,
-    device: Literal["auto", "cpu"] | None = None,
-    precision: Literal["fp32", "bf16", "fp16"] | None = None,
-    resume: bool = False,
-    finish: bool = False,
-    view: str | None = None,
+    training: Training = TrainingOptions(),  # noqa: B008  frozen
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
@@ -57,15 +52,7 @@ def train(
         what: which network; all but pose are compared with it, or cut the object out for it.
         start: weights to begin with, by name or file. A CAD file without a config begins with
             'parts', which saves two thirds of the first minutes; 'nothing' begins anew.
-        steps: optimiser steps in place of the config's length.
         workers: processes that make views beside the one that trains.
-        seed: decides initial weights, views and their order.
-        device: auto takes what accelerate finds; cpu takes no GPU.
-        precision: arithmetic of the forward pass.
-        resume: go on from the state that OUT holds.
-        finish: calibrate and write weights of the state that OUT holds, without another step;
-            Ctrl-C twice does the same while it trains.
-        view: live draws the losses in Rerun's viewer (an extra); FILE.rrd records them.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -75,9 +62,7 @@ def train(
     chosen = kind() if config is None else read_config(config, kind)
     if cad and unit is None:
         raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
-    loop = changed(chosen.loop, seed=seed, device=device, precision=precision, workers=workers)
-    if steps is not None:
-        loop = dataclasses.replace(loop, steps=steps, epochs=None)
+    loop = training.applied(chosen.loop, workers=workers)
     if start is None and what == "pose" and cad and config is None:
         start = _START
     chosen = dataclasses.replace(chosen, loop=loop)
@@ -88,9 +73,11 @@ def train(
     if data is not None:
         chosen = _with_data(chosen, data)
     is_first = find_shard().rank == 0
-    with progress_bar(view) as on_step:
+    with progress_bar(training.view) as on_step:
         tell = partial(print, flush=True) if is_first else None
-        run = Run(folder=out, resume=resume, finish=finish, on_step=on_step, tell=tell)
+        run = Run(
+            folder=out, resume=training.resume, finish=training.finish, on_step=on_step, tell=tell
+        )
         path = run_stage(chosen, run)
     if is_first:
         say_trained(path)

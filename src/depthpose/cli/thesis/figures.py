@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
+from depthpose.cli.options import PoseData, PoseDataOptions
+
 
 def figure_3_2(
     weights: str,
     out: Path,
-    linemod: Path | None = None,
-    bop: Path | None = None,
-    split: str = "test",
-    objects: tuple[str, ...] = (),
+    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
     number: int = 4,
     perplexity: float = 40.0,
 ) -> int:
@@ -17,106 +16,85 @@ def figure_3_2(
 
     The features before the last layer (64 numbers a point) of all clouds are mapped to one number
     by an exact t-SNE and shown in the Spectral scale; the model is black. Without a data set the
-    clouds are made views of the weights' objects. Writes figure-3-2.png, panels and report.html.
+    clouds are synthetic views. Writes figure-3-2.png, panels and report.html.
 
         depthpose figure 3-2 --weights W.safetensors --out out/figure-3-2
 
     Args:
         weights: file or name, of the sparse network.
         out: folder for the figure.
-        linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
-        bop: any other data set in BOP's layout.
-        split: test, ...
-        objects: keep these alone, by name or number.
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis import pose_figures as pose_drawing
-    from depthpose.cli.thesis import views as pose_views
+    from depthpose.cli.thesis import pose_figures
+    from depthpose.cli.thesis.views import open_views
     from depthpose.pose.estimator import GeoPoseNet
 
-    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects, made=number)
     net = GeoPoseNet.load(weights)
-    views = pose_views.open_views(net, source, number)
-    panels = pose_drawing.feature_panels(net, views, perplexity)
+    views = open_views(net, data, number, number)
+    panels = pose_figures.feature_panels(net, views, perplexity)
     text = (
         "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
         "model is black, each cloud posed on it by the truth."
     )
-    return pose_drawing.write_figure("3-2", text, panels, out, columns=4)
+    return pose_figures.write_figure("3-2", text, panels, out, columns=4)
 
 
 def figure_3_4(
     weights: str,
     out: Path,
-    linemod: Path | None = None,
-    bop: Path | None = None,
-    split: str = "test",
-    objects: tuple[str, ...] = (),
+    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
     number: int = 20,
     keypoint: int | None = None,
 ) -> int:
     """Draw figure 3-4: true and predicted directions to the keypoint whose vote errs most.
 
     Looks at some views and shows the worst. In the plane of the camera's x and y: a yellow star is
-    the true keypoint, a red cross the voted one. Without a data set the views are made ones of the
-    weights' objects. Writes figure-3-4.png, panels and report.html.
+    the true keypoint, a red cross the voted one. Without a data set the views are synthetic.
+    Writes figure-3-4.png, panels and report.html.
 
         depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4
 
     Args:
         weights: file or name, of the sparse network.
         out: folder for the figure.
-        linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
-        bop: any other data set in BOP's layout.
-        split: test, ...
-        objects: keep these alone, by name or number.
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis import pose_figures as pose_drawing
-    from depthpose.cli.thesis import views as pose_views
+    from depthpose.cli.thesis import pose_figures
+    from depthpose.cli.thesis.views import open_views
     from depthpose.pose.estimator import GeoPoseNet
 
-    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects, made=number)
     net = GeoPoseNet.load(weights)
-    views = pose_views.open_views(net, source, number)
-    panels = pose_drawing.field_panels(net, views, keypoint)
+    views = open_views(net, data, number, number)
+    panels = pose_figures.field_panels(net, views, keypoint)
     text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
-    return pose_drawing.write_figure("3-4", text, panels, out, columns=3)
+    return pose_figures.write_figure("3-4", text, panels, out, columns=3)
 
 
 def figure_3_5(
     weights: str,
     out: Path,
-    linemod: Path | None = None,
-    bop: Path | None = None,
-    split: str = "test",
-    objects: tuple[str, ...] = (),
+    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
     number: int = 6,
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
 
-    Over the picture, or the depth where there is none. Without a data set the views are made ones
-    of the weights' objects. Writes figure-3-5.png, panels and report.html.
+    Over the picture, or the depth where there is none. Without a data set the views are
+    synthetic. Writes figure-3-5.png, panels and report.html.
 
         depthpose figure 3-5 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
     Args:
         weights: file or name, of the method or of a baseline that votes.
         out: folder for the figure.
-        linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
-        bop: any other data set in BOP's layout.
-        split: test, ...
-        objects: keep these alone, by name or number.
         number: how many views.
     """
-    from depthpose.cli.thesis import pose_figures as pose_drawing
-    from depthpose.cli.thesis import views as pose_views
+    from depthpose.cli.thesis import pose_figures
+    from depthpose.cli.thesis.views import open_views
     from depthpose.pose.estimator import GeoPoseNet
 
-    source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects, made=number)
     net = GeoPoseNet.load(weights)
-    views = pose_views.open_views(net, source, number)
-    panels = pose_drawing.box_panels(net, views)
-    return pose_drawing.write_figure("3-5", pose_drawing.BOXES, panels, out, columns=3)
+    views = open_views(net, data, number, number)
+    panels = pose_figures.box_panels(net, views)
+    return pose_figures.write_figure("3-5", pose_figures.BOXES, panels, out, columns=3)

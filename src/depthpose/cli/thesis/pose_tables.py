@@ -7,21 +7,15 @@ from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions
 from depthpose.cli.pose import evaluating as pose_evaluating
 from depthpose.cli.pose import masks as pose_masks
 from depthpose.cli.pose import methods as pose_methods
 from depthpose.cli.thesis.pose_figures import picture_sections
-from depthpose.cli.thesis.views import Source, open_views
+from depthpose.cli.thesis.views import open_views
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.run import claim_folder, environment
-from depthpose.pose.config import (
-    DiameterTable,
-    EstimateConfig,
-    EvaluationConfig,
-    VotingConfig,
-    VotingMethod,
-)
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.evaluate import frames_hash
@@ -51,55 +45,32 @@ class Order:
     pictures: int
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rule:
-    """How to estimate and how to measure."""
-
-    diameters: DiameterTable
-    voting: VotingMethod
-    with_icp: bool
-    with_vsd: bool
-    device: str
-
-    @property
-    def estimate(self) -> EstimateConfig:
-        """Knobs of the estimators."""
-        voting = VotingConfig(method=self.voting)
-        return EstimateConfig(voting=voting, with_icp=self.with_icp, device=self.device)
-
-    @property
-    def evaluation(self) -> EvaluationConfig:
-        """Knobs of the measures."""
-        return EvaluationConfig(diameters=self.diameters, with_vsd=self.with_vsd)
-
-
-def make_order(number: str, source: Source, targets: Path | None, pictures: int) -> Order:
+def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Order:
     """Open the one data set that was named.
 
     Raises:
         InputError: none was named, or two.
     """
-    if source.folder is None:
+    if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
-    dataset = pose_evaluating.open_instances(source.folder, source.split, source.objects, targets)
-    return Order(number=number, dataset=dataset, pictures=pictures)
+    dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
+    return Order(number=number, dataset=dataset, pictures=how.pictures)
 
 
 def reproduce_by_object(
     order: Order,
     weights: Sequence[str],
-    masks: Sequence[str],
-    rule: Rule,
+    how: PoseTableOptions,
     out: Path,
     csv: Sequence[Path] = (),
 ) -> int:
     """Predict what is missing, measure, set beside the print, and write everything."""
     dataset = order.dataset
-    methods = pose_methods.pose_methods(weights, rule.estimate, tuple(dataset.objects.values()))
-    claim_folder(out, _settings(order, methods, rule), _RESULTS)
-    shown = pose_masks.find_masks(masks, dataset, out, rule.device) if methods else []
+    methods = pose_methods.pose_methods(weights, how.estimate, tuple(dataset.objects.values()))
+    claim_folder(out, _settings(order, methods, how), _RESULTS)
+    shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
-    measured = pose_evaluating.measure_all(dataset, [*folders, *csv], rule.evaluation)
+    measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
     numbers = {model.name: number for number, model in dataset.objects.items()}
     rows = join_by_object(measured.rows, numbers, with_published=order.number == "3.2")
     write_table(out, rows)
@@ -114,11 +85,13 @@ def reproduce_by_object(
     return _write(f"{TITLES[order.number]}, on {dataset.folder.resolve().name}", sections, out)
 
 
-def reproduce_voting(weights: str, source: Source, points: Sequence[int], out: Path) -> int:
+def reproduce_voting(
+    weights: str, data: PoseDataOptions, synthetic: int, points: Sequence[int], out: Path
+) -> int:
     """Compare ways of voting on the same directions, block by block of points."""
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
-    views = open_views(net, source)
+    views = open_views(net, data, None, synthetic)
     facts = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12], **views.facts}
     files = [*table_files("rows"), "report.md", "report.html"]
     claim_folder(out, {"command": "reproduce 3.3"}, files)
@@ -146,13 +119,13 @@ def _write(title: str, sections: Sequence[Section], out: Path) -> int:
 
 
 def _settings(
-    order: Order, methods: Sequence[pose_methods.PoseMethod], rule: Rule
+    order: Order, methods: Sequence[pose_methods.PoseMethod], how: PoseTableOptions
 ) -> dict[str, Any]:
     """What decides the results; the files of a run of other settings are not touched."""
     return {
         "table": order.number,
         "frames_sha256": frames_hash(order.dataset.instances),
-        "diameters": rule.diameters,
+        "diameters": how.diameters,
         "methods": {method.name: dict(method.settings) for method in methods},
     }
 

@@ -2,15 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.cli.options import PoseDataOptions
 from depthpose.cli.pose import evaluating as pose_evaluating
 from depthpose.cli.pose import methods as pose_methods
-from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
@@ -23,38 +22,6 @@ from depthpose.report.overlay import grey_depth
 
 MADE_SEED = 3303
 """Of made views of tables and figures: no training begins with it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """Where views come from.
-
-    Attributes:
-        linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
-        bop: any other data set in BOP's layout.
-        split: of it.
-        objects: keep these alone; all where there is none.
-        made: how many made views where no data set is named.
-    """
-
-    linemod: Path | None
-    bop: Path | None
-    split: str
-    objects: tuple[str, ...] = ()
-    made: int = 0
-
-    @property
-    def folder(self) -> Path | None:
-        """The one data set that was named, if any.
-
-        Raises:
-            InputError: two were.
-        """
-        if self.linemod is not None and self.bop is not None:
-            raise InputError(
-                f"two data sets were named, {self.linemod} and {self.bop}; a table is of one."
-            )
-        return self.linemod or self.bop
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,30 +40,31 @@ class Views:
         return grey_depth(self.samples[index].input.depth_m)
 
 
-def open_views(net: GeoPoseNet, source: Source, number: int | None = None) -> Views:
-    """Read the views of a data set, or make some of the objects that the weights know.
+def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
+    """Read the views of a data set, or render some of the objects that the weights know.
 
     Args:
         net: whose objects, under whose names.
-        source: where from.
-        number: of a data set so many from all over; None: all.
+        data: the data set, if any.
+        number: of a data set so many, evenly taken; None: all.
+        synthetic: how many are rendered where no data set is named.
 
     Raises:
         InputError: the weights do not know an object, or a file is damaged.
     """
-    folder = source.folder
+    folder = data.folder
     if folder is None:
-        config = ObjectsConfig(number=source.made, seed=MADE_SEED)
+        config = ObjectsConfig(number=synthetic, seed=MADE_SEED)
         objects = Objects(net.weights.models, config, net.weights.cloud)
-        samples = [objects.view(i) for i in range(source.made)]
+        samples = [objects.view(i) for i in range(synthetic)]
         return Views(
             samples=samples,
             instances=[None] * len(samples),
             facts={"frames": f"made, seed {MADE_SEED}"},
         )
-    dataset = pose_evaluating.open_instances(folder, source.split, source.objects, None)
+    dataset = pose_evaluating.open_instances(folder, data.split, data.objects, None)
     facts = {
-        "frames": f"{folder.resolve().name} {source.split}",
+        "frames": f"{folder.resolve().name} {data.split}",
         "frames_sha256": frames_hash(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
