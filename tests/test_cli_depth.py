@@ -171,7 +171,7 @@ def test_where_depth_comes_from_is_one_word(
     capsys.readouterr()
     other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
     assert main(["depth", "predict", *words, *other]) == 2
-    assert "another matcher matches the drawn view; leave one away" in capsys.readouterr().err
+    assert "another matcher matches the synthesised view; leave one away" in capsys.readouterr().err
 
 
 def test_a_threshold_is_chosen_on_a_folder(

@@ -57,8 +57,8 @@ class PoseDataOptions:
 
 @group
 @dataclass(frozen=True, kw_only=True)
-class PoseTableOptions:
-    """How the poses of a table are estimated and measured."""
+class PoseMeasureOptions:
+    """How poses of a data set are estimated and measured."""
 
     masks: tuple[str, ...] = ("truth",)
     """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
@@ -73,8 +73,6 @@ class PoseTableOptions:
     """refine each pose by ICP."""
     vsd: bool = False
     """measure VSD and BOP's average recall too, which takes most of the time."""
-    pictures: int = 4
-    """instances that the page shows."""
     device: Device = "cpu"
 
     @property
@@ -87,6 +85,15 @@ class PoseTableOptions:
     def evaluation(self) -> EvaluationConfig:
         """Settings of the metrics."""
         return EvaluationConfig(diameters=self.diameters, with_vsd=self.vsd)
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class PoseTableOptions(PoseMeasureOptions):
+    """How the poses of a table are estimated, measured and shown."""
+
+    pictures: int = 4
+    """instances that the page shows."""
 
 
 @group
@@ -124,5 +131,6 @@ def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
 
 
 PoseData = Annotated[PoseDataOptions, tyro.conf.OmitArgPrefixes]
+PoseMeasure = Annotated[PoseMeasureOptions, tyro.conf.OmitArgPrefixes]
 PoseTable = Annotated[PoseTableOptions, tyro.conf.OmitArgPrefixes]
 Training = Annotated[TrainingOptions, tyro.conf.OmitArgPrefixes]

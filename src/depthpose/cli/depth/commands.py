@@ -5,39 +5,43 @@ from typing import Literal
 
 import tyro
 
+from depthpose.cli.depth.options import (
+    ImageNetworks,
+    MatcherOptions,
+    Matching,
+    MatchMatching,
+    MatchOptions,
+    Networks,
+    Output,
+    PairMatching,
+    PairOptions,
+    PredictOutput,
+    Protocol,
+    ProtocolOptions,
+)
 from depthpose.cli.engine import Engine, EngineOptions, Weights
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, FloorName, MatcherConfig, Speed
-
-Precision = Literal["fp32", "bf16"]
+from depthpose.depth.config import FloorName, MatcherConfig
 
 
 def predict(
-    images: tyro.conf.Positional[list[str]],
+    images: tyro.conf.Positional[tuple[str, ...]],
     out: str,
     camera: Path | None = None,
     focal_px: float | None = None,
-    weights: str = "default",
-    matcher: str = "psmnet",
-    answer: Answer | None = None,
-    color_range: tuple[float, float] = (3.0, 80.0),
-    device: str = "cpu",
-    precision: Precision = "fp32",
-    max_memory: str | None = None,
-    batch: int = 1,
-    cloud: bool = False,
-    with_unlike: bool = False,
-    view: str | None = None,
-    engine: Engine = EngineOptions(),  # noqa: B008  frozen
+    networks: Networks = ImageNetworks(),  # noqa: B008  frozen
+    matching: Matching = MatcherOptions(),  # noqa: B008
+    output: Output = PredictOutput(),  # noqa: B008
+    engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
 
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
-    drawn view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
-    NAME.cloud.ply with --cloud. A video gives the files of each frame and
-    NAME.color.mp4. report.html shows some of them, with the cloud in 3D. A rerun skips what is
-    finished; other settings need another --out. No file is written over that is not the run's own.
+    synthesised view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
+    NAME.cloud.ply with --cloud. A video gives the files of each frame and NAME.color.mp4.
+    report.html shows some of them, with the cloud in 3D. A rerun skips what is finished; other
+    settings need another --out. No file is written over that is not the run's own.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --focal-px 1100 --out out
@@ -46,70 +50,54 @@ def predict(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
         camera: JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D,
-            BOP, ROS or OpenCV. A baseline in it is not looked at: one image has none.
+            BOP, ROS or OpenCV. A baseline in it is ignored: one image has none.
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
-        weights: weights with a generator, by name or file ('depthpose weights list').
-        matcher: what matches the drawn view: psmnet (that of the weights), sgbm (OpenCV's), or
-            other weights with a matcher, by name or file.
-        answer: own: the generator's own disparity; matched: the matcher on left and drawn right
-            view; joined: both. Left out: what the weights say; another matcher matches.
-        color_range: metres of the brightest and the darkest colour, the same for all pictures.
-        device: cpu, cuda, cuda:1, ...
-        precision: of the matcher, fp32, or bf16: faster, at some hundredths of a pixel.
-        max_memory: bound on the memory of the matcher, such as 1GB; exact.
-        batch: images of one size that go through the networks together: for a GPU; a processor is
-            busy with one.
-        cloud: write a coloured point cloud, NAME.cloud.ply.
-        with_unlike: answer images that are unlike what the weights know too, with a warning
-            (NAME.warning.txt), in place of refusing them.
-        view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
-        engine: where the work is done.
     """
     from depthpose.cli.depth import methods, predicting
 
-    config = MatcherConfig(
-        device=device, precision=precision, max_memory_bytes=methods.parse_bytes(max_memory)
-    )
-    if not 0 < color_range[0] < color_range[1]:
-        raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
-    if batch < 1:
-        raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
-    if matcher != "psmnet" and answer is not None:
-        raise InputError(
-            f"--answer {answer} and --matcher {matcher}: another matcher matches the drawn view; "
-            "leave one away."
-        )
-    if matcher == "sgbm" and config != MatcherConfig():
-        raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
-    look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
+    config = matching.config
+    output.refuse_unusable()
+    networks.refuse_contradiction(matching)
     if engine.is_ray:
-        from depthpose.cli.depth import engine as engine_depth
-
-        if matcher not in ("psmnet", "sgbm"):
-            raise InputError(
-                f"--matcher {matcher}: --engine ray takes psmnet or sgbm; make one file of both by "
-                "'depthpose weights pack G --matcher S --out W'"
-            )
-        recipe = engine_depth.NetRecipe(
-            weights=Weights.read(weights),
-            config=config,
-            with_right=False,
-            with_sgbm=matcher == "sgbm",
-            with_unlike=with_unlike,
-            answer=answer,
-        )
-        return engine_depth.predict(images, (camera, focal_px), recipe, look, out, engine)
+        return _predict_on_ray(images, (camera, focal_px), networks, config, output, out, engine)
     sources = predicting.find_sources(images, Path(out))
     lens = predicting.read_lens(camera, focal_px, sources[0])
     method = methods.weights_method(
-        weights,
+        networks.weights,
         config,
         with_right=False,
-        matcher=matcher,
-        with_unlike=with_unlike,
-        answer=answer,
+        matcher=networks.matcher,
+        with_unlike=networks.with_unlike,
+        answer=networks.answer,
     )
-    return predicting.predict_all(sources, lens, method, Path(out), look, view)
+    return predicting.predict_all(sources, lens, method, Path(out), output)
+
+
+def _predict_on_ray(
+    images: tuple[str, ...],
+    lens: tuple[Path | None, float | None],
+    networks: ImageNetworks,
+    config: MatcherConfig,
+    output: PredictOutput,
+    out: str,
+    on: EngineOptions,
+) -> int:
+    from depthpose.cli.depth import engine
+
+    if networks.matcher not in ("psmnet", "sgbm"):
+        raise InputError(
+            f"--matcher {networks.matcher}: --engine ray takes psmnet or sgbm; make one file of "
+            "both by 'depthpose weights pack G --matcher S --out W'"
+        )
+    recipe = engine.NetRecipe(
+        weights=Weights.read(networks.weights),
+        config=config,
+        with_right=False,
+        with_sgbm=networks.matcher == "sgbm",
+        with_unlike=networks.with_unlike,
+        answer=networks.answer,
+    )
+    return engine.predict(images, lens, recipe, output, out, on)
 
 
 def match(
@@ -120,15 +108,10 @@ def match(
     out: str,
     weights: str | None = None,
     matcher: str = "psmnet",
-    device: str = "cpu",
-    speed: Speed = "fine",
-    precision: Precision = "fp32",
-    max_memory: str | None = None,
-    tile: tuple[int, int] | None = None,
-    left_right_check: bool = False,
+    matching: MatchMatching = MatchOptions(),  # noqa: B008  frozen
     cloud: bool = False,
     check: bool = True,
-    engine: Engine = EngineOptions(),  # noqa: B008  frozen
+    engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
     """Match real stereo pairs to metric depth.
 
@@ -151,30 +134,15 @@ def match(
         weights: weights with a matcher, by name or file; 'default' unless sgbm matches.
         matcher: what matches the two views: psmnet (that of the weights), sgbm (OpenCV's, which
             needs none), or weights with a matcher, by name or file.
-        device: cpu, cuda, cuda:1, ...
-        speed: quick: at the focal length that the weights were trained at; fine: at up to 280,000
-            pixels, for KITTI in 3 to 4 times the time.
-        precision: fp32, or bf16: faster, at some hundredths of a pixel.
-        max_memory: bound on the memory of activations, such as 1GB or 800MB; exact.
-        tile: match tiles of so many rows and columns: less memory and approximate. The first
-            pair is matched whole as well, and the change of its disparity is said.
-        left_right_check: match the mirrored pair too, which makes the confidence better.
         cloud: write a coloured point cloud, NAME.cloud.ply.
         check: look at the first pair for swapped or unrectified images before any work.
-        engine: where the work is done.
     """
-    from depthpose.cli.depth import matching, methods
+    from depthpose.cli.depth import matching as pairs_of
+    from depthpose.cli.depth import methods
     from depthpose.core.run import refuse_among_inputs
 
     weights = _weights_that_match(weights, matcher)
-    config = MatcherConfig(
-        device=device,
-        speed=speed,
-        precision=precision,
-        max_memory_bytes=methods.parse_bytes(max_memory),
-        tile_px=tile,
-        with_left_right_check=left_right_check,
-    )
+    config = matching.config
     if weights is None and config != MatcherConfig():
         raise InputError(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
@@ -184,17 +152,17 @@ def match(
         return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it as the second word")
-    pairs = matching.Pairs.find(left, right, camera)
+    pairs = pairs_of.Pairs.find(left, right, camera)
     refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
     if check:
-        matching.refuse_unusable_first(pairs)
+        pairs_of.refuse_unusable_first(pairs)
     if weights is None:
         method = methods.sgbm_method(with_filled_holes=False)
     else:
         method = methods.weights_method(weights, config, with_right=True)
-    if tile is not None:
-        matching.say_tile_change(pairs, method)
-    return matching.match_all(pairs, method, Path(out), with_cloud=cloud)
+    if matching.tile is not None:
+        pairs_of.say_tile_change(pairs, method)
+    return pairs_of.match_all(pairs, method, Path(out), with_cloud=cloud)
 
 
 def _weights_that_match(weights: str | None, matcher: str) -> str | None:
@@ -241,15 +209,11 @@ def evaluate(
     floor: tuple[FloorName, ...] = (),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
-    protocol: str = "eigen-raw",
-    cap: tuple[float, ...] = (80.0, 50.0),
     split: str | None = None,
     holes: Literal["fill", "leave"] = "fill",
-    device: str = "cpu",
-    speed: Speed = "fine",
-    precision: Precision = "fp32",
-    max_memory: str | None = None,
-    engine: Engine = EngineOptions(),  # noqa: B008  frozen
+    comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
+    matching: PairMatching = PairOptions(),  # noqa: B008
+    engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 
@@ -276,17 +240,10 @@ def evaluate(
             nearest (the depth of the training image that looks most alike), or both.
         train: folders with the frames that a floor is fitted to.
         train_without: names of frames to keep out of them.
-        protocol: how prediction and truth are compared.
-        cap: metres beyond which truth does not count; a row each.
         split: eigen-test, eigen-val, eigen-train, eigen-train-val, eigen-benchmark, or a file of
             frames.
         holes: sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out
             (then the column 'coverage' says what share was measured).
-        device: cpu, cuda, cuda:1, ...
-        speed: of matching real pairs, quick or fine; 'quick:NAME' and 'fine:NAME' say it for one.
-        precision: fp32 or bf16.
-        max_memory: bound on the memory of activations, such as 1GB.
-        engine: where --predictions that are shards are measured; the numbers are the same.
     """
     from depthpose.cli.depth import evaluating, methods
     from depthpose.core.engine import is_job
@@ -298,14 +255,12 @@ def evaluate(
         raise InputError(
             "measure --weights FILE, --matcher sgbm, --predictions DIR or --floor rows, or several."
         )
-    rule = find_protocol(protocol)
+    rule = find_protocol(comparison.protocol)
     dataset = evaluating.open_frames(data, split)
     chosen: list[methods.Method] = []
     if matcher == "sgbm":
         chosen.append(methods.sgbm_method(with_filled_holes=holes == "fill"))
-    memory = methods.parse_bytes(max_memory)
-    config = MatcherConfig(device=device, speed=speed, precision=precision, max_memory_bytes=memory)
-    chosen += [methods.named_method(word, config) for word in weights]
+    chosen += [methods.named_method(word, matching.config) for word in weights]
     if floor:
         training = evaluating.open_training(train, train_without)
         chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
@@ -316,10 +271,17 @@ def evaluate(
     if predictions is not None and is_job(predictions):
         from depthpose.cli.depth.engine import ShardTruth, measure_shards
 
-        truth = ShardTruth(data=str(data.resolve()), split=split, protocol=protocol, caps_m=cap)
+        truth = ShardTruth(
+            data=str(data.resolve()),
+            split=split,
+            protocol=comparison.protocol,
+            caps_m=comparison.cap,
+        )
         ready = measure_shards(dataset, predictions, truth, out, engine)
-        return evaluating.measure(dataset, folders, protocol, cap, out, [ready])
+        return evaluating.measure(
+            dataset, folders, comparison.protocol, comparison.cap, out, [ready]
+        )
     if engine.is_ray:
         raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
-    return evaluating.measure(dataset, folders, protocol, cap, out)
+    return evaluating.measure(dataset, folders, comparison.protocol, comparison.cap, out)

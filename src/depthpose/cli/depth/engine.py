@@ -11,7 +11,8 @@ from typing import Any
 from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.matching import refuse_unrectified_pair, write_match
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
-from depthpose.cli.depth.predicting import Lens, Look, Predictor, read_lens
+from depthpose.cli.depth.options import PredictOutput
+from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
 from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.engine import (
@@ -80,7 +81,7 @@ class PredictWork:
 
     recipe: NetRecipe
     lens: Lens
-    look: Look
+    look: PredictOutput
     files: Files = IMAGES
     endings: Sequence[str] = ENDINGS
 
@@ -116,7 +117,7 @@ def predict(
     words: Sequence[str],
     given: tuple[Path | None, float | None],
     recipe: NetRecipe,
-    look: Look,
+    look: PredictOutput,
     out: str,
     options: EngineOptions,
 ) -> int:
@@ -128,7 +129,7 @@ def predict(
     with inputs.first() as (image,):
         lens = read_lens(*given, image)
     settings = {
-        **recipe.settings(), "camera": lens.facts(), "color_range_m": list(look.range_m)
+        **recipe.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
     }  # fmt: skip
     work = PredictWork(recipe=recipe, lens=lens, look=look)
     return run(_job(work, inputs, out, settings, options), options, "depth maps")
@@ -175,7 +176,7 @@ def _job(
 
 
 def _predict(
-    net: FakestereoNet, lens: Lens, look: Look, samples: Sequence[Sample], out: Path
+    net: FakestereoNet, lens: Lens, look: PredictOutput, samples: Sequence[Sample], out: Path
 ) -> list[str]:
     predictor = Predictor(lens=lens, net=net, out=out, look=look)
     predictor.predict_images({sample.name: sample.files[0] for sample in samples})

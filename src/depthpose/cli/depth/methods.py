@@ -1,7 +1,6 @@
 """Methods by their words on the command line, with what decides their results."""
 
 import hashlib
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, cast, get_args
@@ -18,8 +17,6 @@ from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
 from depthpose.depth.stereo import with_usable_precision
-
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
 
 class Method(NamedTuple):
@@ -143,17 +140,3 @@ def floor_method(name: FloorName, training: Dataset) -> Method:
         return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
 
     return Method(f"floor-{name}", kinds[name].fit(training, show), settings, with_right=False)
-
-
-def parse_bytes(text: str | None) -> int | None:
-    """Read a size such as ``1GB``, ``800MB`` or ``1500000`` (bytes); decimal units.
-
-    Raises:
-        InputError: not a number with such a unit.
-    """
-    if text is None:
-        return None
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMG]?B)?\s*", text, re.IGNORECASE)
-    if found is None:
-        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB or 800MB.")
-    return int(float(found[1]) * _UNITS[(found[2] or "").upper()])

@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import Camera, StereoRig, centred_camera, read_camera
 from depthpose.core.draw import draw_depth
@@ -60,15 +61,6 @@ class Lens:
         return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """Which pictures and clouds are written beside the maps, and how many images go together."""
-
-    range_m: tuple[float, float]
-    with_cloud: bool
-    batch: int
-
-
 def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
     """Read what the user knows of the camera; where its file says no size, that of an image.
 
@@ -114,17 +106,17 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
 
 
 def predict_all(
-    sources: list[Path], lens: Lens, method: Method, out: Path, look: Look, view: str | None
+    sources: list[Path], lens: Lens, method: Method, out: Path, look: PredictOutput
 ) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
-    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.range_m)}
+    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.color_range)}
     claim_folder(out, settings, [PAGE])
     videos = [source.stem for source in sources if _is_video(source)]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     claim_names(out, {source.stem: source for source in sources}, endings, videos)
     mine = [sources[k] for k in find_shard().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
-    with open_viewer(None if find_shard().rank else view) as viewer:
+    with open_viewer(None if find_shard().rank else look.view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
         images = {path.stem: path for path in mine if not _is_video(path)}
         done = predictor.predict_images(images)
@@ -142,7 +134,7 @@ def predict_all(
 
 
 def _write_page(
-    sources: list[Path], lens: Lens, out: Path, look: Look, failures: list[str]
+    sources: list[Path], lens: Lens, out: Path, look: PredictOutput, failures: list[str]
 ) -> None:
     """Write the page of what is finished: other processes may still be at work."""
     done = {source: _finished_names(source, out) for source in sources}
@@ -155,7 +147,9 @@ def _write_page(
                     camera = lens.camera_of(image)
                     yield StereoInput(name=name, left=image, right=None, camera=camera)
 
-    write_depth_page(out, [n for some in done.values() for n in some], read, failures, look.range_m)
+    write_depth_page(
+        out, [n for some in done.values() for n in some], read, failures, look.color_range
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +159,7 @@ class Predictor:
     lens: Lens
     net: FakestereoNet
     out: Path
-    look: Look
+    look: PredictOutput
     viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
@@ -211,9 +205,9 @@ class Predictor:
         try:
             found = self.net.estimate_many(wanted)
             for given, estimate in zip(wanted, found, strict=True):
-                if self.look.with_cloud:
+                if self.look.cloud:
                     write_estimate_cloud(self.out, given, estimate)
-                write_estimate(self.out, given, estimate, self.look.range_m)
+                write_estimate(self.out, given, estimate, self.look.color_range)
                 if estimate.warning:
                     tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
                 if self.viewer is not None:
@@ -226,7 +220,7 @@ class Predictor:
         return [given.name for given in inputs]
 
     def _is_finished(self, name: str) -> bool:
-        is_drawn = not self.look.with_cloud or has_cloud(self.out, name)
+        is_drawn = not self.look.cloud or has_cloud(self.out, name)
         return is_drawn and is_finished(self.out, name)
 
 
@@ -262,6 +256,6 @@ def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tenso
                 return
 
 
-def _colors(names: list[str], out: Path, look: Look) -> Iterator[Tensor]:
+def _colors(names: list[str], out: Path, look: PredictOutput) -> Iterator[Tensor]:
     for name in names:
-        yield draw_depth(read_map(out / f"{name}.depth_m.npy"), *look.range_m)
+        yield draw_depth(read_map(out / f"{name}.depth_m.npy"), *look.color_range)

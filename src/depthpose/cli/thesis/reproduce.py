@@ -5,8 +5,8 @@ from typing import Literal
 
 import tyro
 
+from depthpose.cli.depth.options import MatcherOptions, Matching, Protocol, ProtocolOptions
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
 
 TableNumber = Literal["2.1", "2.2", "2.3"]
 FigureNumber = Literal["2-1", "2-5"]
@@ -21,13 +21,10 @@ def reproduce(
     beside: tuple[str, ...] = ("default",),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
-    protocol: str = "eigen-raw",
-    cap: tuple[float, ...] = (80.0, 50.0),
     split: str = "eigen-test",
     pictures: int = 3,
-    device: str = "cpu",
-    precision: Literal["fp32", "bf16"] = "fp32",
-    max_memory: str | None = None,
+    comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
+    matching: Matching = MatcherOptions(),  # noqa: B008
 ) -> int:
     """Make a table of the thesis again, from data on disk to published rows, ours and difference.
 
@@ -48,13 +45,8 @@ def reproduce(
             default those that ship, whose generator selects. '--beside' without a name: none.
         train: training folders: adds the two floors (best depth of each row, nearest image).
         train_without: names of training frames to keep out.
-        protocol: how prediction and truth are compared; eigen-raw is the thesis's.
-        cap: metres beyond which truth does not count.
         split: eigen-test (697 frames), another split, a file of frames, or 'all' that is there.
         pictures: how many frames the page shows.
-        device: cpu, cuda, cuda:1, ...
-        precision: fp32 or bf16.
-        max_memory: bound on the memory of activations, such as 1GB.
     """
     from depthpose.cli.depth import evaluating, methods
     from depthpose.cli.thesis import depth_tables as reproducing
@@ -62,13 +54,14 @@ def reproduce(
     from depthpose.thesis.depth_tables import find_table
 
     published = find_table(table)
-    rule = find_protocol(protocol)
+    rule = find_protocol(comparison.protocol)
     if rule.truth == "disparity":
-        raise InputError(f"--protocol {protocol}: measures disparity, and the tables hold depth.")
+        raise InputError(
+            f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
+        )
     reproducing.refuse_wrong_count(published, weights, matcher)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
-    memory = methods.parse_bytes(max_memory)
-    config = MatcherConfig(device=device, precision=precision, max_memory_bytes=memory)
+    config = matching.config
     chosen = reproducing.own_methods(published, weights, matcher, config)
     names = {method.name for _, method in chosen}
     if not published.with_right:
@@ -82,8 +75,8 @@ def reproduce(
     order = reproducing.Order(
         table=published,
         dataset=dataset,
-        protocol=protocol,
-        caps_m=cap,
+        protocol=comparison.protocol,
+        caps_m=comparison.cap,
         pictures=pictures,
     )
     return reproducing.reproduce_table(order, chosen, out)
@@ -97,8 +90,7 @@ def figure(
     frames: tuple[str, ...] = (),
     number: int | None = None,
     split: str | None = None,
-    device: str = "cpu",
-    max_memory: str | None = None,
+    matching: Matching = MatcherOptions(),  # noqa: B008  frozen
 ) -> int:
     """Draw a figure of the thesis from your frames and weights.
 
@@ -117,8 +109,6 @@ def figure(
         frames: names of frames; by default some from all over the folder.
         number: how many frames where none is named: 1 for figure 2-1 and 4 for 2-5.
         split: choose among the frames of a split, such as eigen-test.
-        device: cpu, cuda, cuda:1, ...
-        max_memory: bound on the memory of activations, such as 1GB.
     """
     from depthpose.cli.depth import evaluating, methods
     from depthpose.cli.thesis import depth_tables as reproducing
@@ -126,6 +116,7 @@ def figure(
     dataset = evaluating.open_frames(kitti, split)
     count = number or (1 if figure == "2-1" else 4)
     chosen = reproducing.choose_frames(dataset, frames, count)
-    config = MatcherConfig(device=device, max_memory_bytes=methods.parse_bytes(max_memory))
-    method = methods.weights_method(weights, config, with_right=False if figure == "2-1" else None)
+    method = methods.weights_method(
+        weights, matching.config, with_right=False if figure == "2-1" else None
+    )
     return reproducing.write_figure(figure, dataset, chosen, method, out)

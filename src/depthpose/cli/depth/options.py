@@ -1,0 +1,167 @@
+"""Options that several depth commands take: each is declared, and described, once."""
+
+import re
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import tyro
+
+from depthpose.cli.help import group
+from depthpose.cli.options import Device
+from depthpose.core.errors import InputError
+from depthpose.depth.config import Answer, MatcherConfig, Speed
+
+_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class MatcherOptions:
+    """How the matcher of the weights runs."""
+
+    device: Device = "cpu"
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """fp32, or bf16: faster, at some hundredths of a pixel."""
+    max_memory: str | None = None
+    """bound on the memory of activations, such as 1GB or 800MB; exact."""
+
+    @property
+    def config(self) -> MatcherConfig:
+        """Settings of the matcher.
+
+        Raises:
+            InputError: a size that is none.
+        """
+        memory = parse_bytes(self.max_memory)
+        return MatcherConfig(device=self.device, precision=self.precision, max_memory_bytes=memory)
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class PairOptions(MatcherOptions):
+    """How the matcher of the weights runs on real pairs."""
+
+    speed: Speed = "fine"
+    """quick: at the focal length that the weights were trained at; fine: at up to 280,000 pixels,
+    for KITTI in 3 to 4 times the time."""
+
+    @property
+    def config(self) -> MatcherConfig:
+        """Settings of the matcher."""
+        return replace(super().config, speed=self.speed)
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions(PairOptions):
+    """How the matcher of the weights runs; sgbm takes none of these."""
+
+    tile: tuple[int, int] | None = None
+    """match tiles of so many rows and columns: less memory and approximate. The first pair is
+    matched whole as well, and the change of its disparity is printed."""
+    left_right_check: bool = False
+    """match the mirrored pair too, which makes the confidence better."""
+
+    @property
+    def config(self) -> MatcherConfig:
+        """Settings of the matcher."""
+        return replace(
+            super().config, tile_px=self.tile, with_left_right_check=self.left_right_check
+        )
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class ImageNetworks:
+    """Which networks answer depth of one image."""
+
+    weights: str = "default"
+    """weights with a generator, by name or file ('depthpose weights list')."""
+    matcher: str = "psmnet"
+    """what matches the synthesised view: psmnet (that of the weights), sgbm (OpenCV's), or other
+    weights with a matcher, by name or file."""
+    answer: Answer | None = None
+    """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
+    joined: both. Left out: what the weights say; another matcher matches."""
+    with_unlike: bool = False
+    """answer images that are unlike the training images too, with a warning (NAME.warning.txt), in
+    place of refusing them."""
+
+    def refuse_contradiction(self, matching: MatcherOptions) -> None:
+        """Refuse options that exclude each other.
+
+        Raises:
+            InputError: which, and what to leave away.
+        """
+        if self.matcher != "psmnet" and self.answer is not None:
+            raise InputError(
+                f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
+                "synthesised view; leave one away."
+            )
+        if self.matcher == "sgbm" and matching != MatcherOptions():
+            raise InputError(
+                "--device, --precision and --max-memory are for psmnet; leave them away."
+            )
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class PredictOutput:
+    """What is written, and how many images go together."""
+
+    color_range: tuple[float, float] = (3.0, 80.0)
+    """metres of the brightest and the darkest colour, the same for all pictures."""
+    batch: int = 1
+    """images of one size that go through the networks together: for a GPU; a processor is busy
+    with one."""
+    cloud: bool = False
+    """write a coloured point cloud, NAME.cloud.ply."""
+    view: str | None = None
+    """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
+
+    def refuse_unusable(self) -> None:
+        """Refuse values out of their range.
+
+        Raises:
+            InputError: which, and the rule.
+        """
+        near, far = self.color_range
+        if not 0 < near < far:
+            raise InputError(
+                f"--color-range {self.color_range}: give near and far metres, near first."
+            )
+        if self.batch < 1:
+            raise InputError(f"--batch {self.batch}: give 1 or more images.")
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class ProtocolOptions:
+    """How prediction and truth are compared."""
+
+    protocol: str = "eigen-raw"
+    """name of the protocol; eigen-raw is the thesis's."""
+    cap: tuple[float, ...] = (80.0, 50.0)
+    """metres beyond which truth does not count; a row each."""
+
+
+Matching = Annotated[MatcherOptions, tyro.conf.OmitArgPrefixes]
+PairMatching = Annotated[PairOptions, tyro.conf.OmitArgPrefixes]
+MatchMatching = Annotated[MatchOptions, tyro.conf.OmitArgPrefixes]
+Networks = Annotated[ImageNetworks, tyro.conf.OmitArgPrefixes]
+Output = Annotated[PredictOutput, tyro.conf.OmitArgPrefixes]
+Protocol = Annotated[ProtocolOptions, tyro.conf.OmitArgPrefixes]
+
+
+def parse_bytes(text: str | None) -> int | None:
+    """Read a size such as ``1GB``, ``800MB`` or ``1500000`` (bytes); decimal units.
+
+    Raises:
+        InputError: not a number with such a unit.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMG]?B)?\s*", text, re.IGNORECASE)
+    if found is None:
+        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB or 800MB.")
+    return int(float(found[1]) * _UNITS[(found[2] or "").upper()])

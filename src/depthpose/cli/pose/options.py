@@ -1,0 +1,98 @@
+"""Options that several pose commands take: each is declared, and described, once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from depthpose.cli.help import group
+from depthpose.cli.options import Device, Voting, voting_config
+from depthpose.core.errors import InputError
+from depthpose.pose.config import EstimateConfig, Unit
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class OneObjectOptions:
+    """A cloud or a depth image of known objects, and what is known of it."""
+
+    cloud: str | None = None
+    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
+    or a folder of such files."""
+    depth: str | None = None
+    """16-bit PNG in the camera's depth_unit_m, or a folder of them."""
+    mask: str | None = None
+    """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
+    the names of the depth images. Without, the image is searched: its planes are removed, and each
+    region left is tried as every object, or as --object alone."""
+    camera: Path | None = None
+    """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
+    BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
+    object: str | None = None
+    """which of the objects that the weights know."""
+    unit: Unit | None = None
+    """of the clouds, metres by default; of depth images, where their camera says none."""
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class DataSetOptions:
+    """A data set, in place of --cloud and --depth."""
+
+    bop: Path | None = None
+    """folder of a data set in BOP's layout, or of Linemod_preprocessed."""
+    split: str = "test"
+    """of the data set."""
+    masks: str = "truth"
+    """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
+    file of BOP detections, or weights of a segmentation, by name or file."""
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions:
+    """How poses are estimated."""
+
+    voting: Voting = "ransac"
+    """how directions become keypoints."""
+    hypotheses: int = 128
+    """of RANSAC, for each keypoint."""
+    icp: bool = True
+    """refine the voted pose by ICP."""
+    up_to_symmetry: bool = False
+    """copies of an object that look nearly alike are one answer, not alternatives."""
+    batch: int = 16
+    """inputs in one call of the network."""
+    device: Device = "cpu"
+
+    @property
+    def config(self) -> EstimateConfig:
+        """Settings of the estimator, on the device of this process."""
+        from depthpose.core.run import own_device  # --help must not load torch
+
+        return EstimateConfig(
+            voting=voting_config(self.voting, self.hypotheses),
+            with_icp=self.icp,
+            up_to_symmetry=self.up_to_symmetry,
+            device=own_device(self.device),
+        )
+
+
+OneObject = Annotated[OneObjectOptions, tyro.conf.OmitArgPrefixes]
+DataSet = Annotated[DataSetOptions, tyro.conf.OmitArgPrefixes]
+Estimates = Annotated[EstimateOptions, tyro.conf.OmitArgPrefixes]
+
+
+def refuse_mixture(given: OneObjectOptions, bop: Path | None) -> None:
+    """Refuse none of the three kinds of input, or several.
+
+    Raises:
+        InputError: which, and the rule.
+    """
+    count = sum(word is not None for word in (given.cloud, given.depth, bop))
+    if count != 1:
+        raise InputError(
+            f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
+            "with --mask and --camera, or a data set"
+        )
