@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from depthpose.moved import point_to_new_names
+
 if TYPE_CHECKING:
     from depthpose.depth.estimator import FakestereoNet as FakestereoNet
     from depthpose.depth.estimator import pipeline as pipeline
@@ -16,6 +18,8 @@ _HOMES = {
     "GeoPoseNet": "depthpose.pose.estimator",
     "pipeline": "depthpose.depth.estimator",
 }
+
+point_to_new_names()
 
 
 def __getattr__(name: str) -> object:

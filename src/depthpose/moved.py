@@ -1,0 +1,51 @@
+"""Names that modules had before: importing one says where it is now."""
+
+import sys
+from collections.abc import Sequence
+from importlib.abc import MetaPathFinder
+from types import ModuleType
+
+MOVED = {
+    "cli.viewing": "report.viewer",
+    "core.raster": "core.render",
+    "core.report": "report.tables",
+    "core.scene": "report.scene",
+    "core.shipped": "core.hub",
+    "depth.degrade": "depth.augment",
+    "depth.figures": "thesis.depth_figures",
+    "depth.floors": "depth.baselines",
+    "depth.kitti": "depth.datasets",
+    "depth.sizes": "depth.disparity",
+    "depth.streets": "depth.synthetic",
+    "depth.tables": "thesis.depth_tables",
+    "demo.motorcycle": "demo.depth",
+    "pages": "report",
+    "pose.bop": "pose.datasets",
+    "pose.figures": "thesis.pose_figures",
+    "pose.objects": "pose.synthetic",
+    "pose.overlay": "report.overlay",
+    "pose.tables": "thesis.pose_tables",
+}
+
+
+class MovedFinder(MetaPathFinder):
+    """Asked last, for modules that no other finder has found."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> None:
+        """Say the new name of a module of ours that moved.
+
+        Raises:
+            ModuleNotFoundError: it did.
+        """
+        del path, target
+        package, _, name = fullname.partition(".")
+        if package == "depthpose" and name in MOVED:
+            raise ModuleNotFoundError(f"{fullname} is now depthpose.{MOVED[name]}", name=fullname)
+
+
+def point_to_new_names() -> None:
+    """Let imports of old names fail with the new one."""
+    if not any(isinstance(finder, MovedFinder) for finder in sys.meta_path):
+        sys.meta_path.append(MovedFinder())
