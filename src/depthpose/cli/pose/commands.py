@@ -254,7 +254,7 @@ def _predict_on_ray(
     cloud, depth, mask, camera = given
     if depth is not None and camera is None:
         raise InputError("--depth needs --camera beside it")
-    files = engine.CLOUD_FILES if depth is None else engine.VIEW_FILES
+    files = engine.cloud_files() if depth is None else engine.VIEW_FILES
     work = engine.PoseWork(
         weights=Weights.read(weights),
         config=config,
