@@ -372,3 +372,25 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     theirs = torch.autograd.grad(expected, double, pull)
     for gradient, wanted in zip(mine, theirs, strict=True):
         torch.testing.assert_close(gradient, wanted.float(), rtol=1e-4, atol=1e-4)
+
+
+def refuse(*_: object) -> Tensor:
+    raise RuntimeError("no such operator")
+
+
+def test_without_the_private_operator_the_public_one_gives_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = conv_function.__globals__
+    rows, kernel = features_of(cloud(), 8).float(), weight_of(1, 8, 5)[0].float()
+    fast = names["multiply"](rows, kernel, 1)
+    monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", refuse, raising=False)
+    names["_has_private_product"].cache_clear()
+    try:
+        assert not names["_has_private_product"]()
+        assert names["block_rows"](rows, kernel) > len(rows)
+        public = names["multiply"](rows, kernel, 1)
+    finally:
+        names["_has_private_product"].cache_clear()
+    assert torch.equal(public, rows @ kernel)
+    torch.testing.assert_close(fast, public)

@@ -1,9 +1,10 @@
-"""The masks that methods of the pose room are shown, by their words."""
+"""The masks that pose methods are given, by their names."""
 
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,6 +16,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.run import claim_folder
 from depthpose.pose.datasets import (
+    LAYOUTS,
     BopDataset,
     Detection,
     Instance,
@@ -23,7 +25,6 @@ from depthpose.pose.datasets import (
     read_detections,
     write_detections,
 )
-from depthpose.pose.datasets.linemod import segnet_mask
 from depthpose.pose.datasets.parse import integer, read_rows
 from depthpose.pose.predictions import Job, detection_jobs, instance_jobs
 from depthpose.pose.segmentation import Segmenter
@@ -32,7 +33,7 @@ from depthpose.pose.types import ViewInput
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """Which pixels a method is shown: what to call them, and the jobs that they make."""
+    """Which pixels a method is given: what to call them, and the jobs that they make."""
 
     name: str
     jobs: Callable[[Mapping[int, str]], list[Job[ViewInput]]]
@@ -78,19 +79,17 @@ def _path_of(word: str) -> Path | None:
 
 
 def _shipped_masks(word: str, dataset: BopDataset) -> Masks:
-    def mask_of(instance: Instance) -> Path:
-        return segnet_mask(dataset.folder, instance)
-
     if word == "truth":
         return Masks(name=word, jobs=lambda names: instance_jobs(dataset, names), settings={})
-    if dataset.layout == "BOP":
+    mask_of = LAYOUTS[dataset.layout].predicted_mask
+    if mask_of is None:
         raise InputError(
             f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has them; "
             "give --masks a file of BOP detections, or weights of a segmentation"
         )
     return Masks(
         name=word,
-        jobs=lambda names: instance_jobs(dataset, names, mask_of),
+        jobs=lambda names: instance_jobs(dataset, names, partial(mask_of, dataset.folder)),
         settings={"masks_of": "segnet_results"},
     )
 

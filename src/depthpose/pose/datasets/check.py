@@ -14,8 +14,8 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.datasets.dataset import open_bop, read_instance_mask
-from depthpose.pose.datasets.frames import Instance, bop_splits
-from depthpose.pose.datasets.linemod import is_linemod
+from depthpose.pose.datasets.frames import Instance
+from depthpose.pose.datasets.layouts import layout_of
 from depthpose.pose.datasets.models import model_path, models_folder, read_models_info
 from depthpose.pose.mesh import (
     exact_diameter,
@@ -55,15 +55,15 @@ def check_bop(
         InputError: there is no such split.
     """
     folder = Path(folder)
-    layout = "Linemod_preprocessed" if is_linemod(folder) else "BOP"
-    known = ["train", "test"] if layout != "BOP" else bop_splits(folder)
+    name, layout = layout_of(folder)
+    known = layout.splits(folder)
     if split is not None and split not in known:
         raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(known) or 'none'}.")
     found: list[Problem] = []
     instances: list[Instance] = []
-    for name in known if split is None else [split]:
+    for one in known if split is None else [split]:
         try:
-            instances += open_bop(folder, name).instances
+            instances += open_bop(folder, one).instances
         except InputError as error:
             found.append(Problem(path=folder, kind="unreadable", message=str(error)))
     models, more = _check_models(folder, {i.object_id for i in instances})
@@ -72,7 +72,7 @@ def check_bop(
         found += _check_instance(instance, models, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(instances))
-    return make_report(layout, _count(instances, models), found)
+    return make_report(name, _count(instances, models), found)
 
 
 def _count(instances: list[Instance], models: Models) -> dict[str, int]:

@@ -4,6 +4,7 @@ Every way of computing it is gather, multiply, add up; the ways differ in how mu
 once. A faster kernel would replace :func:`conv` and nothing else.
 """
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -35,7 +36,6 @@ def multiply(
     """Multiply up to ``block`` rows."""
     if len(rows) < block or not _has_onednn(rows):
         return torch.mm(rows, kernel)
-    # The one name by which torch multiplies strided float32 through oneDNN is private to it.
     return torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
 
 
@@ -52,7 +52,23 @@ def add_product(out: Tensor, x: Tensor, kernel: Tensor) -> Tensor:
 
 def _has_onednn(x: Tensor) -> bool:
     is_usable = x.device.type == "cpu" and x.dtype == torch.float32
-    return is_usable and torch.backends.mkldnn.is_available()
+    return is_usable and _has_private_product()
+
+
+@cache
+def _has_private_product() -> bool:
+    """Whether this torch multiplies strided float32 through oneDNN, by an operator private to it.
+
+    Without it every product goes through ``torch.mm``: the same numbers, more slowly.
+    """
+    if not torch.backends.mkldnn.is_available():
+        return False
+    rows, kernel = torch.ones(2, 3, dtype=torch.float32), torch.ones(3, 4, dtype=torch.float32)
+    try:
+        product = torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
+    except (AttributeError, RuntimeError, TypeError):  # renamed, not built in, other arguments
+        return False
+    return torch.equal(product, torch.full_like(product, 3.0))
 
 
 GRID_PRODUCTS = 1 << 20

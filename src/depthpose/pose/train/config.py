@@ -1,11 +1,11 @@
 """Knobs of a training of the direction network."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
+from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
 
 
@@ -147,8 +147,8 @@ class PoseTraining:
     start: str | None = None
     """Weights to begin with; those of other objects give all but the last layer."""
 
-    loss: Literal["mse", "cosine", "l1"] = "mse"
-    """How a direction is punished."""
+    loss: str = "mse"
+    """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
 
     confidence_weight: float = 0.1
     """Of the loss of the confidences, where the network has them."""
@@ -175,6 +175,7 @@ class PoseTraining:
     """Write the weights in 16 bits."""
 
     def __post_init__(self) -> None:
-        """Refuse a negative number of views."""
+        """Refuse an unknown loss and a negative number of views."""
+        refuse_unknown("loss", self.loss, POINT_LOSSES)
         if self.first_alone < 0:
             raise InputError(f"first_alone is {self.first_alone}; take 0 or more made views")
