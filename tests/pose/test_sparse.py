@@ -1,5 +1,7 @@
 """The sparse convolution against the dense one of torch, and the laws that it obeys."""
 
+from importlib import import_module
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -18,9 +20,9 @@ from depthpose.pose.sparse import (
     conv,
     kernel_offsets,
 )
-from depthpose.pose.sparse import conv as conv_function
 from depthpose.pose.sparse.keys import CLOUD_LIMIT, pack, unpack
 
+CONV = import_module("depthpose.pose.sparse.conv")
 SIDE = 8
 """Dense grids run from -SIDE to SIDE - 1."""
 
@@ -79,7 +81,7 @@ def dense_conv(x: Tensor, weight: Tensor, stride: int, *, is_transposed: bool) -
 @pytest.fixture(params=["by grid", "by offset"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways of computing the same."""
-    module = conv_function.__globals__
+    module = vars(CONV)
     monkeypatch.setitem(module, "GRID_PRODUCTS", -1 if request.param == "by offset" else 1 << 30)
 
 
@@ -364,8 +366,8 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     pull = features_of(coordinates, 5, seed=3)
     single = [t.float().requires_grad_() for t in (x, weight)]
     double = [t.clone().requires_grad_() for t in (x, weight)]
-    monkeypatch.setitem(conv_function.__globals__, "BLOCK_PRODUCTS", 8 * 5 * 16)
-    monkeypatch.setitem(conv_function.__globals__, "GRID_PRODUCTS", -1)
+    monkeypatch.setattr(CONV, "BLOCK_PRODUCTS", 8 * 5 * 16)
+    monkeypatch.setattr(CONV, "GRID_PRODUCTS", -1)
     found, expected = conv(single[0], single[1], m), conv(double[0], double[1], m)
     torch.testing.assert_close(found, expected.float(), rtol=1e-4, atol=1e-4)
     mine = torch.autograd.grad(found, single, pull.float())
@@ -381,16 +383,15 @@ def refuse(*_: object) -> Tensor:
 def test_without_the_private_operator_the_public_one_gives_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    names = conv_function.__globals__
     rows, kernel = features_of(cloud(), 8).float(), weight_of(1, 8, 5)[0].float()
-    fast = names["multiply"](rows, kernel, 1)
+    fast = CONV.multiply(rows, kernel, 1)
     monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", refuse, raising=False)
-    names["_has_private_product"].cache_clear()
+    CONV._has_private_product.cache_clear()
     try:
-        assert not names["_has_private_product"]()
-        assert names["block_rows"](rows, kernel) > len(rows)
-        public = names["multiply"](rows, kernel, 1)
+        assert not CONV._has_private_product()
+        assert CONV.block_rows(rows, kernel) > len(rows)
+        public = CONV.multiply(rows, kernel, 1)
     finally:
-        names["_has_private_product"].cache_clear()
+        CONV._has_private_product.cache_clear()
     assert torch.equal(public, rows @ kernel)
     torch.testing.assert_close(fast, public)
