@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid
 Directions = Float[Tensor, "points keypoints 3"]
 
 CONFIDENCE_SCALE_RAD = 0.1415
-"""Angle of a vote that deserves half the trust: its cosine is 0.99, where RANSAC draws its line."""
+"""Angle of a vote whose target confidence is a half: its cosine is 0.99, RANSAC's threshold."""
 
 
 def unit_directions(
@@ -87,7 +87,7 @@ def direction_loss(
 ) -> Float[Tensor, ""]:
     """Mean over instances of the least loss that any symmetric copy of the truth gives.
 
-    It is the same whichever of the symmetric truths stands first.
+    It is the same whichever of the symmetric truths comes first.
 
     Args:
         found: raw outputs of each point's own class.
@@ -110,7 +110,7 @@ def direction_loss(
 def confidence_target(
     found: Directions, truth: Directions, scale_rad: float = CONFIDENCE_SCALE_RAD
 ) -> Float[Tensor, "points keypoints"]:
-    """Say how far each vote deserves trust: 1 / (1 + (angle / scale)^2); no gradient."""
+    """Give the confidence that each vote should have: 1 / (1 + (angle / scale)^2); no gradient."""
     found = found.detach()
     # atan2 keeps its digits near 0 and pi, where acos of a cosine loses half of them.
     across = torch.linalg.cross(found, truth).norm(dim=-1)
@@ -121,7 +121,7 @@ def confidence_target(
 def confidence_loss(
     logits: Float[Tensor, "points keypoints"], found: Directions, truth: Directions
 ) -> Float[Tensor, ""]:
-    """Binary cross entropy of the trust that the network claims against what its votes deserve."""
+    """Binary cross entropy of the network's confidences against those its votes should have."""
     if not len(logits):
         return logits.sum()
     return F.binary_cross_entropy_with_logits(logits, confidence_target(found, truth))
@@ -135,7 +135,7 @@ def mask_loss(
     Args:
         logits: class 0 is the background.
         labels: the true class of each pixel.
-        object_weight: objects cover a few percent of an image; 1 lets the background rule.
+        object_weight: objects cover a few percent of an image; at 1 the background dominates.
     """
     weight = logits.new_full((logits.shape[1],), object_weight)
     weight[0] = 1.0

@@ -30,7 +30,7 @@ class PublishedRow:
 
     Attributes:
         method: who.
-        sees: what the method looks at.
+        sees: what the method uses.
         by_object: percent by BOP's number; empty where only the mean is printed.
         mean: percent, as printed.
         diameters: whose table a success is a tenth of.
@@ -49,7 +49,7 @@ class PublishedRow:
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
 _FFB6D = "table in the README of ethnhe/FFB6D"
-_EACH = "one network an object, some 20,000 made images of each"
+_EACH = "one network an object, some 20,000 synthetic images of each"
 
 
 def _row(method: str, sees: str, printed: str, mean: float, note: str, source: str) -> PublishedRow:

@@ -38,7 +38,7 @@ class VotingCase:
     """One cloud with the network's directions, and what they should give.
 
     Attributes:
-        points_m: where the votes stand.
+        points_m: where the votes start.
         directions: of unit length.
         model: the object.
         truth: its pose.
@@ -92,7 +92,7 @@ def cases_of(
     Every point votes from its own place; points of one voxel share the network's direction.
 
     Args:
-        net: whose directions; its objects bear the names that the views say.
+        net: whose directions; its objects have the names in the views.
         views: with truth.
         points: at most so many of each, chosen at random, the same each time.
         is_adds: whether ADD-S decides; None: by what the object declares.
@@ -209,7 +209,7 @@ def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
 def _directions(
     network: ResUNet, points_m: Points, number: int, cloud: CloudConfig
 ) -> Float[Tensor, "n k 3"]:
-    """Ask for the direction of every point, not of one a voxel: those of a voxel share it."""
+    """Give the direction of every point; those of a voxel share it."""
     grid = voxelise(points_m, cloud)
     rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
     voxels = Voxels.from_points(rows, grid.features)

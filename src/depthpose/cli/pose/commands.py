@@ -21,9 +21,9 @@ Voting = Literal["ransac", "least-squares"]
 Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
-def voting_method(word: Voting) -> VotingMethod:
-    """Give the method of a word, which a shell takes without quotes."""
-    return "least squares" if word == "least-squares" else "ransac"
+def voting_method(name: Voting) -> VotingMethod:
+    """Give the method of an option's value, which a shell takes without quotes."""
+    return "least squares" if name == "least-squares" else "ransac"
 
 
 def predict(
@@ -73,7 +73,7 @@ def predict(
         depth: 16-bit PNG in the camera's depth_unit_m, or a folder of them.
         mask: picture, not black is the object, or .json with COCO's run lengths; or a folder of
             masks with the names of the depth images. Without, the image is searched: its planes
-            are taken away, and what is left is asked for every object, or for --object alone.
+            are taken away, and what is left is tried for every object, or for --object alone.
         camera: JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of BOP, TUM RGB-D,
             ROS, OpenCV, KITTI or Middlebury.
         object: which of the objects that the weights know.
@@ -83,7 +83,7 @@ def predict(
             a JSON file of BOP detections, or weights of a segmentation, by name or file.
         voting: ransac, or least-squares.
         hypotheses: of RANSAC, for each keypoint.
-        icp: slide the voted pose onto the cloud.
+        icp: refine the voted pose by ICP.
         up_to_symmetry: copies of an object that look nearly alike are one answer, not alternatives.
         batch: inputs in one call of the network.
         device: cpu, cuda, cuda:1, ...
@@ -110,7 +110,7 @@ def predict(
         return _predict_bop(method, (bop, split, masks), Path(out), batch, config.device, view)
     if cloud is not None and not method.takes_clouds:
         raise InputError(
-            f"--cloud {cloud}: the weights {weights} look at depth images; give --depth, --mask "
+            f"--cloud {cloud}: the weights {weights} use depth images; give --depth, --mask "
             "and --camera, or weights that vote"
         )
     home = Path(out)
@@ -173,7 +173,7 @@ def evaluate(
         bop: folder of the data set.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
-        weights: files or names, of the method or of a baseline; the word open3d is registration by
+        weights: files or names, of the method or of a baseline; open3d is registration by
             Open3D (an extra), which has none.
         csv: BOP results of any method.
         predictions: folders with poses.json.

@@ -47,7 +47,7 @@ def write_pose_page(
     Args:
         out: its folder.
         predictions: all, in the order of the jobs.
-        jobs: what they were made of.
+        jobs: their inputs.
         method: by which.
         dataset: that they are of, if they are of one.
     """
@@ -107,7 +107,7 @@ def instance_sections(
 
 
 def _results(predictions: Sequence[Prediction], shown: int) -> Section:
-    """Say every refusal; answers stand behind them."""
+    """List every refusal, then the answers."""
     counts = Counter(prediction.estimate.status for prediction in predictions)
     said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_ok)]

@@ -43,7 +43,7 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ruler:
-    """What of an object its errors are measured with; made once.
+    """What the errors of an object are measured with; computed once.
 
     Attributes:
         model: the object.
@@ -170,7 +170,7 @@ def _vsd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Float[Tensor, "1
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)
     left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
-    # What neither pose covers has no say: only the window about both is drawn.
+    # What neither pose covers does not count: only the window about both is drawn.
     K = instance.K.double().clone()
     K[0, 2] -= left
     K[1, 2] -= top
@@ -251,7 +251,7 @@ def match(
 ) -> dict[str, PoseEstimate]:
     """Give each instance the estimate that answers for it, by the instance's name.
 
-    An estimate that bears an instance's name was made from its very mask, and is its own, unless
+    An estimate with an instance's name was computed from its mask, and is its own, unless
     it says that it belongs elsewhere: in another data set names may be the same. Of the
     others an image with n instances of an object takes the n of the highest scores, as BOP does,
     and sets them against the instances so that the sum of ADD-S, at most a diameter each, is least.

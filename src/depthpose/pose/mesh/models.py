@@ -45,7 +45,7 @@ def refuse_too_large(path: AnyPath, suffix: str, data: bytes) -> None:
 
 
 def _is_text(suffix: str, data: bytes) -> bool:
-    """Tell text as trimesh does: an STL is binary where its length is that of its triangles."""
+    """Recognise text as trimesh does: an STL is binary if its length is that of its triangles."""
     if suffix == ".ply":
         return b"format ascii" in data[: 2**16]
     if suffix == ".stl" and len(data) >= 84:

@@ -146,7 +146,7 @@ def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
 def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     """Gather and add up an offset at a time: its pairs write each row once at most."""
     out = x.new_zeros(m.outputs, weight.shape[2])
-    # Lists of views, each made by one call: slicing one by one costs as much as small products.
+    # Lists of views, each from one call: slicing one by one costs as much as small products.
     kernels = weight.unbind()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
@@ -204,7 +204,7 @@ def _gradients_by_offset(
 def _with_centre(
     gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, so_far: Gradients
 ) -> Gradients:
-    """Add the part of the offset at which each voxel meets itself."""
+    """Add the part of the offset at which each voxel is its own neighbour."""
     for_x, for_weight = so_far
     if m.centre is not None and for_x is not None:
         add_product(for_x, gradient, weight[m.centre].T)
@@ -222,7 +222,7 @@ def _read(x: Tensor, slots: Tensor, m: KernelMap) -> Tensor:
 def _table(x: Tensor, m: KernelMap) -> Tensor:
     """Lay out what each output voxel reads: (volume * channels, outputs), 0 where it is empty."""
     padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
-    rows = m.meetings.table
+    rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
 
