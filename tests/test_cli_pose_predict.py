@@ -424,6 +424,6 @@ def test_a_cloud_for_weights_that_regress_a_depth_image_is_refused(
     words = ["pose", "predict", "--weights", str(path), "--out", str(tmp_path / "out")]
     assert main([*words, "--cloud", str(tmp_path / "a.ply")]) == 2
     said = capsys.readouterr().err
-    assert "look at depth images; give --depth, --mask and --camera, or weights that vote" in said
+    assert "use depth images; give --depth, --mask and --camera, or weights that vote" in said
     assert main([*words, *frames(tmp_path)]) == 0
     assert poses_of(tmp_path / "out")["seen"]["status"] == "ok"

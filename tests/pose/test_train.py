@@ -523,7 +523,7 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
         (lambda: _training(first_alone=-1), "first_alone is -1; take 0 or more"),
         (FramesConfig, "frames has no folder"),
         (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
-        (lambda: HeldOutConfig(number=0), "nothing would be looked at; take 25"),
+        (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
         (lambda: CalibrationConfig(number=5), "number is 5; nothing can be chosen by fewer"),
         (lambda: CalibrationConfig(max_wrong_share=1.0), "max_wrong_share is 1.0"),
     ],
