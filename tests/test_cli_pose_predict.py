@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from depthpose.cli.pose import methods as pose_methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,
+    cloud_suffixes,
     read_cloud,
     read_image,
     write_cloud,
@@ -65,6 +67,33 @@ def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle
 
 def poses_of(out: Path) -> dict[str, dict]:
     return {row["name"]: row for row in json.loads((out / "poses.json").read_text())}
+
+
+def test_a_folder_gives_the_poses_of_clouds_of_every_format(weights: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    points = cloud_of(bracket(), TRUTH)
+    for suffix in cloud_suffixes():
+        path = folder / f"of{suffix[1:]}{suffix.upper()}"
+        if suffix in (".ply", ".pcd"):
+            write_cloud(path, Cloud(points=points))
+        elif suffix == ".npy":
+            path.write_bytes(npy_bytes(points.numpy()))
+        else:
+            np.savetxt(path, points.numpy())
+    (folder / "notes.md").write_text("no cloud")
+    (folder / ".hidden.txt").write_text("no cloud")
+    words = ["--cloud", str(folder), "--object", "bracket", "--weights", str(weights)]
+    assert main(["pose", "predict", *words, "--out", str(tmp_path / "out")]) == 0
+    found = poses_of(tmp_path / "out")
+    assert sorted(found) == ["ofnpy", "ofpcd", "ofply", "oftxt", "ofxyz"]
+    assert {row["status"] for row in found.values()} == {"ok"}
+
+
+def npy_bytes(values: np.ndarray) -> bytes:
+    buffer = BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
 
 
 def test_a_cloud_gives_its_pose_and_the_posed_model(
@@ -316,7 +345,7 @@ def test_two_processes_share_the_work(
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera beside it"),
-        (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz file there"),
+        (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
     ],
 )
 def test_what_cannot_be_predicted_is_refused(

@@ -1,4 +1,4 @@
-"""Tables and figures of chapter 3 as commands, on made frames in both layouts."""
+"""Tables and figures of chapter 3 as commands, on synthetic frames in both layouts."""
 
 import json
 from pathlib import Path

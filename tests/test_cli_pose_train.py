@@ -66,7 +66,7 @@ def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
         ([own, "--out", str(own)], "is there already; delete it, or give another name"),
         ([own, "--out", str(tmp_path / "bold")], "ending in .safetensors"),
         ([own, "--out", other, "--number", "0"], "there is nothing to choose by; take 600"),
-        ([blind, "--out", other], "answered not one made view"),
+        ([blind, "--out", other], "answered not one synthetic view"),
     ):
         assert main(["pose", "calibrate", *map(str, words), "--config", str(config)]) == 2
         assert said in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A small Linemod_preprocessed of made frames."""
+"""A small Linemod_preprocessed of synthetic frames."""
 
 import json
 from collections.abc import Sequence

@@ -5,9 +5,9 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.pose.augment import (
-    hide,
     measure,
     misjudge_mask,
+    occlude,
     random_levels,
     random_rotation,
     whole,
@@ -33,7 +33,7 @@ def test_an_occluder_hides_exactly_its_share_and_stands_nearer() -> None:
     silhouette = random_levels(60, 80, _generator(9)) < 0.3
     depth_m = torch.where(silhouette, 0.8 + 0.1 * torch.rand(60, 80), 1.5)
     for seed in range(40):
-        hidden_m, visible = hide(depth_m, silhouette, 0.3, _generator(seed))
+        hidden_m, visible = occlude(depth_m, silhouette, 0.3, _generator(seed))
         everything = int(silhouette.sum())
         # A wide pixel of equal level may be hidden with the last one.
         assert abs(1 - int(visible.sum()) / everything - 0.3) < 0.02
@@ -45,7 +45,7 @@ def test_an_occluder_hides_exactly_its_share_and_stands_nearer() -> None:
 
 def test_nothing_is_hidden_by_no_share() -> None:
     silhouette = torch.ones(5, 6, dtype=torch.bool)
-    depth_m, visible = hide(torch.ones(5, 6), silhouette, 0.0, _generator())
+    depth_m, visible = occlude(torch.ones(5, 6), silhouette, 0.0, _generator())
     assert torch.equal(depth_m, torch.ones(5, 6))
     assert torch.equal(visible, silhouette)
 
@@ -149,7 +149,7 @@ def test_whole_numbers_stay_below_their_count() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("values", "text"),
     [
         ({"number": 0}, "number is 0 and views 2000; both are 1 or more"),
         ({"seed": -1}, "seed is -1; take 0 or more"),
@@ -165,21 +165,21 @@ def test_whole_numbers_stay_below_their_count() -> None:
         ),
     ],
 )
-def test_bad_knobs_of_objects_are_refused(knobs: dict, text: str) -> None:
+def test_bad_settings_of_objects_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError) as error:
-        ObjectsConfig(**knobs)
+        ObjectsConfig(**values)
     assert text in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("values", "text"),
     [
         ({"kinds": ()}, "kinds is (); name one or more of structured light, time of flight"),
         ({"noise": (2.0, 1.0)}, "noise is (2.0, 1.0), but it is a range within 0.0 to 20.0"),
         ({"missing": (0.0, 1.0)}, "missing is (0.0, 1.0), but it is a range within 0.0 to 0.9"),
     ],
 )
-def test_bad_knobs_of_a_sensor_are_refused(knobs: dict, text: str) -> None:
+def test_bad_settings_of_a_sensor_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError) as error:
-        SensorConfig(**knobs)
+        SensorConfig(**values)
     assert text in str(error.value)

@@ -169,7 +169,7 @@ def test_the_check_names_what_is_wrong(made: Path) -> None:
         check_bop(made, "val")
 
 
-def test_a_model_in_metres_is_told(made: Path) -> None:
+def test_a_model_in_metres_is_reported(made: Path) -> None:
     mesh = trimesh.creation.box((0.04, 0.04, 0.06))
     mesh.export(made / "models/obj_000001.ply")
     problems = check_bop(made).problems
@@ -218,7 +218,7 @@ def test_damaged_cameras_and_files_are_refused(made: Path) -> None:
         open_bop(made)
 
 
-def test_no_mask_is_told_with_a_remedy(made: Path) -> None:
+def test_no_mask_is_reported_with_a_remedy(made: Path) -> None:
     (made / "test/000003/mask_visib/000000_000000.png").unlink()
     with pytest.raises(InputError, match="render mask_visib, or give masks of your own"):
         open_bop(made)[0]

@@ -101,7 +101,7 @@ def test_samples_are_a_subset_in_order_and_reproducible() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knob", "value", "said"),
+    ("setting", "value", "said"),
     [
         ("voxel_m", 8.0, "0.008 means 8 mm"),
         ("voxel_m", 0.0, "positive part of a metre"),
@@ -110,9 +110,9 @@ def test_samples_are_a_subset_in_order_and_reproducible() -> None:
         ("max_offset_diameters", 0.0, "take 1"),
     ],
 )
-def test_knobs_out_of_range_are_refused(knob: str, value: object, said: str) -> None:
+def test_settings_out_of_range_are_refused(setting: str, value: object, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        config_from_dict({knob: value}, CloudConfig, source="test")
+        config_from_dict({setting: value}, CloudConfig, source="test")
 
 
 def test_the_real_cat(real: Path) -> None:

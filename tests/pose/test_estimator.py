@@ -142,7 +142,7 @@ def test_calls_of_the_network_are_bounded(part: ObjectModel) -> None:
     assert net.calls == [1, 1]
 
 
-def test_instances_of_one_mask_are_told_apart(part: ObjectModel) -> None:
+def test_instances_of_one_mask_are_distinguished(part: ObjectModel) -> None:
     truths = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
     net = Oracle(tiny_weights(part), truths)
     depth_m, mask = view_of(part, *truths)
@@ -201,7 +201,7 @@ def test_one_flat_side_is_not_observable(part: ObjectModel) -> None:
     model_points[:, 2] += 0.001 * torch.randn(2000, generator=torch.Generator().manual_seed(1))
     found = Oracle(tiny_weights(part), [truth]).estimate(cloud=truth.apply(model_points))
     assert found.status == "not observable"
-    assert "may slide along itself" in found.reason or "may turn along itself" in found.reason
+    assert "may shift along itself" in found.reason or "may turn along itself" in found.reason
 
 
 def test_directions_that_do_not_meet_are_refused(part: ObjectModel) -> None:
@@ -225,7 +225,7 @@ def test_the_keypoints_of_another_object_do_not_fit(part: ObjectModel) -> None:
 
     found = Liar(told, [truth]).estimate(cloud=cloud)
     assert found.status == "keypoints do not fit"
-    assert "another object, or too much of it hidden" in found.reason
+    assert "another object, or too much of it occluded" in found.reason
 
 
 def test_rough_votes_are_mended_where_a_risk_judges_them(part: ObjectModel) -> None:

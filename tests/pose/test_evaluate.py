@@ -1,6 +1,8 @@
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +21,10 @@ from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Target
 from depthpose.pose.datasets.linemod import linemod_symmetries
 from depthpose.pose.evaluate import (
+    InstanceRow,
+    ObjectRow,
+    Origin,
+    RiskRow,
     diameter_of,
     errors,
     evaluate,
@@ -34,6 +40,10 @@ from depthpose.pose.predictions import Place, write_bop_results, write_predictio
 from depthpose.pose.types import Symmetries
 
 
+def columns(rows: Sequence[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
+    return [row.columns() for row in rows]
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_dataset(tmp_path_factory.mktemp("made"))
@@ -41,8 +51,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
 
 def test_the_truth_itself_is_perfect(made: BopDataset) -> None:
     result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model))
-    assert [row["object"] for row in result.rows] == ["bracket", "bottle", "mean", "all"]
-    for row in result.rows:
+    assert [row.object for row in result.rows] == ["bracket", "bottle", "mean", "all"]
+    for row in columns(result.rows):
         for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
             assert row[name] == pytest.approx(1.0), (row["object"], name)
         assert row["refused"] == row["wrong"] == 0.0
@@ -51,15 +61,15 @@ def test_the_truth_itself_is_perfect(made: BopDataset) -> None:
         assert row["ms_total"] == pytest.approx(25.0)
         assert "ms_icp" not in row
         assert row["frames_sha256"] == frames_hash(made.instances)[:12]
-    assert [row["metric"] for row in result.rows[:2]] == ["ADD", "ADD-S"]
-    assert result.rows[2]["instances"] == result.rows[3]["instances"] == 6
+    assert [row.metric for row in result.rows[:2]] == ["ADD", "ADD-S"]
+    assert columns(result.rows)[2]["instances"] == columns(result.rows)[3]["instances"] == 6
 
 
 def test_a_turn_about_the_axis_of_a_bottle_is_no_error(made: BopDataset) -> None:
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
     quarter = Rigid(turn, torch.zeros(3).double())
     result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model @ quarter))
-    bracket, bottle = result.rows[:2]
+    bracket, bottle = columns(result.rows[:2])
     assert bracket["wrong"] == 1.0
     assert bracket["rotation_deg_median"] == pytest.approx(90.0)
     assert bottle["success"] == 1.0
@@ -73,7 +83,7 @@ def test_errors_are_those_of_the_definitions(made: BopDataset) -> None:
         return moved(instance, [0.0, 0.0, 0.0, 0.0, 0.0, 0.012])
 
     result = evaluate(made, predictions_of(made, off))
-    for row, instance in zip(result.per_instance, made.instances, strict=True):
+    for row, instance in zip(columns(result.per_instance), made.instances, strict=True):
         points = made.objects[instance.object_id].vertices_m
         error = add_m if row["metric"] == "ADD" else adds_m
         exact = float(error(off(instance), instance.camera_from_model, points))
@@ -88,31 +98,31 @@ def test_errors_are_those_of_the_definitions(made: BopDataset) -> None:
         # 12 mm are beyond the first tau (0.05 d) of a bottle of 18 cm, within all others.
         assert 0 < row["vsd"] < 0.4
     # Moved away by 12 mm: AUC is what is left of 10 cm.
-    assert result.rows[0]["auc"] == pytest.approx(1 - 0.12)
+    assert columns(result.rows)[0]["auc"] == pytest.approx(1 - 0.12)
 
 
 def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDataset) -> None:
     first, second = made.instances[0].name, made.instances[2].name
     every = predictions_of(made, lambda i: None if i.name == second else i.camera_from_model)
     result = evaluate(made, [p for p in every if p.estimate.name != first])
-    bracket, bottle, mean, pooled = result.rows
+    bracket, bottle, mean, pooled = columns(result.rows)
     for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
         assert bracket[name] == pytest.approx(1 / 3), name
         assert bottle[name] == pytest.approx(1.0), name
         assert mean[name] == pooled[name] == pytest.approx(2 / 3), name
     assert bracket["refused"] == pytest.approx(2 / 3)
     assert bracket["wrong"] == 0.0
-    statuses = [row["status"] for row in result.per_instance]
+    statuses = [row.status for row in result.per_instance]
     assert statuses == ["missing", "ok", "votes do not meet", "ok", "ok", "ok"]
-    assert result.per_instance[0]["error_m"] is None
-    assert result.per_instance[2]["reason"] == "the directions are parallel"
+    assert result.per_instance[0].error("error_m") is None
+    assert result.per_instance[2].reason == "the directions are parallel"
 
 
 def test_without_vsd_no_depth_is_decoded(made: BopDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = predictions_of(made, lambda i: i.camera_from_model)
     monkeypatch.setattr(errors, "read_depth_png", None)
     result = evaluate(made, answers, EvaluationConfig(with_vsd=False))
-    assert result.rows[0]["ar_mspd"] == pytest.approx(1.0)
+    assert columns(result.rows)[0]["ar_mspd"] == pytest.approx(1.0)
 
 
 def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
@@ -123,28 +133,28 @@ def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
     )
     every[0] = replace(every[0], estimate=replace(every[0].estimate, inlier_share=0.1))
     result = evaluate(made, every)
-    assert result.rows[0]["wrong"] == pytest.approx(1 / 3)
-    assert result.rows[0]["refused"] == 0.0
+    assert columns(result.rows)[0]["wrong"] == pytest.approx(1 / 3)
+    assert columns(result.rows)[0]["refused"] == 0.0
     # The wrong one is the least sure: who asks for less gets no wrong answer.
-    assert [row["risk"] for row in result.risk][-1] == pytest.approx(1 / 6)
-    assert [row["risk"] for row in result.risk][:-1] == [0.0] * (len(result.risk) - 1)
-    assert result.risk[-1]["coverage"] == 1.0
+    assert [row.risk for row in result.risk][-1] == pytest.approx(1 / 6)
+    assert [row.risk for row in result.risk][:-1] == [0.0] * (len(result.risk) - 1)
+    assert result.risk[-1].coverage == 1.0
 
 
 def test_behind_the_camera_is_measured_too(made: BopDataset) -> None:
     back = [0.0, 0.0, 0.0, 0.0, 0.0, -1.5]
     result = evaluate(made, predictions_of(made, lambda i: moved(i, back)))
-    assert result.rows[-1]["ar"] == 0.0
-    assert result.per_instance[0]["mspd_px"] is None
-    assert result.per_instance[0]["vsd"] == 1.0
+    assert columns(result.rows)[-1]["ar"] == 0.0
+    assert result.per_instance[0].error("mspd_px") is None
+    assert result.per_instance[0].error("vsd") == 1.0
 
 
 def test_files_are_measured_alike(made: BopDataset, tmp_path: Path) -> None:
     every = predictions_of(made, lambda i: moved(i, [0.1, 0.0, 0.0, 0.0, 0.0, 0.01]))
     write_predictions(tmp_path, every)
     write_bop_results(tmp_path / "ours_made-test.csv", every)
-    ours = evaluate(made, read_any(tmp_path)).rows
-    csv = evaluate(made, read_any(tmp_path / "ours_made-test.csv")).rows
+    ours = columns(evaluate(made, read_any(tmp_path)).rows)
+    csv = columns(evaluate(made, read_any(tmp_path / "ours_made-test.csv")).rows)
     for one, other in zip(ours, csv, strict=True):
         for name in ("success", "auc", "ar", "rotation_deg_median", "ms_total"):
             assert one[name] == pytest.approx(other[name]), name
@@ -162,7 +172,7 @@ def test_several_of_an_object_are_set_against_their_nearest(made: BopDataset) ->
         for k, p in enumerate([stray, *reversed(answers)])
     ]
     row = evaluate(two, nameless).rows[0]
-    assert (row["success"], row["instances"]) == (1.0, 2)
+    assert (row.success, row.instances) == (1.0, 2)
 
 
 def test_the_diameter_table_is_named_and_decides(made: BopDataset) -> None:
@@ -197,9 +207,9 @@ def test_an_estimate_that_belongs_elsewhere_answers_for_none(made: BopDataset) -
     with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
         evaluate(made, elsewhere)
     result = evaluate(made, [*every[:1], *elsewhere[1:]])
-    assert [row["status"] for row in result.per_instance] == ["ok"] + ["missing"] * 5
+    assert [row.status for row in result.per_instance] == ["ok"] + ["missing"] * 5
     nowhere = [replace(p, place=None) for p in every]
-    assert evaluate(made, nowhere).rows[-1]["success"] == 1.0
+    assert evaluate(made, nowhere).rows[-1].success == 1.0
 
 
 def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:
@@ -209,7 +219,7 @@ def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:
     ]
     with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
         evaluate(made, strangers)
-    assert evaluate(made, []).rows[0]["refused"] == 1.0
+    assert evaluate(made, []).rows[0].refused == 1.0
     with pytest.raises(InputError, match="vsd_delta_m is 15"):
         EvaluationConfig(vsd_delta_m=15.0)
 
@@ -228,3 +238,25 @@ def test_the_nearest_copy_of_what_turns_freely_is_the_estimate_itself() -> None:
     assert math.degrees(float(rotation_error_rad(found, free))) < 3
     assert torch.allclose(fixed.R, true.R)
     assert torch.allclose(fixed.t_m, true.t_m)
+
+
+_SCORES = ["auc", "auc_adds", "ar_mssd", "ar_mspd", "ar_vsd", "ar", "rotation_deg_median",
+           "translation_m_median"]  # fmt: skip
+
+
+def test_columns_come_in_the_declared_order(made: BopDataset) -> None:
+    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model))
+    found = result.of(Origin(method="ours", masks="truth", weights="w", weights_sha256="ab"))
+    who, times = ["method", "masks"], ["ms_network", "ms_voting", "ms_total"]
+    stamp = ["diameters", "frames", "frames_sha256"]
+    assert list(found.per_instance[0].columns()) == [
+        *who, "instance", "object", "status", "is_success", "score", "visible_fraction", "truth",
+        "diameter_m", "metric", "error_m", "adds_m", "mssd_m", "mspd_px", "rotation_deg",
+        "translation_m", "vsd", *times, "reason",
+    ]  # fmt: skip
+    shares = ["object", "instances", "annotated", "success", "refused", "wrong", "coverage"]
+    every = [*who, "weights", "weights_sha256", *shares, *_SCORES, *times]
+    assert list(found.rows[0].columns()) == [*every, "metric", "diameter_m", *stamp]
+    assert list(found.rows[2].columns()) == list(found.rows[3].columns()) == [*every, *stamp]
+    risk = [*who, "coverage", "answers", "least_score", "risk", *stamp]
+    assert list(found.risk[0].columns()) == risk

@@ -99,7 +99,7 @@ def test_two_keypoints_fix_no_pose() -> None:
                  torch.rand(8, 3).double(), torch.arange(8) < 2)  # fmt: skip
 
 
-def test_keypoints_that_break_rigidity_are_outvoted() -> None:
+def test_keypoints_that_break_rigidity_are_dropped() -> None:
     model = torch.randn(8, 3, generator=generator(4)).double() * 0.1
     found = random_pose(7, (3,)).apply(model.expand(3, 8, 3))
     errors = distance_errors(found, model)

@@ -153,7 +153,7 @@ def test_faces_that_are_no_surface_are_refused(tmp_path: Path) -> None:
     )
 
 
-def test_the_wrong_unit_is_told(tmp_path: Path) -> None:
+def test_the_wrong_unit_is_reported(tmp_path: Path) -> None:
     trimesh.creation.box((100, 200, 300)).export(tmp_path / "mm.ply")
     trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "m.ply")
     with pytest.raises(InputError, match=r"is 300 m long.*is it in mm"):

@@ -247,7 +247,7 @@ def test_a_bare_network_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("values", "text"),
     [
         ({"classes": 0}, "classes must be 1 or more, got 0"),
         ({"encoder": (32, 0, 1, 1)}, "encoder must be 1 or more"),
@@ -255,6 +255,6 @@ def test_a_bare_network_comes_back(tmp_path: Path) -> None:
         ({"descriptor": -1}, "descriptor must be 1 or more, got -1"),
     ],
 )
-def test_sizes_that_cannot_be_are_refused(knobs: dict, text: str) -> None:
+def test_sizes_that_cannot_be_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        ResUNetConfig(**knobs)
+        ResUNetConfig(**values)

@@ -1,4 +1,4 @@
-"""Made views: exact, reproducible, and what the knobs say."""
+"""Synthetic views: exact, reproducible, and what the settings say."""
 
 import dataclasses
 from pathlib import Path
@@ -133,9 +133,9 @@ def test_visible_fractions_fill_their_range() -> None:
 
 
 def test_grown_masks_hold_what_is_behind() -> None:
-    knobs = {**_CLEAN, "with_background": True, "mask_error_px": 3, "resolution": (1.0, 1.0)}
+    values = {**_CLEAN, "with_background": True, "mask_error_px": 3, "resolution": (1.0, 1.0)}
     model = _model()
-    objects = Objects([model], ObjectsConfig(views=None, **knobs))
+    objects = Objects([model], ObjectsConfig(views=None, **values))
     grown = 0
     for index in range(12):
         view = objects.view(index)

@@ -192,16 +192,16 @@ def test_what_a_surface_does_not_fix_is_uncertain() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "said"),
+    ("values", "said"),
     [
         ({"iterations": 0}, "take 1, 100 and 100"),
         ({"cloud_points": 10}, "take 1, 100 and 100"),
         ({"end_distance_diameters": 0.2}, "the limit shrinks"),
     ],
 )
-def test_knobs_out_of_range_are_refused(knobs: dict[str, object], said: str) -> None:
+def test_settings_out_of_range_are_refused(values: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        config_from_dict(knobs, IcpConfig, source="test")
+        config_from_dict(values, IcpConfig, source="test")
 
 
 def test_the_real_cat_and_ape(real: Path) -> None:

@@ -13,7 +13,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.estimator import calibrate_refusal, fit_candidate_slopes, risk_of
 from depthpose.pose.estimator.alternatives import share_out
-from depthpose.pose.estimator.evidence import SIGNALS, hold_of, surface_signals
+from depthpose.pose.estimator.evidence import SIGNALS, observability, surface_signals
 from depthpose.pose.estimator.refusal import reason_of
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.surface import prepare_surface
@@ -119,15 +119,15 @@ def test_what_cannot_be_calibrated_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("values", "text"),
     [
         ({"max_risk": 1.5}, "max_risk is 1.5, but a risk lies between 0 and 1"),
         ({"min_hold": -0.1}, "min_hold is -0.1, but it is a share"),
     ],
 )
-def test_knobs_beyond_their_range_are_refused(knobs: dict, text: str) -> None:
+def test_settings_beyond_their_range_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        RefusalConfig(**knobs)
+        RefusalConfig(**values)
     with pytest.raises(InputError, match="batch_voxels 0; take 100 and 1 at least"):
         EstimateConfig(batch_voxels=0)
     with pytest.raises(InputError, match="starts is 8; take 1, the voted pose, to 7"):
@@ -151,19 +151,19 @@ def test_a_wrong_pose_has_worse_signals_than_the_true_one() -> None:
         assert surface_signals(cloud, turned, surface)[name] > true[name] + 0.1
 
 
-def test_the_hold_of_a_plane_is_nothing_and_of_a_corner_is_firm() -> None:
+def test_a_plane_is_unobservable_and_a_corner_is_not() -> None:
     model = bracket()
     surface = prepare_surface(model)
     pose = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, 0.8]).double())
     flat = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     side = flat * torch.tensor([0.19, 0.05, 0]) + torch.tensor([0.0, 0, -0.025])
     none = torch.zeros(0, 6)
-    hold, motion = hold_of(pose.apply(side.double()), pose, surface, none)
+    hold, motion = observability(pose.apply(side.double()), pose, surface, none)
     assert hold < 1e-6
     assert float(motion.norm()) == pytest.approx(1)
-    whole, _ = hold_of(pose.apply(surface.points_m), pose, surface, none)
+    whole, _ = observability(pose.apply(surface.points_m), pose, surface, none)
     assert whole > 0.15
-    away, _ = hold_of(torch.ones(100, 3), pose, surface, none)
+    away, _ = observability(torch.ones(100, 3), pose, surface, none)
     assert away == 0
 
 

@@ -188,13 +188,13 @@ def test_overlap_of_a_worked_example() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knob", "value", "said"),
+    ("setting", "value", "said"),
     [
         ("widths", (0, 1, 1, 1), "widths must be 1 or more"),
         ("long_side_px", 16, "long_side_px is 16.*take 640"),
         ("min_share", 1.0, "min_share is 1.0.*share of the image"),
     ],
 )
-def test_sizes_that_cannot_be_are_refused(knob: str, value: Any, said: str) -> None:  # noqa: ANN401
+def test_sizes_that_cannot_be_are_refused(setting: str, value: Any, said: str) -> None:  # noqa: ANN401
     with pytest.raises(InputError, match=said):
-        SegmentationConfig(**{knob: value})
+        SegmentationConfig(**{setting: value})

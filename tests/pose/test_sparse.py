@@ -1,5 +1,7 @@
 """The sparse convolution against the dense one of torch, and the laws that it obeys."""
 
+from importlib import import_module
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -18,9 +20,9 @@ from depthpose.pose.sparse import (
     conv,
     kernel_offsets,
 )
-from depthpose.pose.sparse import conv as conv_function
 from depthpose.pose.sparse.keys import CLOUD_LIMIT, pack, unpack
 
+CONV = import_module("depthpose.pose.sparse.conv")
 SIDE = 8
 """Dense grids run from -SIDE to SIDE - 1."""
 
@@ -79,7 +81,7 @@ def dense_conv(x: Tensor, weight: Tensor, stride: int, *, is_transposed: bool) -
 @pytest.fixture(params=["by grid", "by offset"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways of computing the same."""
-    module = conv_function.__globals__
+    module = vars(CONV)
     monkeypatch.setitem(module, "GRID_PRODUCTS", -1 if request.param == "by offset" else 1 << 30)
 
 
@@ -141,7 +143,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
     cache = CoordinateCache(pack(torch.tensor([[0, -1, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0],
                                                [1, 0, 0, 0]])))  # fmt: skip
     kernel_map = cache.kernel_map(0, 3)
-    pairs = kernel_map.meetings.pairs
+    pairs = kernel_map.neighbours.pairs
     met = set(zip(*(t.tolist() for t in (pairs.slot // 2, pairs.fine, pairs.coarse)), strict=True))
     offsets = kernel_offsets(3)
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
@@ -152,10 +154,10 @@ def test_pairs_of_a_small_case_by_hand() -> None:
 
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
-    by_table = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
+    by_table = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
-    by_search = [cloud_keys.kernel_map(*a).meetings.table for a in ((0, 5), (0, 3, 2), (1, 3))]
+    by_search = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
 
 
@@ -167,9 +169,9 @@ def test_no_look_leaves_the_table(
     """A full block, whichever of its planes the coarser voxels lie on or before."""
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
-    found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
+    found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
-    wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).meetings.table
+    wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     assert torch.equal(found, wanted)
 
 
@@ -183,7 +185,7 @@ def test_a_kernel_that_looks_beyond_the_table_is_refused(kernel: int, stride: in
 def test_voxels_far_apart_need_no_table_of_the_air_between() -> None:
     ends = COORDINATE_LIMIT - 1
     far = torch.tensor([[0, -ends, -ends, -ends], [0, ends, ends, ends], [0, ends, ends, ends - 1]])
-    table = Voxels.from_points(far).cache.kernel_map(0, 3).meetings.table
+    table = Voxels.from_points(far).cache.kernel_map(0, 3).neighbours.table
     assert int((table < 3).sum()) == 3 + 2
 
 
@@ -268,9 +270,9 @@ def test_one_voxel_meets_itself_alone() -> None:
 def test_maps_are_made_once() -> None:
     cache = Voxels.from_points(cloud()).cache
     down = cache.kernel_map(0, 3, 2)
-    assert cache.kernel_map(0, 3, 2).meetings is down.meetings
-    assert cache.kernel_map(1, 3, 2, is_transposed=True).meetings is down.meetings
-    assert cache.kernel_map(0, 3).meetings is not down.meetings
+    assert cache.kernel_map(0, 3, 2).neighbours is down.neighbours
+    assert cache.kernel_map(1, 3, 2, is_transposed=True).neighbours is down.neighbours
+    assert cache.kernel_map(0, 3).neighbours is not down.neighbours
 
 
 def test_the_gathered_rows_are_not_kept() -> None:
@@ -364,11 +366,32 @@ def test_blocks_through_onednn_add_up_to_the_same(monkeypatch: pytest.MonkeyPatc
     pull = features_of(coordinates, 5, seed=3)
     single = [t.float().requires_grad_() for t in (x, weight)]
     double = [t.clone().requires_grad_() for t in (x, weight)]
-    monkeypatch.setitem(conv_function.__globals__, "BLOCK_PRODUCTS", 8 * 5 * 16)
-    monkeypatch.setitem(conv_function.__globals__, "GRID_PRODUCTS", -1)
+    monkeypatch.setattr(CONV, "BLOCK_PRODUCTS", 8 * 5 * 16)
+    monkeypatch.setattr(CONV, "GRID_PRODUCTS", -1)
     found, expected = conv(single[0], single[1], m), conv(double[0], double[1], m)
     torch.testing.assert_close(found, expected.float(), rtol=1e-4, atol=1e-4)
     mine = torch.autograd.grad(found, single, pull.float())
     theirs = torch.autograd.grad(expected, double, pull)
     for gradient, wanted in zip(mine, theirs, strict=True):
         torch.testing.assert_close(gradient, wanted.float(), rtol=1e-4, atol=1e-4)
+
+
+def refuse(*_: object) -> Tensor:
+    raise RuntimeError("no such operator")
+
+
+def test_without_the_private_operator_the_public_one_gives_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows, kernel = features_of(cloud(), 8).float(), weight_of(1, 8, 5)[0].float()
+    fast = CONV.multiply(rows, kernel, 1)
+    monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", refuse, raising=False)
+    CONV._has_private_product.cache_clear()
+    try:
+        assert not CONV._has_private_product()
+        assert CONV.block_rows(rows, kernel) > len(rows)
+        public = CONV.multiply(rows, kernel, 1)
+    finally:
+        CONV._has_private_product.cache_clear()
+    assert torch.equal(public, rows @ kernel)
+    torch.testing.assert_close(fast, public)

@@ -1,4 +1,4 @@
-"""One object through made frames: followed by ICP alone, lost where it is not, and found anew."""
+"""One object through synthetic frames: followed by ICP, lost where it is not, and found anew."""
 
 import math
 

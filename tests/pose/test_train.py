@@ -49,7 +49,7 @@ from depthpose.pose.train.held_out import (
     HeldOut,
     calibrated,
     held_out_objects,
-    judged,
+    score_held_out,
     table_text,
 )
 from depthpose.pose.train.task import keypoint_copies, packed
@@ -83,7 +83,7 @@ def _training(**changes: object) -> PoseTraining:
     return dataclasses.replace(config, **changes)
 
 
-def test_a_ticket_gives_the_same_cloud_whenever_it_is_asked_for() -> None:
+def test_an_index_gives_the_same_cloud_at_any_time() -> None:
     one, other = (TrainingClouds(_models(), _MADE, None, _CLOUD, 0) for _ in range(2))
     for ticket in (0, 5, 17):
         first, second = one[ticket], other[ticket]
@@ -267,12 +267,12 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
     assert weights.network.config.norm == "none"
     assert [model.name for model in weights.models] == ["bracket"]
     assert weights.cloud == _CLOUD
-    assert "made views of bracket" in weights.facts["trained_on"]
+    assert "synthetic views of bracket" in weights.facts["trained_on"]
     card = path.with_suffix(".md").read_text()
     assert "- **Objects**: bracket (160 mm)\n" in card
     assert "`depthpose pose train --what pose --config config.yaml --out run`" in card
     assert "- **Time**: " in card
-    assert "| hidden % | right % |" in card
+    assert "| occluded % | right % |" in card
     rows = json.loads(path.with_suffix(".json").read_text())["held_out"]
     assert set(rows) == {"0"}
     shares = [rows["0"][name] for name in ("right", "wrong", "refused")]
@@ -375,7 +375,7 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> 
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_weights_are_calibrated_and_judged_as_the_file_has_them(
+def test_weights_are_calibrated_and_measured_as_the_file_has_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[PoseWeights] = []
@@ -389,7 +389,7 @@ def test_weights_are_calibrated_and_judged_as_the_file_has_them(
         return {}
 
     monkeypatch.setattr("depthpose.pose.train.runs.calibrated", chosen)
-    monkeypatch.setattr("depthpose.pose.train.runs.judged", counted)
+    monkeypatch.setattr("depthpose.pose.train.runs.score_held_out", counted)
     path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     assert len(seen) == 2
@@ -420,16 +420,16 @@ def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", _as_known)
     weights = tiny_weights(*_models())
     held_out = HeldOutConfig(number=100, occlusions=(0.0,))
-    uncalibrated = judged(weights, _MADE, held_out)["0"]
+    uncalibrated = score_held_out(weights, _MADE, held_out)["0"]
     assert uncalibrated["wrong"] == pytest.approx(0.4)
     chosen = calibrated(weights, _MADE, CalibrationConfig(number=200, max_wrong_share=0.02))
-    table = judged(chosen, _MADE, held_out)
+    table = score_held_out(chosen, _MADE, held_out)
     assert (table["0"]["wrong"] or 0.0) <= 0.02
     assert (table["0"]["right"] or 0.0) > 0.55
     opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
-    without = judged(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
+    without = score_held_out(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
     assert without["wrong"] == pytest.approx(0.4)
-    assert "| hidden % | right % | wrong % | refused %" in table_text(table)
+    assert "| occluded % | right % | wrong % | refused %" in table_text(table)
     assert table_text(table).splitlines()[-1].startswith("| 0 | ")
 
 
@@ -444,7 +444,7 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
     weights = tiny_weights(*_models())
     assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
     _ = calibrated(weights, _MADE, CalibrationConfig(number=20))
-    _ = judged(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
+    _ = score_held_out(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
     calibration, held_out = (objects[0].input.points_m for objects in seen)
     assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
@@ -478,7 +478,7 @@ def test_models_come_from_one_source(tmp_path: Path) -> None:
     assert [len(model.keypoints_m) for model in read_models(four)] == [4, 4]
 
 
-def test_symmetries_of_a_cad_file_are_told_and_taken_where_asked(tmp_path: Path) -> None:
+def test_symmetries_of_a_cad_file_are_reported_and_taken_on_request(tmp_path: Path) -> None:
     file, told = str(write_part("flange", tmp_path)), []
     (plain,) = read_models(ModelsConfig(cad=(file,)), told.append)
     assert plain.symmetries.is_none
@@ -523,12 +523,12 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
         (lambda: _training(first_alone=-1), "first_alone is -1; take 0 or more"),
         (FramesConfig, "frames has no folder"),
         (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
-        (lambda: HeldOutConfig(number=0), "nothing would be looked at; take 25"),
+        (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
         (lambda: CalibrationConfig(number=5), "number is 5; nothing can be chosen by fewer"),
         (lambda: CalibrationConfig(max_wrong_share=1.0), "max_wrong_share is 1.0"),
     ],
 )
-def test_knobs_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001
+def test_settings_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001
     with pytest.raises(InputError) as error:
         make()
     assert said in str(error.value)

@@ -100,7 +100,7 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
     card = path.with_suffix(".md").read_text()
     for said in (
         "- **Objects**: bracket (268 mm)\n",
-        "- **Trained on**: made views of bracket\n",
+        "- **Trained on**: synthetic views of bracket\n",
         "- **Licence**: MIT\n",
         "- **Terms**: For research alone.\n",
         "`depthpose pose train --what depth-image --config config.yaml --out ",
@@ -355,6 +355,6 @@ def test_training_images_are_the_same_for_the_same_ticket(colored: Path) -> None
         (lambda: DepthImageTraining(surface_points=2), "surface_points is 2"),
     ],
 )
-def test_knobs_that_cannot_be_are_refused(make: object, said: str) -> None:
+def test_settings_that_cannot_be_are_refused(make: object, said: str) -> None:
     with pytest.raises(InputError, match=said):
         make()  # pyright: ignore[reportCallIssue]

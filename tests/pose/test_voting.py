@@ -206,7 +206,7 @@ def test_too_few_votes_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knob", "value", "said"),
+    ("setting", "value", "said"),
     [
         ("hypotheses", 0, "take 128"),
         ("min_cosine", 1.5, "0.99 means 8 degrees"),
@@ -216,6 +216,6 @@ def test_too_few_votes_are_refused() -> None:
         ("rigidity_diameters", 0.0, "take 0.1"),
     ],
 )
-def test_knobs_out_of_range_are_refused(knob: str, value: object, said: str) -> None:
+def test_settings_out_of_range_are_refused(setting: str, value: object, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        config_from_dict({knob: value}, VotingConfig, source="test")
+        config_from_dict({setting: value}, VotingConfig, source="test")

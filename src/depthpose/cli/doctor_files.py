@@ -17,17 +17,22 @@ from depthpose.core.camera import (
     suspicious_centre,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_cloud, read_depth_png, read_image, read_json, read_map
+from depthpose.core.files import (
+    cloud_suffixes,
+    read_cloud,
+    read_depth_png,
+    read_image,
+    read_json,
+    read_map,
+)
 from depthpose.core.files.images import opened_image
 from depthpose.pose.cloud import frame_advice
 from depthpose.pose.datasets import mask_from_rle
-from depthpose.pose.mesh import exact_diameter, unit_advice
-from depthpose.pose.mesh.models import MESHES, read_geometry
+from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, unit_advice
 
 Size = tuple[int, int]
 
 _CAMERAS = (".json", ".yaml", ".yml", ".xml", ".txt")
-_CLOUDS = (".pcd", ".xyz")
 _MAPS = (".npy", ".pfm")
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
 _NEAR_M, _FAR_M = 0.05, 100.0
@@ -94,12 +99,12 @@ def _read(path: Path, size: Size | None) -> Seen:
         return _read_words(path, size)
     if suffix in _MAPS:
         return _of_map(path)
-    if suffix in _CLOUDS:
-        return _of_points(path, read_cloud(path).points.double())
-    if suffix in MESHES:
+    if suffix in mesh_suffixes():
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
         return _of_model(path, points, len(faces)) if len(faces) else _of_points(path, points)
+    if suffix in cloud_suffixes():
+        return _of_points(path, read_cloud(path).points.double())
     return _of_picture(path)
 
 

@@ -64,7 +64,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     ]
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
-    rows = [_row(row) for row in evaluate(dataset, predictions).per_instance]
+    rows = [_row(row.columns()) for row in evaluate(dataset, predictions).per_instance]
     assert frame.rgb is not None
     picture = frame.rgb
     layers = [Layer(name="table, as the sensor sees it", shape=_cloud(frame))]

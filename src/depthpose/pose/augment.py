@@ -1,4 +1,4 @@
-"""Random changes that keep a pose true: what hides an object, wrong masks, a sensor's errors.
+"""Random changes that keep a pose true: occluders, wrong masks, a sensor's errors.
 
 Each takes its chance from a generator alone. Depth is NaN where nothing is seen.
 """
@@ -48,7 +48,7 @@ def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
 def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     """Draw a function whose lower parts are half-planes, ellipses, boxes or convex polygons.
 
-    Cut at a quantile, it hides exactly the wanted share of anything.
+    Cut at a quantile, it occludes exactly the wanted share of anything.
     """
     size = max(height, width)
     angle, stretch = uniform(generator, 0.0, 2 * math.pi), uniform(generator, 0.3, 1.0)
@@ -68,10 +68,10 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
             return _polygon(along, across, generator)
 
 
-def hide(
+def occlude(
     depth_m: Depth, silhouette: Mask, share: float, generator: torch.Generator
 ) -> tuple[Depth, Mask]:
-    """Stand something before the object that hides exactly a share of its silhouette.
+    """Occlude exactly a share of the object's silhouette by something before it.
 
     Returns:
         The depth with the occluder in it, and what is left of the silhouette.
@@ -82,7 +82,7 @@ def hide(
     if count == 0:
         return depth_m, silhouette
     is_hidden = levels <= levels[silhouette].kthvalue(count).values
-    # Nearer than all that it hides.
+    # Nearer than all that it occludes.
     nearest_m = depth_m.masked_fill(~(silhouette & is_hidden), torch.inf).min()
     occluder_m = (nearest_m - gap_m).clamp(min=0.1 * nearest_m)
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden

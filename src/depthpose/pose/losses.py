@@ -1,19 +1,19 @@
-"""What the direction network is punished for."""
+"""Losses of the pose networks."""
 
-from typing import Literal
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from depthpose.core.errors import refuse_unknown
 from depthpose.core.rigid import Rigid
 
-DirectionMode = Literal["mse", "cosine", "l1"]
 Directions = Float[Tensor, "points keypoints 3"]
 
 CONFIDENCE_SCALE_RAD = 0.1415
-"""Angle of a vote that deserves half the trust: its cosine is 0.99, where RANSAC draws its line."""
+"""Angle of a vote whose target confidence is a half: its cosine is 0.99, RANSAC's threshold."""
 
 
 def unit_directions(
@@ -23,18 +23,26 @@ def unit_directions(
     return F.normalize(keypoints_m - points_m[:, None], dim=-1, eps=1e-9)
 
 
-def point_losses(
-    found: Directions, truth: Directions, mode: DirectionMode = "mse"
-) -> Float[Tensor, " points"]:
-    """Punish the raw directions of each point, averaged over keypoints.
+POINT_LOSSES: dict[str, Callable[[Directions, Directions], Float[Tensor, " points"]]] = {
+    "mse": lambda found, truth: (found - truth).square().mean((-2, -1)),
+    "cosine": lambda found, truth: (1 - F.cosine_similarity(found, truth, dim=-1)).mean(-1),
+    "l1": lambda found, truth: (found - truth).abs().mean((-2, -1)),
+}
+"""Losses of the raw directions of each point, averaged over keypoints; a training config's ``loss``
+names one, and a new one is one more entry. ``mse`` and ``l1`` pull to unit length too; ``cosine``
+leaves the length alone."""
 
-    ``mse`` and ``l1`` pull to unit length too, over the three components; ``cosine`` is
-    1 - cos of the angle and leaves the length alone.
+
+def point_losses(
+    found: Directions, truth: Directions, mode: str = "mse"
+) -> Float[Tensor, " points"]:
+    """Give the loss of each point's raw directions.
+
+    Raises:
+        InputError: ``mode`` is no key of ``POINT_LOSSES``.
     """
-    if mode == "cosine":
-        return (1 - F.cosine_similarity(found, truth, dim=-1)).mean(-1)
-    difference = found - truth
-    return (difference.square() if mode == "mse" else difference.abs()).mean((-2, -1))
+    refuse_unknown("loss", mode, POINT_LOSSES)
+    return POINT_LOSSES[mode](found, truth)
 
 
 def instance_means(
@@ -52,7 +60,7 @@ def choose_copies(
     points_m: Float[Tensor, "points 3"],
     copies_m: Float[Tensor, "instances copies keypoints 3"],
     instance: Int[Tensor, " points"],
-    mode: DirectionMode = "mse",
+    mode: str = "mse",
 ) -> Int[Tensor, " instances"]:
     """Find for each instance the symmetric copy of its truth that its votes are nearest to.
 
@@ -75,11 +83,11 @@ def direction_loss(
     points_m: Float[Tensor, "points 3"],
     copies_m: Float[Tensor, "instances copies keypoints 3"],
     instance: Int[Tensor, " points"],
-    mode: DirectionMode = "mse",
+    mode: str = "mse",
 ) -> Float[Tensor, ""]:
     """Mean over instances of the least loss that any symmetric copy of the truth gives.
 
-    It is the same whichever of the symmetric truths stands first.
+    It is the same whichever of the symmetric truths comes first.
 
     Args:
         found: raw outputs of each point's own class.
@@ -87,7 +95,7 @@ def direction_loss(
         copies_m: keypoints of each instance under each of its object's symmetries; objects with
             fewer than others repeat a copy.
         instance: which instance each point belongs to.
-        mode: how a direction is punished.
+        mode: a key of ``POINT_LOSSES``.
     """
     if not len(found):
         return found.sum()
@@ -102,7 +110,7 @@ def direction_loss(
 def confidence_target(
     found: Directions, truth: Directions, scale_rad: float = CONFIDENCE_SCALE_RAD
 ) -> Float[Tensor, "points keypoints"]:
-    """Say how far each vote deserves trust: 1 / (1 + (angle / scale)^2); no gradient."""
+    """Give the confidence that each vote should have: 1 / (1 + (angle / scale)^2); no gradient."""
     found = found.detach()
     # atan2 keeps its digits near 0 and pi, where acos of a cosine loses half of them.
     across = torch.linalg.cross(found, truth).norm(dim=-1)
@@ -113,7 +121,7 @@ def confidence_target(
 def confidence_loss(
     logits: Float[Tensor, "points keypoints"], found: Directions, truth: Directions
 ) -> Float[Tensor, ""]:
-    """Binary cross entropy of the trust that the network claims against what its votes deserve."""
+    """Binary cross entropy of the network's confidences against those its votes should have."""
     if not len(logits):
         return logits.sum()
     return F.binary_cross_entropy_with_logits(logits, confidence_target(found, truth))
@@ -127,7 +135,7 @@ def mask_loss(
     Args:
         logits: class 0 is the background.
         labels: the true class of each pixel.
-        object_weight: objects cover a few percent of an image; 1 lets the background rule.
+        object_weight: objects cover a few percent of an image; at 1 the background dominates.
     """
     weight = logits.new_full((logits.shape[1],), object_weight)
     weight[0] = 1.0
@@ -139,8 +147,8 @@ def model_point_loss(
 ) -> Float[Tensor, " b"]:
     """ADD [m] of each pose against the nearest symmetric copy of its truth.
 
-    The mean distance of model points, differentiable in the found pose. The copy is chosen once an
-    instance.
+    The mean distance of model points, differentiable in the found pose. The copy is chosen once for
+    each instance.
 
     Args:
         found: ``camera_from_model``, a batch.

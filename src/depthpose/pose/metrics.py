@@ -254,7 +254,7 @@ def risk_coverage(
     order = risks.argsort(stable=True)
     ordered, wrong = risks[order], (~is_right[order]).double().cumsum(0)
     answered = torch.arange(1, len(risks) + 1, dtype=torch.float64)
-    # Equal risks are refused together: the last of them stands for all.
+    # Equal risks are refused together: the last of them counts for all.
     is_last = torch.ones_like(ordered, dtype=torch.bool)
     is_last[:-1] = ordered[1:] > ordered[:-1]
     kept = is_last & ordered.isfinite()

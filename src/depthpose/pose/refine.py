@@ -1,4 +1,4 @@
-"""Point-to-plane ICP: a pose slides onto the cloud along the model's surface."""
+"""Point-to-plane ICP: refines poses of a model's surface on a cloud."""
 
 import math
 from collections.abc import Callable
@@ -22,11 +22,11 @@ _TURN_RAD = math.radians(15)
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
 _ROUGH_POINTS = 100
-"""Of the cloud, by which starts slide and are told apart."""
+"""Points of the cloud that refine and compare starts."""
 _ROUGH_JUDGED = 1000
-"""Of the cloud, by which it is seen what a pose would hide."""
+"""Points of the cloud that show what a pose would occlude."""
 _UNSEEN = 0.3
-"""What a surface that should be seen and is not counts against a pose: something may hide it."""
+"""What a surface that should be seen and is not counts against a pose: something may occlude it."""
 _LOST = 0.1
 """A given pose that leaves by so many points less near than its own start did was lost on the way:
 it began farther off than exact steps reach."""
@@ -126,7 +126,7 @@ def refine_best(
     All begin with some of the points and a table of what lies near
     (:class:`~depthpose.pose.surface.Boxes`); the best goes on exactly, in half of the steps, from
     the given pose where it was that one. It is the one that leaves the most points near the
-    surface, less those that it would have hidden and some of the surface that it shows and nobody
+    surface, less those that it would have occluded and some of the surface that it shows and nobody
     saw.
 
     Args:

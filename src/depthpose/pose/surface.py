@@ -17,7 +17,7 @@ NEAR = 0.05
 _CELL = 1 / 24
 """Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
 _REACH = 72
-"""Cells to each side of the middle of the cloud that are told apart, three diameters; what lies
+"""Cells to each side of the middle of the cloud that are distinguished, three diameters; what lies
 farther off counts as if it lay there."""
 _FRONT = 0.1
 """Points nearer to the camera than this share of the median are no part of what it saw."""
@@ -55,7 +55,7 @@ class Boxes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """Samples of a model's surface, made once and used for every cloud.
+    """Samples of a model's surface, computed once and used for every cloud.
 
     Attributes:
         points_m: of the surface, in the model frame.
@@ -103,10 +103,10 @@ def look_along_rays(
         cloud_m: what was seen, in the camera frame.
         poses: a batch, ``camera_from_model``.
         surface: of the model.
-        every: take each so-manieth point of the surface alone.
+        every: use each n-th point of the surface alone.
 
     Returns:
-        The share of the points that the posed surface would have hidden, and the share of the
+        The share of the points that the posed surface would have occluded, and the share of the
         cells of the posed surface in which nothing was seen; both 1 where the surface lies behind
         the camera.
     """
@@ -130,13 +130,13 @@ def look_along_rays(
     depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = depth_m.new_full((len(depth_m), cells), torch.inf)
     nearest_m = nearest_m.scatter_reduce_(1, mine, depth_m, "amin")
-    hidden = nearest_m[:, theirs] < cloud_m[:, 2] - 1.5 * NEAR * surface.diameter_m
+    occluded = nearest_m[:, theirs] < cloud_m[:, 2] - 1.5 * NEAR * surface.diameter_m
     is_seen = torch.zeros(cells, dtype=torch.bool)
     is_seen[theirs] = True
     is_posed = nearest_m.isfinite()
     total = is_posed.sum(1)
     unseen = (is_posed & ~is_seen).sum(1) / total.clamp(min=1)
-    front = hidden.double().mean(1)
+    front = occluded.double().mean(1)
     return torch.where(total > 0, front, 1.0), torch.where(total > 0, unseen.double(), 1.0)
 
 

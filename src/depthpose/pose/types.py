@@ -1,4 +1,4 @@
-"""What flows through the pose room: input apart from truth, the object, and the estimate."""
+"""Types of the pose package: input apart from truth, the object, and the estimate."""
 
 from dataclasses import dataclass, field, fields
 from typing import Literal
@@ -30,10 +30,10 @@ neither."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudInput:
-    """What a pose estimate may look at. There is no truth here, so none can leak.
+    """Input of a pose estimate. There is no truth here, so none can leak.
 
     Attributes:
-        name: what the files made from this input are called.
+        name: what the files of its results are called.
         points_m: the visible part of one object, in the camera frame (x right, y down, z forward).
         object: name of the object, as its :class:`ObjectModel` carries it.
     """
@@ -45,7 +45,7 @@ class CloudInput:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenPoints:
-    """What a network whose points vote is shown: one or several clouds, one after the other.
+    """Input of a network whose points vote: one or several clouds, one after the other.
 
     Attributes:
         points_m: one of each voxel, in the axes of its cloud's grid about its camera.
@@ -70,7 +70,7 @@ class PoseTruth:
 
     Attributes:
         camera_from_model: its pose.
-        visible_fraction: share of its silhouette that is not hidden, 0..1; None where unknown.
+        visible_fraction: share of its silhouette that is not occluded, 0..1; None where unknown.
         is_measured: whether the pose was annotated, not itself fitted to the same depth.
     """
 
@@ -92,7 +92,7 @@ class ViewInput:
     """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from.
 
     Attributes:
-        name: what the files made from this input are called.
+        name: what the files of its results are called.
         depth_m: along the optical axis; NaN where there is no reading. May be a window of a larger
             image.
         mask: the object's pixels, as a segmentation gives them: not free of errors.
@@ -267,7 +267,7 @@ class PoseEstimate:
         certainty: chance that this very pose is right, given the alternatives; None where there is
             neither a risk nor an alternative.
         alternatives: other poses that fit, the likeliest first.
-        signals: what the risk is made of, by name; kept for refusals too.
+        signals: what the risk is computed from, by name; kept for refusals too.
         seconds: time of each stage.
         tracking: how it came about, in a sequence; None elsewhere.
     """

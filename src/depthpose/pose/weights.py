@@ -1,4 +1,4 @@
-"""Weights of the pose room on disk: one network, and every object that it knows, in one file."""
+"""Pose weights on disk: one network, and every object that it knows, in one file."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ _TENSORS = (*_SURFACE, "keypoints_m")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWeights:
-    """What a weights file of this room holds: enough to pose an object without its CAD file.
+    """What a file of pose weights contains: enough to pose an object without its CAD file.
 
     Attributes:
         network: partial cloud to directions, in eval mode where it was read; or a baseline.

@@ -119,7 +119,7 @@ def pose_layers(
 
 
 def alternative_layers(found: PoseEstimate, model: ObjectModel) -> list[Layer]:
-    """Show each alternative by its axes and its box, hidden at first."""
+    """Show each alternative by its axes and its box, not shown at first."""
     layers: list[Layer] = []
     for other in found.alternatives:
         pose = Rigid(other.camera_from_model.R.double(), other.camera_from_model.t_m.double())
@@ -162,7 +162,7 @@ def vote_layer(
     Args:
         points_m: that vote.
         directions: to each keypoint, of any length.
-        voted_m: what they were found to meet at.
+        voted_m: the voted keypoints.
     """
     from_m, toward = take_evenly(points_m, _VOTES), take_evenly(directions, _VOTES)
     toward = torch.nn.functional.normalize(toward, dim=-1)

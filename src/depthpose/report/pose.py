@@ -40,7 +40,7 @@ class PoseShown:
 
     Attributes:
         given: what was seen.
-        estimate: what was made of it.
+        estimate: its result.
         model: the object.
         image: what the pose is drawn over, of the view's camera; None: its depth in grey.
         truth: ``camera_from_model``, where it is known.
@@ -70,7 +70,7 @@ def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Ro
 
 
 def pose_sentence(found: PoseEstimate) -> str:
-    """Say where the object is, or why that is not said."""
+    """Give where the object is, or why it is refused."""
     if found.camera_from_model is None:
         return f"Refused ({found.status}): {found.reason}."
     x, y, z = found.camera_from_model.t_m.tolist()

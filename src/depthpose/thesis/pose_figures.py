@@ -133,7 +133,7 @@ def draw_features(
     """Draw a cloud in the frame of its model, which is black.
 
     Looked at along parallel lines from the side that the cloud was seen from, so that the model
-    does not hide it; the model's z axis is up.
+    does not occlude it; the model's z axis is up.
 
     Args:
         points_m: in the model frame.
@@ -194,7 +194,7 @@ def draw_field(
         points_m: in the camera frame.
         directions: of unit length, one a point.
         true_m: the keypoint, in the camera frame.
-        voted_m: what the directions were said to meet at.
+        voted_m: the voted keypoints.
         size_px: side of the picture.
     """
     marks = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]

@@ -1,8 +1,10 @@
 """A row a method, a column an object: ours set beside what is printed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
 
 TITLES = {
     "3.1": "Table 3.1: comparison with baselines on LineMOD, ADD(-S)",
@@ -28,7 +30,7 @@ class PublishedRow:
 
     Attributes:
         method: who.
-        sees: what the method looks at.
+        sees: what the method uses.
         by_object: percent by BOP's number; empty where only the mean is printed.
         mean: percent, as printed.
         diameters: whose table a success is a tenth of.
@@ -47,7 +49,7 @@ class PublishedRow:
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
 _FFB6D = "table in the README of ethnhe/FFB6D"
-_EACH = "one network an object, some 20,000 made images of each"
+_EACH = "one network an object, some 20,000 synthetic images of each"
 
 
 def _row(method: str, sees: str, printed: str, mean: float, note: str, source: str) -> PublishedRow:
@@ -95,23 +97,87 @@ ROWS = (
 """Every figure as printed. Not like for like: see the notes, and the diameters."""
 
 
-Row = dict[str, Any]
+@dataclass(frozen=True, kw_only=True)
+class ComparedRow:
+    """A method, or the difference of two, in percent; None: there is no such number.
+
+    Attributes:
+        source: ``published``, ``ours`` or ``difference`` (ours minus the other).
+        method: who.
+        masks: that it was given.
+        sees: what the method uses.
+        by_object: percent by column.
+        mean: over the objects.
+        refused: percent of instances.
+        wrong: percent of instances.
+        auc: to 10 cm, in percent.
+        instances: how many.
+        diameters: whose table a success is a tenth of.
+        note: what else it takes to compare it.
+        printed_in: where it is printed.
+        origin: whose predictions are measured.
+        conditions: of the evaluation.
+        ms: mean milliseconds of each stage.
+    """
+
+    source: Literal["published", "ours", "difference"]
+    method: str
+    masks: str
+    sees: str | None = None
+    by_object: Mapping[str, float]
+    mean: float | None
+    refused: float | None = None
+    wrong: float | None = None
+    auc: float | None = None
+    instances: int | None = None
+    diameters: str | None = None
+    note: str | None = None
+    printed_in: str | None = None
+    origin: Origin | None = None
+    conditions: Conditions | None = None
+    ms: Mapping[str, float | None] = field(default_factory=dict)
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        found: dict[str, Any] = {
+            "source": self.source,
+            "method": self.method,
+            "masks": self.masks,
+            "sees": self.sees,
+            **self.by_object,
+            "mean": self.mean,
+            "refused": self.refused,
+            "wrong": self.wrong,
+            "auc": self.auc,
+            "instances": self.instances,
+            "diameters": self.diameters,
+            "note": self.note,
+            "printed in": self.printed_in,
+        }
+        found = {name: v for name, v in found.items() if v is not None or name == "mean"}
+        if self.origin is not None and self.conditions is not None:
+            found |= {
+                "weights": self.origin.weights,
+                "weights_sha256": self.origin.weights_sha256,
+                "frames": self.conditions.frames,
+                "frames_sha256": self.conditions.frames_sha256,
+            }
+        return found | {f"ms_{stage}": value for stage, value in self.ms.items()}
 
 
 def join_by_object(
-    rows: Sequence[Mapping[str, Any]], numbers: Mapping[str, int], *, with_published: bool
-) -> list[Row]:
+    rows: Sequence[ObjectRow], numbers: Mapping[str, int], *, with_published: bool
+) -> list[ComparedRow]:
     """Turn the rows of evaluations into a row a method and kind of masks, in percent.
 
     Args:
-        rows: of ``pose.evaluate``, with ``method`` and ``masks``.
-        numbers: BOP's number of each object, by the name that the rows bear.
+        rows: of ``pose.evaluate``, with their origin and conditions.
+        numbers: BOP's number of each object, by the name in the rows.
         with_published: set the printed rows of LineMOD before ours, and the differences to
             ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 
     Returns:
-        Rows with ``source``: ``published``, ``ours`` or ``difference`` (ours minus the other). The
-        mean of ours is over the objects that were measured; a difference of means is given only
+        The mean of ours is over the objects that were measured; a difference of means is given only
         where both are over the same objects.
     """
     columns = [_column(name, number, with_published) for name, number in numbers.items()]
@@ -119,7 +185,7 @@ def join_by_object(
     if not with_published:
         return [*ours, *(_difference(ours[0], other, columns) for other in ours[1:])]
     printed = [_published(row) for row in ROWS]
-    peers = [row for row in printed if row["method"] in PEERS]
+    peers = [row for row in printed if row.method in PEERS]
     differences = [_difference(row, peer, columns) for row in ours for peer in peers]
     return [*printed, *ours, *differences]
 
@@ -128,48 +194,70 @@ def _column(name: str, number: int, with_published: bool) -> str:
     return LINEMOD.get(number, name) if with_published else name
 
 
-def _grouped(rows: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
-    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+def _grouped(rows: Sequence[ObjectRow]) -> list[list[ObjectRow]]:
+    groups: dict[tuple[str, str], list[ObjectRow]] = {}
     for row in rows:
-        groups.setdefault((row["method"], row["masks"]), []).append(row)
+        assert row.origin is not None, "rows of an evaluation say whose they are"
+        groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
     return list(groups.values())
 
 
 def _own(
-    rows: Sequence[Mapping[str, Any]], numbers: Mapping[str, int], with_published: bool
-) -> Row:
-    of = {row["object"]: row for row in rows}
-    first = rows[0]
-    found: Row = {"source": "ours", "method": first["method"], "masks": first["masks"]}
-    found |= {"sees": "depth"}
-    for name, number in numbers.items():
-        found[_column(name, number, with_published)] = 100 * of[name]["success"]
+    rows: Sequence[ObjectRow], numbers: Mapping[str, int], with_published: bool
+) -> ComparedRow:
+    by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
-    mean = of.get("mean", first)
-    found["mean"] = 100 * mean["success"]
-    found |= {name: 100 * mean[name] for name in ("refused", "wrong", "auc")}
-    for name in ("instances", "diameters", "weights", "weights_sha256", "frames", "frames_sha256"):
-        found[name] = mean[name]
-    return found | {name: value for name, value in mean.items() if name.startswith("ms_")}
+    mean = by_name.get("mean", rows[0])
+    assert mean.origin is not None
+    assert mean.conditions is not None
+    return ComparedRow(
+        source="ours",
+        method=mean.origin.method,
+        masks=mean.origin.masks,
+        sees="depth",
+        by_object={
+            _column(name, number, with_published): 100 * by_name[name].success
+            for name, number in numbers.items()
+        },
+        mean=100 * mean.success,
+        refused=100 * mean.refused,
+        wrong=100 * mean.wrong,
+        auc=100 * (mean.scores["auc"] or 0.0),
+        instances=mean.instances,
+        diameters=mean.conditions.diameters,
+        origin=mean.origin,
+        conditions=mean.conditions,
+        ms=mean.ms,
+    )
 
 
-def _published(row: PublishedRow) -> Row:
-    found: Row = {"source": "published", "method": row.method, "masks": "", "sees": row.sees}
-    found |= {LINEMOD[number]: percent for number, percent in row.by_object.items()}
-    return found | {
-        "mean": row.mean, "diameters": row.diameters, "note": row.note, "printed in": row.source,
-    }  # fmt: skip
+def _published(row: PublishedRow) -> ComparedRow:
+    return ComparedRow(
+        source="published",
+        method=row.method,
+        masks="",
+        sees=row.sees,
+        by_object={LINEMOD[number]: percent for number, percent in row.by_object.items()},
+        mean=row.mean,
+        diameters=row.diameters,
+        note=row.note,
+        printed_in=row.source,
+    )
 
 
-def _difference(ours: Row, other: Row, columns: Sequence[str]) -> Row:
-    name = f"{ours['method']} - {other['method']}"
-    found: Row = {"source": "difference", "method": name, "masks": ours["masks"]}
-    for column in columns:
-        if other.get(column) is not None:
-            found[column] = ours[column] - other[column]
-    printed = [column for column in LINEMOD.values() if column in other]
-    is_same = other["source"] == "ours" or set(printed) == set(columns)
-    found["mean"] = ours["mean"] - other["mean"] if is_same else None
-    if ours["diameters"] != other["diameters"]:
-        found["diameters"] = f"{ours['diameters']} against {other['diameters']}"
-    return found
+def _difference(ours: ComparedRow, other: ComparedRow, columns: Sequence[str]) -> ComparedRow:
+    is_same = other.source == "ours" or set(other.by_object) == set(columns)
+    is_comparable = is_same and ours.mean is not None and other.mean is not None
+    differ = ours.diameters != other.diameters
+    return ComparedRow(
+        source="difference",
+        method=f"{ours.method} - {other.method}",
+        masks=ours.masks,
+        by_object={
+            column: ours.by_object[column] - other.by_object[column]
+            for column in columns
+            if column in other.by_object
+        },
+        mean=(ours.mean or 0.0) - (other.mean or 0.0) if is_comparable else None,
+        diameters=f"{ours.diameters} against {other.diameters}" if differ else None,
+    )

@@ -4,7 +4,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,8 @@ _ADD_POINTS = 1000
 LOOP_HYPOTHESES = 50
 """Of the loop: published practice."""
 OUR_HYPOTHESES = (50, 128, 1024)
+_LOOP = "RANSAC, one by one (NumPy)"
 
-Row = dict[str, Any]
 Points = Float[Tensor, "n 3"]
 
 
@@ -38,7 +38,7 @@ class VotingCase:
     """One cloud with the network's directions, and what they should give.
 
     Attributes:
-        points_m: where the votes stand.
+        points_m: where the votes start.
         directions: of unit length.
         model: the object.
         truth: its pose.
@@ -52,6 +52,38 @@ class VotingCase:
     is_adds: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class VotingRow:
+    """A way of voting, measured.
+
+    Attributes:
+        points: at most so many of each cloud.
+        votes: points of a cloud, their mean.
+        method: the way.
+        hypotheses: of RANSAC.
+        inlier_test: of RANSAC.
+        instances: how many clouds.
+        success: percent of them whose pose is right.
+        milliseconds: of the vote alone, the median.
+        times_faster: than the loop.
+    """
+
+    points: int
+    votes: float
+    method: str
+    hypotheses: int | None
+    inlier_test: str
+    instances: int
+    success: float
+    milliseconds: float
+    times_faster: float = 1.0
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        titles = {"inlier_test": "inliers by", "times_faster": "times faster"}
+        return {titles.get(name, name): value for name, value in asdict(self).items()}
+
+
 def cases_of(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int, *, is_adds: bool | None = None
 ) -> Iterator[VotingCase | None]:
@@ -60,7 +92,7 @@ def cases_of(
     Every point votes from its own place; points of one voxel share the network's direction.
 
     Args:
-        net: whose directions; its objects bear the names that the views say.
+        net: whose directions; its objects have the names in the views.
         views: with truth.
         points: at most so many of each, chosen at random, the same each time.
         is_adds: whether ADD-S decides; None: by what the object declares.
@@ -91,7 +123,7 @@ def cases_of(
         )
 
 
-def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[Row]:
+def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[VotingRow]:
     """Let every way vote on every case, one after the other, and sum up.
 
     The pose follows by the same fit for all: without the covariances that only ours give. What has
@@ -102,24 +134,24 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[Row]
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
     votes = sum(len(case.points_m) for case in usable) / len(usable)
-    rows: list[Row] = []
+    rows: list[VotingRow] = []
     for method, hypotheses, test, vote in _ways():
         with _one_thread():
             vote(usable[0])  # warm
             outcomes = [_outcome(case, vote) for case in usable]
-        rows.append({
-            "points": points,
-            "votes": votes,
-            "method": method,
-            "hypotheses": hypotheses,
-            "inliers by": test,
-            "instances": len(cases),
-            "success": 100 * sum(good for good, _ in outcomes) / len(cases),
-            "milliseconds": 1000 * statistics.median(seconds for _, seconds in outcomes),
-        })  # fmt: skip
-    slow = {row["hypotheses"]: row["milliseconds"] for row in rows if "one by one" in row["method"]}
-    base = slow[LOOP_HYPOTHESES]
-    return [row | {"times faster": base / row["milliseconds"]} for row in rows]
+        row = VotingRow(
+            points=points,
+            votes=votes,
+            method=method,
+            hypotheses=hypotheses,
+            inlier_test=test,
+            instances=len(cases),
+            success=100 * sum(good for good, _ in outcomes) / len(cases),
+            milliseconds=1000 * statistics.median(seconds for _, seconds in outcomes),
+        )
+        rows.append(row)
+    slow = next(row.milliseconds for row in rows if row.method == _LOOP)
+    return [replace(row, times_faster=slow / row.milliseconds) for row in rows]
 
 
 @contextmanager
@@ -133,7 +165,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _ways() -> Iterator[tuple[str, int | None, str, Callable[[VotingCase], Tensor]]]:
-    yield ("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle", _loop)
+    yield (_LOOP, LOOP_HYPOTHESES, "angle", _loop)
     for hypotheses in OUR_HYPOTHESES:
         for test in ("angle", "distance"):
             config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
@@ -177,7 +209,7 @@ def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
 def _directions(
     network: ResUNet, points_m: Points, number: int, cloud: CloudConfig
 ) -> Float[Tensor, "n k 3"]:
-    """Ask for the direction of every point, not of one a voxel: those of a voxel share it."""
+    """Give the direction of every point; those of a voxel share it."""
     grid = voxelise(points_m, cloud)
     rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
     voxels = Voxels.from_points(rows, grid.features)

@@ -10,8 +10,9 @@ from typing import Any
 from depthpose.core.camera import Camera, read_camera
 from depthpose.core.draw import Scale
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size, write_json
+from depthpose.core.files import cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
+from depthpose.pose.mesh import mesh_suffixes
 from depthpose.report.scene import Scene
 
 
@@ -73,8 +74,8 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "depth": ("a depth image", (".png", ".npy", ".pfm")),
     "mask": ("a mask", (".png", ".jpg", ".jpeg", ".bmp")),
     "camera": ("a camera file", (".json", ".yaml", ".yml", ".xml", ".txt")),
-    "cloud": ("a point cloud", (".ply", ".pcd", ".npy", ".xyz", ".txt")),
-    "cad": ("a model file", (".ply", ".stl", ".obj", ".glb")),
+    "cloud": ("a point cloud", cloud_suffixes()),
+    "cad": ("a model file", mesh_suffixes()),
 }
 """What each field of the forms takes."""
 

@@ -24,7 +24,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.report.scene import page_file
-from depthpose.web.answer import Answer, Form, Shown, without_paths
+from depthpose.web.answer import KINDS, Answer, Form, Shown, without_paths
 from depthpose.web.depth import answer_depth
 from depthpose.web.examples import depth_example, pose_example
 from depthpose.web.guard import (
@@ -90,6 +90,7 @@ class Pages:
         self._page = template.get_template("page.html").render(
             version=__version__,
             objects=pose.objects,
+            kinds=KINDS,
             limit_mb=limits.upload_bytes // 10**6,
             has_one_image=depth.synthesiser is not None,
             has_pair=depth.matcher is not None,

@@ -202,7 +202,7 @@ def _predict_on_ray(
         return engine.predict_bop(asked, Weights.read(weights), config, batch, out, on)
     if given.depth is not None and given.camera is None:
         raise InputError("--depth needs --camera beside it")
-    files = engine.CLOUD_FILES if given.depth is None else engine.VIEW_FILES
+    files = engine.cloud_files() if given.depth is None else engine.VIEW_FILES
     work = engine.PoseWork(
         weights=Weights.read(weights),
         config=config,

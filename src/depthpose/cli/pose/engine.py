@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
-from depthpose.cli.pose.inputs import CLOUDS, bop_jobs, input_job, known_objects, object_named
+from depthpose.cli.pose.inputs import bop_jobs, input_job, known_objects, object_named
 from depthpose.cli.pose.masks import find_masks
 from depthpose.cli.pose.methods import PoseMethod, pose_methods
 from depthpose.cli.pose.page import write_pose_page
@@ -28,7 +28,7 @@ from depthpose.core.engine import (
     stem,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size, write_json
+from depthpose.core.files import cloud_suffixes, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.datasets import BopDataset, open_bop
@@ -44,8 +44,14 @@ from depthpose.pose.predictions import (
 )
 from depthpose.pose.types import PoseEstimate
 
-CLOUD_FILES = Files(roles=("cloud",), suffixes=CLOUDS)
 VIEW_FILES = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+
+
+def cloud_files() -> Files:
+    """Give the kinds of files that are clouds."""
+    return Files(roles=("cloud",), suffixes=cloud_suffixes())
+
+
 ENDING = "pose.json"
 """Of the one file of a result: an entry of ``poses.json``."""
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,16 @@ from depthpose.core.errors import InputError
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
-from depthpose.pose.evaluate import Evaluation, evaluate, of_targets, read_any
+from depthpose.pose.evaluate import (
+    Evaluation,
+    InstanceRow,
+    ObjectRow,
+    Origin,
+    RiskRow,
+    evaluate,
+    of_targets,
+    read_any,
+)
 from depthpose.report.tables import Section, plain_table, write_page, write_table
 
 HOW = (
@@ -54,17 +64,9 @@ def measure_each(
 ) -> list[Evaluation]:
     """Measure folders or csv files of predictions one by one; each row says whose it is."""
     found: list[Evaluation] = []
-    for path, who in zip(predictions, describe(predictions), strict=True):
+    for path, origin in zip(predictions, describe(predictions), strict=True):
         _refuse_others(path, dataset)
-        result = evaluate(dataset, read_any(path), config, _show_progress)
-        short = {"method": who["method"], "masks": who["masks"]}
-        found.append(
-            Evaluation(
-                rows=[who | row for row in result.rows],
-                per_instance=[short | row for row in result.per_instance],
-                risk=[short | row for row in result.risk],
-            )
-        )
+        found.append(evaluate(dataset, read_any(path), config, _show_progress).of(origin))
     return found
 
 
@@ -77,8 +79,8 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
     )
 
 
-def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
-    """Give columns that say whose predictions each of these are.
+def describe(predictions: Sequence[Path]) -> list[Origin]:
+    """Name whose predictions each of these are.
 
     Methods of one name that lie in two folders are two, and bear the folders' names too.
 
@@ -87,9 +89,7 @@ def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
     """
     found = [_describe_one(path) for path in predictions]
     homes = [path.resolve().parent for path in predictions]
-    rows = Counter(
-        (home, who["method"], who["masks"]) for home, who in zip(homes, found, strict=True)
-    )
+    rows = Counter((home, one.method, one.masks) for home, one in zip(homes, found, strict=True))
     twice = [key for key, count in rows.items() if count > 1]
     if twice:
         home, method, masks = twice[0]
@@ -97,11 +97,10 @@ def describe(predictions: Sequence[Path]) -> list[dict[str, Any]]:
             f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their rows "
             "would be one; give one of them, or rename it"
         )
-    own = list({(home, who["method"]): None for home, who in zip(homes, found, strict=True)})
+    own = list({(home, one.method): None for home, one in zip(homes, found, strict=True)})
     names = dict(zip(own, distinct_names(own), strict=True))
     return [
-        {**who, "method": names[home, who["method"]]}
-        for home, who in zip(homes, found, strict=True)
+        replace(one, method=names[home, one.method]) for home, one in zip(homes, found, strict=True)
     ]
 
 
@@ -117,29 +116,35 @@ def _refuse_others(path: Path, dataset: BopDataset) -> None:
             )
 
 
-def _describe_one(path: Path) -> dict[str, Any]:
+def _describe_one(path: Path) -> Origin:
     settings = read_settings(path) if path.is_dir() else None
     if settings is None:
         # A file of others is its own fingerprint.
         sha256 = "" if path.is_dir() else file_sha256(path)[:12]
-        return {"method": path.stem, "masks": "", "weights": "", "weights_sha256": sha256}
+        return Origin(method=path.stem, weights_sha256=sha256)
     masks = settings.get("masks", "")
-    return {
-        "method": path.name.removesuffix(f"_{masks}"),
-        "masks": masks,
-        "weights": settings.get("weights", ""),
-        "weights_sha256": settings.get("weights_sha256", "")[:12],
-    }
+    return Origin(
+        method=path.name.removesuffix(f"_{masks}"),
+        masks=masks,
+        weights=settings.get("weights", ""),
+        weights_sha256=settings.get("weights_sha256", "")[:12],
+    )
 
 
-def success_by_masks(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def success_by_masks(rows: Sequence[ObjectRow]) -> list[dict[str, Any]]:
     """Set the successes with each kind of masks side by side, a row a method and object."""
     table: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
-        place = (row["method"], row["object"])
-        entry = table.setdefault(place, {"method": row["method"], "object": row["object"]})
-        entry[f"{row['masks'] or 'their'} masks"] = row["success"]
+        assert row.origin is not None
+        place = (row.origin.method, row.object)
+        entry = table.setdefault(place, {"method": row.origin.method, "object": row.object})
+        entry[f"{row.origin.masks or 'their'} masks"] = row.success
     return list(table.values())
+
+
+def table_of(rows: Iterable[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
+    """Give the columns of rows, as tables and files take them."""
+    return [row.columns() for row in rows]
 
 
 def measure(
@@ -148,39 +153,40 @@ def measure(
     """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
     each = measure_each(dataset, predictions, config)
     measured = join(each)
-    write_table(out, measured.rows)
+    rows = table_of(measured.rows)
+    write_table(out, rows)
     write_details(measured, out)
     sections = [
         Section(title="Success by masks", text=HOW, rows=success_by_masks(measured.rows)),
-        Section(title="All numbers", rows=measured.rows),
+        Section(title="All numbers", rows=rows),
         *instance_sections(dataset, predictions, [one.per_instance for one in each]),
         *detail_sections(measured),
     ]
     page = out / "report.html"
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
     write_page(page, title, sections, environment())
-    print(plain_table(measured.rows, _SHOWN))
+    print(plain_table(rows, _SHOWN))
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
     return 0
 
 
 def write_details(measured: Evaluation, out: Path) -> None:
     """Write each instance's numbers, and the risk by coverage."""
-    write_table(out, measured.per_instance, name="instances")
+    write_table(out, table_of(measured.per_instance), name="instances")
     if measured.risk:
-        write_table(out, measured.risk, name="risk")
+        write_table(out, table_of(measured.risk), name="risk")
 
 
 def detail_sections(measured: Evaluation) -> list[Section]:
     """Make the parts of a page below its tables."""
-    failed = [row for row in measured.per_instance if not row["is_success"]]
+    failed = [row for row in measured.per_instance if not row.is_success]
     sections = [
         Section(
             title="Risk by coverage",
             text="How many answers are wrong if only the surest are given.",
-            rows=measured.risk,
+            rows=table_of(measured.risk),
         ),
-        Section(title="Each instance that is no success", rows=failed),
+        Section(title="Each instance that is no success", rows=table_of(failed)),
     ]
     return [section for section in sections if section.rows]
 

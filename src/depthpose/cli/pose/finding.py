@@ -38,7 +38,7 @@ def find_all(
         InputError: weights that take no clouds, several processes, or two images of one name.
     """
     if method.find is None:
-        raise InputError("--depth without --mask: these weights look at masked views; give --mask")
+        raise InputError("--depth without --mask: these weights need masked views; give --mask")
     if find_shard().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     depths = list_images(depth)
@@ -65,7 +65,7 @@ def find_all(
 
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:
-    """Take what was found in a whole depth image as if a mask had shown it."""
+    """Take what was found in a whole depth image as if a mask had given it."""
     model = next((m for m in method.models if m.name == estimate.object), None)
 
     def read() -> AnyInput | Unreadable:

@@ -10,15 +10,13 @@ from typing import Any
 from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import list_images
+from depthpose.core.files import cloud_suffixes, list_images
 from depthpose.core.run import refuse_among_inputs
 from depthpose.pose.config import Unit
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Place
-
-CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,21 +44,23 @@ def object_named(name: str | None, method: PoseMethod) -> str:
     return known[0] if name is None else name
 
 
-def cloud_jobs(word: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
+def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:
     """Take a cloud, or every one of a folder.
 
     Raises:
         InputError: there is none, two of one name, or the folder is ``out`` too.
     """
-    if word.is_dir():
-        files = sorted(p for p in word.iterdir() if p.suffix.lower() in CLOUDS)
-    else:
-        files = [word]
+    files = sorted(p for p in cloud.iterdir() if _is_cloud(p)) if cloud.is_dir() else [cloud]
     if not files:
-        raise InputError(f"{word}: no {', '.join(CLOUDS)} file there; give a cloud, or a folder")
+        known = ", ".join(cloud_suffixes())
+        raise InputError(f"{cloud}: no {known} file there; give a cloud, or a folder")
     _refuse_one_name(files)
-    refuse_among_inputs(out, [word], files)
+    refuse_among_inputs(out, [cloud], files)
     return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+
+
+def _is_cloud(path: Path) -> bool:
+    return path.suffix.lower() in cloud_suffixes() and not path.name.startswith(".")
 
 
 def view_jobs(
@@ -123,13 +123,13 @@ def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
         InputError: they know none.
     """
     numbers = {model.number for model in method.models}
-    words = {model.name for model in method.models}
+    names = {model.name for model in method.models}
     there = sorted({instance.object_id for instance in dataset.instances})
-    known = [n for n in there if n in numbers or dataset.objects[n].name in words]
+    known = [n for n in there if n in numbers or dataset.objects[n].name in names]
     left = sorted(set(there) - set(known))
     if not known:
         raise InputError(
-            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(words)}; "
+            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(names)}; "
             "give weights of its objects"
         )
     if left:

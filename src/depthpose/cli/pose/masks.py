@@ -1,9 +1,10 @@
-"""The masks that methods of the pose room are shown, by their words."""
+"""The masks that pose methods are given, by their names."""
 
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,6 +16,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.run import claim_folder
 from depthpose.pose.datasets import (
+    LAYOUTS,
     BopDataset,
     Detection,
     Instance,
@@ -23,7 +25,6 @@ from depthpose.pose.datasets import (
     read_detections,
     write_detections,
 )
-from depthpose.pose.datasets.linemod import segnet_mask
 from depthpose.pose.datasets.parse import integer, read_rows
 from depthpose.pose.predictions import Job, detection_jobs, instance_jobs
 from depthpose.pose.segmentation import Segmenter
@@ -32,7 +33,7 @@ from depthpose.pose.types import ViewInput
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """Which pixels a method is shown: what to call them, and the jobs that they make."""
+    """Which pixels a method is given: what to call them, and the jobs that they make."""
 
     name: str
     jobs: Callable[[Mapping[int, str]], list[Job[ViewInput]]]
@@ -40,29 +41,29 @@ class Masks:
 
 
 def find_masks(
-    words: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
+    kinds: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
 ) -> list[Masks]:
     """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights.
 
     Args:
-        words: which masks.
-        dataset: whose images are shown.
+        kinds: which masks.
+        dataset: whose images are used.
         out: where a segmentation writes what it finds.
         device: of a segmentation.
 
     Raises:
         InputError: one is none of these, or the data set came without predicted masks.
     """
-    paths = [_path_of(word) for word in words]
+    paths = [_path_of(kind) for kind in kinds]
     files = [
-        (None, word) if path is None else (path.parent, path.stem)
-        for word, path in zip(words, paths, strict=True)
+        (None, kind) if path is None else (path.parent, path.stem)
+        for kind, path in zip(kinds, paths, strict=True)
     ]
     return [
-        _shipped_masks(word, dataset)
+        _shipped_masks(kind, dataset)
         if path is None
         else _file_masks(path, name, dataset, out, device)
-        for word, path, name in zip(words, paths, distinct_names(files), strict=True)
+        for kind, path, name in zip(kinds, paths, distinct_names(files), strict=True)
     ]
 
 
@@ -71,26 +72,24 @@ def of_dataset(dataset: BopDataset) -> dict[str, Any]:
     return {"dataset": dataset.folder.resolve().name, "split": dataset.split}
 
 
-def _path_of(word: str) -> Path | None:
-    if word in ("truth", "predicted"):
+def _path_of(kind: str) -> Path | None:
+    if kind in ("truth", "predicted"):
         return None
-    return Path(word) if word.endswith(".json") else find_weights(word)
+    return Path(kind) if kind.endswith(".json") else find_weights(kind)
 
 
-def _shipped_masks(word: str, dataset: BopDataset) -> Masks:
-    def mask_of(instance: Instance) -> Path:
-        return segnet_mask(dataset.folder, instance)
-
-    if word == "truth":
-        return Masks(name=word, jobs=lambda names: instance_jobs(dataset, names), settings={})
-    if dataset.layout == "BOP":
+def _shipped_masks(kind: str, dataset: BopDataset) -> Masks:
+    if kind == "truth":
+        return Masks(name=kind, jobs=lambda names: instance_jobs(dataset, names), settings={})
+    mask_of = LAYOUTS[dataset.layout].predicted_mask
+    if mask_of is None:
         raise InputError(
             f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has them; "
             "give --masks a file of BOP detections, or weights of a segmentation"
         )
     return Masks(
-        name=word,
-        jobs=lambda names: instance_jobs(dataset, names, mask_of),
+        name=kind,
+        jobs=lambda names: instance_jobs(dataset, names, partial(mask_of, dataset.folder)),
         settings={"masks_of": "segnet_results"},
     )
 
@@ -163,7 +162,7 @@ def _detect(
     """Segment each picture once; what it took is its time."""
     for shown in tqdm(images, "segmentation", disable=None, unit=" images"):
         if shown.rgb is None:
-            raise InputError(f"{shown.name}: has no picture, and a segmentation looks at pictures")
+            raise InputError(f"{shown.name}: has no picture, and a segmentation needs pictures")
         start = perf_counter()
         found = segmenter.segment(read_image(shown.rgb))
         spent_s = perf_counter() - start
@@ -181,7 +180,7 @@ def _detect(
 
 
 def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
-    """Give each its own name; of equal ones, with as many folders above it as tell them apart.
+    """Give each its own name; of equal ones, with as many folders above it as distinguish them.
 
     Args:
         files: the folder that something lies in, None where it lies in none, and its name.

@@ -1,4 +1,4 @@
-"""Methods of the pose room by their words, and what they predict of a data set."""
+"""Pose methods by their names, and their predictions of a data set."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
 
 REGISTRATION = "open3d"
-"""The word for Open3D's features, RANSAC and ICP, where weights are named."""
+"""The name of Open3D's features, RANSAC and ICP, where weights are named."""
 _SAME_DIAMETER = 0.05
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
@@ -52,22 +52,22 @@ class PoseMethod:
 
 
 def pose_methods(
-    words: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
+    names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
 ) -> list[PoseMethod]:
     """Build the estimators of weights files of any kinds, given by their paths or by names.
 
-    Files of one name are told apart by the folders that they lie in.
+    Files of one name are distinguished by their folders.
 
     Args:
-        words: paths or names; the word ``open3d`` is registration, which has no weights.
+        names: of weights, or paths; ``open3d`` is registration, which has no weights.
         config: of the estimators that have weights.
         models: what registration looks for.
 
     Raises:
         InputError: there are no such weights, they pose nothing, or are given twice.
-        MissingExtraError: registration is asked for, and Open3D is not installed.
+        MissingExtraError: registration is wanted, and Open3D is not installed.
     """
-    paths = [None if word == REGISTRATION else find_weights(word) for word in words]
+    paths = [None if name == REGISTRATION else find_weights(name) for name in names]
     names = distinct_names([(p.parent, p.stem) if p else (None, REGISTRATION) for p in paths])
     return [
         _method(path, name, config) if path else _registration(name, models)

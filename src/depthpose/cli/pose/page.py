@@ -11,7 +11,7 @@ from depthpose.cli.pose.predicting import PAGE
 from depthpose.core.files import read_image
 from depthpose.core.run import environment
 from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.evaluate import match, nearest_copy, read_any
+from depthpose.pose.evaluate import InstanceRow, match, nearest_copy, read_any
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import Job, Prediction, is_finished
 from depthpose.pose.types import PoseEstimate
@@ -47,7 +47,7 @@ def write_pose_page(
     Args:
         out: its folder.
         predictions: all, in the order of the jobs.
-        jobs: what they were made of.
+        jobs: their inputs.
         method: by which.
         dataset: that they are of, if they are of one.
     """
@@ -81,7 +81,7 @@ def write_pose_page(
 def instance_sections(
     dataset: BopDataset,
     predictions: Sequence[Path],
-    rows: Sequence[Sequence[dict[str, Any]]],
+    rows: Sequence[Sequence[InstanceRow]],
 ) -> list[Section]:
     """Show the worst, the median and the best answer of each set of predictions, and a refusal.
 
@@ -97,16 +97,17 @@ def instance_sections(
             continue
         found = match(dataset.instances, read_any(path), dataset.objects)
         for role, row in _choose(of_path, most):
-            instance = instances[row["instance"]]
+            instance = instances[row.instance]
             shown = _shown(dataset, instance, found[instance.name])
-            title = f"{path.stem}: {row['object']} in {instance.name}, {role}"
-            own = {name: row[name] for name in _MEASURED}
+            title = f"{path.stem}: {row.object} in {instance.name}, {role}"
+            columns = row.columns()
+            own = {name: columns[name] for name in _MEASURED}
             sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
     return sections
 
 
 def _results(predictions: Sequence[Prediction], shown: int) -> Section:
-    """Say every refusal; answers stand behind them."""
+    """List every refusal, then the answers."""
     counts = Counter(prediction.estimate.status for prediction in predictions)
     said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_ok)]
@@ -137,15 +138,16 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
     }
 
 
-def _choose(rows: Sequence[dict[str, Any]], most: int) -> list[tuple[str, dict[str, Any]]]:
+def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceRow]]:
     """Choose answers by their error in diameters, and the middle one of the refusals."""
-    answers = [row for row in rows if row["error_m"] is not None]
-    errors = [row["error_m"] / row["diameter_m"] for row in answers]
+    errors = {row.instance: row.error("error_m") for row in rows}
+    answers = [row for row in rows if errors[row.instance] is not None]
+    shares = [(errors[row.instance] or 0.0) / row.diameter_m for row in answers]
     chosen = [
         (f"{role} answer of {len(answers)}", answers[k])
-        for role, k in choose_ranked(errors, min(most, 3))
+        for role, k in choose_ranked(shares, min(most, 3))
     ]
-    refused = [row for row in rows if row["error_m"] is None and row["status"] != "missing"]
+    refused = [r for r in rows if errors[r.instance] is None and r.status != "missing"]
     few = min(most - len(chosen), 1)
     chosen += [
         (f"one of {len(refused)} refused", refused[k]) for k in spread_evenly(len(refused), few)

@@ -81,7 +81,7 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
 
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
                 batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
-    """Estimate what is not finished; several processes share the work and meet in the files.
+    """Estimate what is not finished; several processes share the work through the files.
 
     Returns:
         All predictions in the order of the jobs; None in a process that is not the first.

@@ -55,7 +55,7 @@ def track(
         raise InputError("a sequence is followed by one process; start one")
     (method,) = pose_methods([weights], EstimateConfig(device=device))
     if method.track is None:
-        raise InputError(f"--weights {weights}: these look at masked views; give weights that vote")
+        raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     if bop is not None:
         return track_bop(method, (bop, split, object), out)
     return track_folder(method, (depth, camera, cloud), object, unit, out)

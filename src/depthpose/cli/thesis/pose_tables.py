@@ -72,13 +72,14 @@ def reproduce_by_object(
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
     numbers = {model.name: number for number, model in dataset.objects.items()}
-    rows = join_by_object(measured.rows, numbers, with_published=order.number == "3.2")
+    joined = join_by_object(measured.rows, numbers, with_published=order.number == "3.2")
+    rows, every = [row.columns() for row in joined], pose_evaluating.table_of(measured.rows)
     write_table(out, rows)
-    write_table(out, measured.rows, name="all")
+    write_table(out, every, name="all")
     pose_evaluating.write_details(measured, out)
     sections = [
         Section(title="Percent by object", text=_say_how(order), rows=rows),
-        Section(title="All numbers", text=pose_evaluating.HOW, rows=measured.rows),
+        Section(title="All numbers", text=pose_evaluating.HOW, rows=every),
         *picture_sections(dataset, folders, order.pictures, out),
         *pose_evaluating.detail_sections(measured),
     ]
@@ -98,7 +99,7 @@ def reproduce_voting(
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count))
-        rows += [row | facts for row in compare_voting(cases, count)]
+        rows += [row.columns() | facts for row in compare_voting(cases, count)]
     write_table(out, rows)
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "

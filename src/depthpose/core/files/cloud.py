@@ -1,5 +1,6 @@
 """Point clouds: PLY, PCD, NPY, text and KITTI's binary scans."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
@@ -17,7 +18,6 @@ from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
 from depthpose.core.files.points import Columns, encode_ply, parse_rows, read_ply
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
-_READ = (".ply", ".pcd", ".npy", ".xyz", ".txt")
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
 _MAX_SCAN_BYTES = 2**26
@@ -60,16 +60,15 @@ def read_cloud(path: AnyPath) -> Cloud:
         InputError: the file is missing, damaged, without x, y and z, or no point is finite; a
             coordinate is infinite; a colour is out of range.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in _READ:
-        raise refused_suffix(path, "point cloud", _READ)
-    if suffix in (".ply", ".pcd"):
-        columns = read_ply(path) if suffix == ".ply" else read_pcd(path)
-        return _from_columns(path, columns)
-    table = read_npy(path) if suffix == ".npy" else _read_rows(path)
-    if table.ndim != 2 or table.shape[1] < 3:
-        raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
-    return _finite_cloud(path, to_float32(table[:, :3]), None)
+    reader = CLOUD_READERS.get(Path(path).suffix.lower())
+    if reader is None:
+        raise refused_suffix(path, "point cloud", cloud_suffixes())
+    return reader(path)
+
+
+def cloud_suffixes() -> tuple[str, ...]:
+    """Name the suffixes of the files that :func:`read_cloud` reads, in lower case."""
+    return tuple(CLOUD_READERS)
 
 
 def write_cloud(path: AnyPath, cloud: Cloud) -> None:
@@ -107,19 +106,18 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
     return torch.from_numpy(rows)
 
 
-def _read_rows(path: AnyPath) -> np.ndarray:
-    data = read_bytes(path, MAX_TEXT_BYTES)
-    lines = (line.partition("#")[0] for line in TextIOWrapper(BytesIO(data), "utf-8-sig"))
-    rows = (line.replace(",", " ").replace(";", " ") for line in lines)
-    return parse_rows(path, (row for row in rows if row.strip()))
-
-
 def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
     points = np.stack([to_float32(columns[n]) for n in "xyz"], -1) if columns else np.empty((0, 3))
     return _finite_cloud(path, to_float32(points), _color(path, columns))
+
+
+def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
+    return _finite_cloud(path, to_float32(table[:, :3]), None)
 
 
 def _color(path: AnyPath, columns: Columns) -> np.ndarray | None:
@@ -146,3 +144,20 @@ def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -
         points=torch.from_numpy(points[kept]),
         color=None if color is None else torch.from_numpy(color[kept]),
     )
+
+
+def _read_text(path: AnyPath) -> Cloud:
+    data = read_bytes(path, MAX_TEXT_BYTES)
+    lines = (line.partition("#")[0] for line in TextIOWrapper(BytesIO(data), "utf-8-sig"))
+    rows = (line.replace(",", " ").replace(";", " ") for line in lines)
+    return _from_rows(path, parse_rows(path, (row for row in rows if row.strip())))
+
+
+CLOUD_READERS: dict[str, Callable[[AnyPath], Cloud]] = {
+    ".ply": lambda path: _from_columns(path, read_ply(path)),
+    ".pcd": lambda path: _from_columns(path, read_pcd(path)),
+    ".npy": lambda path: _from_rows(path, read_npy(path)),
+    ".xyz": _read_text,
+    ".txt": _read_text,
+}
+"""Suffix to reader: one more entry, and every command, folder and page takes the new format."""

@@ -74,7 +74,7 @@ class Samples(Protocol):
         """Tickets of one epoch."""
         ...
 
-    def __getitem__(self, ticket: int) -> Any:  # noqa: ANN401 - a tuple of tensors of the room's own
+    def __getitem__(self, ticket: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors of the room's own
         """Make the sample of a ticket."""
         ...
 

@@ -1,4 +1,4 @@
-"""Every knob of the baselines."""
+"""Settings of the baselines."""
 
 from dataclasses import dataclass
 

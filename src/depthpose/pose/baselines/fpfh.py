@@ -78,7 +78,7 @@ class FpfhRegistration:
         return cloud
 
     def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
-        """Thin a cloud to voxels; normals of a measured one look at the camera."""
+        """Thin a cloud to voxels; normals of a measured one point to the camera."""
         o3d, voxel_m, config = self._open3d, self._voxel_m, self.config
         cloud = cloud.voxel_down_sample(voxel_m)
         near = o3d.geometry.KDTreeSearchParamHybrid
@@ -119,7 +119,7 @@ class FpfhRegistration:
 
 
 class FpfhEstimator:
-    """Registration of several objects from their masked depth, asked as the networks are.
+    """Registration of several objects from their masked depth, called as the networks are.
 
     Args:
         models: the objects; an input says by name which of them it shows.

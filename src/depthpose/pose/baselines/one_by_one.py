@@ -17,7 +17,7 @@ def ransac_one_by_one(
     whose unit direction comes within an angle of it; the best is refitted on its inliers.
 
     Args:
-        points_m: where the votes stand.
+        points_m: where the votes start.
         directions: of unit length.
         hypotheses: tried for each keypoint; published practice is 50.
         min_cosine: of the angle of an inlier.

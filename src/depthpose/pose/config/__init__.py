@@ -1,4 +1,4 @@
-"""Every knob of the pose room that needs no torch: frozen dataclasses that refuse at birth."""
+"""Settings of the pose package that need no torch: frozen dataclasses that check their values."""
 
 from depthpose.pose.config.estimate import DiameterTable as DiameterTable
 from depthpose.pose.config.estimate import EstimateConfig as EstimateConfig

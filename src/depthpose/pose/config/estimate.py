@@ -1,4 +1,4 @@
-"""Every knob of an estimate: how a cloud becomes a pose, and when the pose is withheld."""
+"""Settings of an estimate: how a cloud becomes a pose, and when the pose is withheld."""
 
 from dataclasses import dataclass, field
 from typing import Literal, get_args
@@ -14,7 +14,7 @@ _CANDIDATE_SLOPES = {
     "unseen": 0.75,
     "disagree": 0.77,
 }
-"""Of a conditional logit on made views of all shipped objects, held by a ridge
+"""Of a conditional logit on synthetic views of all shipped objects, regularised by a ridge
 (``bench/pose_candidates.py``): how likely each of several poses is that fit."""
 
 
@@ -42,7 +42,7 @@ class RefusalConfig:
 
     min_hold: float = 0.02
     """A motion that no declared symmetry excuses must carry the seen surface across itself by this
-    share of what it moves the object's points; one that only slides it along itself (a plane, a
+    share of what it moves the object's points; one that only moves it along itself (a plane, a
     ball) is not observable."""
 
     max_scale_error: float = 0.03
@@ -81,7 +81,7 @@ class EstimateConfig:
     """Directions to keypoints."""
 
     icp: IcpConfig = field(default_factory=IcpConfig)
-    """How the voted pose slides onto the cloud."""
+    """How ICP refines the voted pose."""
 
     with_icp: bool = True
     """Whether it does; without, the voted pose is the answer."""
@@ -91,7 +91,7 @@ class EstimateConfig:
     then of them all, and they are not named as alternatives."""
 
     rough_rigidity_diameters: float = 0.3
-    """In place of ``voting.rigidity_diameters`` where a calibrated risk judges what comes out: ICP
+    """In place of ``voting.rigidity_diameters`` where a calibrated risk decides: ICP
     mends rough votes, and the risk finds those that it does not mend. Nothing is refused for it
     then: where fewer than four keypoints agree all are fitted, and ICP begins at both fits."""
 
@@ -124,7 +124,7 @@ SymmetryRule = Literal["declared", "all"]
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
-    """How estimates are held against the truth."""
+    """How estimates are measured against the truth."""
 
     diameters: DiameterTable = "bop"
     """Whose diameters a success is a tenth of: those that the data set declares (``bop``), or
@@ -132,7 +132,7 @@ class EvaluationConfig:
 
     adds: SymmetryRule = "declared"
     """Which objects are measured by ADD-S: those declared symmetric (of LineMOD eggbox and glue),
-    or ``all``, as for YCB's, whose symmetries geometry alone cannot tell."""
+    or ``all``, as for YCB's, whose symmetries geometry alone cannot show."""
 
     with_vsd: bool = True
     """Draw both poses for VSD, and so for BOP's average recall: the slowest of the errors."""
@@ -141,7 +141,7 @@ class EvaluationConfig:
     """How far a surface may lie behind the measured one and count as visible (ITODD: 0.005)."""
 
     def __post_init__(self) -> None:
-        """Refuse other words, and a tolerance that is none."""
+        """Refuse unknown names, and a tolerance out of range."""
         refuse_unknown("diameters", self.diameters, get_args(DiameterTable))
         refuse_unknown("adds", self.adds, get_args(SymmetryRule))
         if not 0 < self.vsd_delta_m < 1:

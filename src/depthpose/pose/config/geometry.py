@@ -1,4 +1,4 @@
-"""Every knob of the pose room's geometry: frozen dataclasses that refuse a value at birth."""
+"""Settings of the pose geometry: frozen dataclasses that check their values."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -19,7 +19,7 @@ def metres_of(unit: str) -> float:
     """Give the metres of a unit.
 
     Raises:
-        InputError: another word than ``m`` and ``mm``.
+        InputError: neither ``m`` nor ``mm``.
     """
     refuse_unknown("unit", unit, METRES)
     return METRES[unit]
@@ -55,10 +55,10 @@ class CloudConfig:
 
     with_shape: bool = False
     """Tell the network of each voxel where in it the points lie on average, how many they are, and
-    the normal and curvature there; the published method tells it that there is a point."""
+    the normal and curvature there; the published method gives a constant 1."""
 
     max_points: int | None = 1500
-    """At most so many points, chosen at random before voxels are made; None: all."""
+    """At most so many points, chosen at random before voxelising; None: all."""
 
     min_points: int = 16
     """Fewer points are refused, not posed."""
@@ -89,7 +89,7 @@ class CloudConfig:
 
     @property
     def features(self) -> int:
-        """Numbers that the network is told of each voxel."""
+        """Numbers that the network gets of each voxel."""
         return 9 if self.with_shape else 1
 
 
@@ -174,7 +174,7 @@ class IcpConfig:
     """At most so many points of the cloud, evenly taken: more are slower and no more exact."""
 
     surface_points: int = 10000
-    """Points of the model's surface that stand for it."""
+    """Points sampled on the model's surface."""
 
     starts: int = 7
     """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one

@@ -1,4 +1,4 @@
-"""Knobs of made views: how they look, and the errors of the sensor that sees them."""
+"""Settings of synthetic views: how they look, and the errors of the sensor that sees them."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -35,7 +35,7 @@ class SensorConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsConfig:
-    """Made views of known objects. Ranges are of what each sample draws."""
+    """Synthetic views of known objects. Ranges are of what each sample draws."""
 
     number: int = 1000
     """Samples; sample i shows object i modulo their number."""
@@ -44,7 +44,7 @@ class ObjectsConfig:
     """Another seed, other samples."""
 
     views: int | None = 2000
-    """Renderings of each object, made when first drawn and then kept; a sample turns the camera of
+    """Renderings of each object, rendered at first use and then kept; a sample turns the camera of
     one of them at random, which shows the same surface. None: each sample is a rendering of its
     own, for evaluation."""
 
@@ -61,13 +61,13 @@ class ObjectsConfig:
     """Principal point."""
 
     resolution: tuple[float, float] = (0.4, 0.8)
-    """The image is so many times as large: coarser pictures are faster made."""
+    """The image is so many times as large: coarser pictures are faster."""
 
     occluded_share: float = 0.7
-    """Share of samples in which something stands before the object."""
+    """Share of samples in which something occludes the object."""
 
     occlusion: tuple[float, float] = (0.0, 0.5)
-    """Share of the silhouette that it hides."""
+    """Share of the silhouette that it occludes."""
 
     with_background: bool = True
     """Whether there is something behind and beside the object, which wrong masks take in."""

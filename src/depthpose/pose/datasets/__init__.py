@@ -7,6 +7,8 @@ from depthpose.pose.datasets.dataset import open_bop as open_bop
 from depthpose.pose.datasets.frames import Instance as Instance
 from depthpose.pose.datasets.frames import Target as Target
 from depthpose.pose.datasets.frames import read_targets as read_targets
+from depthpose.pose.datasets.layouts import LAYOUTS as LAYOUTS
+from depthpose.pose.datasets.layouts import Layout as Layout
 from depthpose.pose.datasets.masks import Detection as Detection
 from depthpose.pose.datasets.masks import decode_rle as decode_rle
 from depthpose.pose.datasets.masks import encode_rle as encode_rle

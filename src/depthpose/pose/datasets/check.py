@@ -14,8 +14,8 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.datasets.dataset import open_bop, read_instance_mask
-from depthpose.pose.datasets.frames import Instance, bop_splits
-from depthpose.pose.datasets.linemod import is_linemod
+from depthpose.pose.datasets.frames import Instance
+from depthpose.pose.datasets.layouts import layout_of
 from depthpose.pose.datasets.models import model_path, models_folder, read_models_info
 from depthpose.pose.mesh import (
     exact_diameter,
@@ -40,14 +40,14 @@ def check_bop(
     with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
-    """Look at every file of a data set: are they there and whole, and do they agree?
+    """Check every file of a data set: are they there and whole, and do they agree?
 
     Units are checked too: a cloud a thousand times smaller than its model, or a metre away from
-    its annotated pose, is told as such.
+    its annotated pose, is reported.
 
     Args:
         folder: of the data set.
-        split: look only at this one; None: at all.
+        split: check only this one; None: all.
         with_decoding: decode depth and masks and compare them with poses; else only headers.
         progress: called with the number of instances done and of all.
 
@@ -55,15 +55,15 @@ def check_bop(
         InputError: there is no such split.
     """
     folder = Path(folder)
-    layout = "Linemod_preprocessed" if is_linemod(folder) else "BOP"
-    known = ["train", "test"] if layout != "BOP" else bop_splits(folder)
+    name, layout = layout_of(folder)
+    known = layout.splits(folder)
     if split is not None and split not in known:
         raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(known) or 'none'}.")
     found: list[Problem] = []
     instances: list[Instance] = []
-    for name in known if split is None else [split]:
+    for one in known if split is None else [split]:
         try:
-            instances += open_bop(folder, name).instances
+            instances += open_bop(folder, one).instances
         except InputError as error:
             found.append(Problem(path=folder, kind="unreadable", message=str(error)))
     models, more = _check_models(folder, {i.object_id for i in instances})
@@ -72,7 +72,7 @@ def check_bop(
         found += _check_instance(instance, models, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(instances))
-    return make_report(layout, _count(instances, models), found)
+    return make_report(name, _count(instances, models), found)
 
 
 def _count(instances: list[Instance], models: Models) -> dict[str, int]:
@@ -163,7 +163,7 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
     cloud = cloud_from_depth(depth_m, mask, instance.K)
     refusal = refusal_of(cloud)
     if refusal is not None:
-        # Instances that are hidden altogether are annotated too: no fault, but no test either.
+        # Instances that are fully occluded are annotated too: no fault, but no test either.
         yield Problem(path=instance.mask, kind="note", message=refusal)
         return
     advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
@@ -177,12 +177,12 @@ def _check_content(instance: Instance, model: ObjectModel) -> Iterator[Problem]:
             "depth_scale and cam_t_m2c both for millimetres?"
         )
         yield Problem(path=instance.depth, kind="mismatch", message=message)
-    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not _is_hidden(instance):
+    elif _share_in_mask(instance, model, mask) < _FEW_IN_MASK and not _is_occluded(instance):
         message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
         yield Problem(path=instance.mask, kind="mismatch", message=message)
 
 
-def _is_hidden(instance: Instance) -> bool:
+def _is_occluded(instance: Instance) -> bool:
     return instance.visible_fraction is not None and instance.visible_fraction < _FEW_IN_MASK
 
 

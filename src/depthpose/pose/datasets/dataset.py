@@ -1,4 +1,4 @@
-"""A data set of BOP's or LineMOD's layout as samples."""
+"""A data set of any known layout as samples."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.pose.cloud import cloud_from_depth, refuse_other_size
 from depthpose.pose.config import CloudConfig, MeshConfig
-from depthpose.pose.datasets.frames import Instance, bop_instances, bop_scenes, bop_splits
-from depthpose.pose.datasets.linemod import is_linemod, linemod_instances
+from depthpose.pose.datasets.frames import Instance
+from depthpose.pose.datasets.layouts import find_layout, layout_of
 from depthpose.pose.datasets.masks import read_mask
 from depthpose.pose.datasets.models import (
     models_folder,
@@ -38,7 +38,7 @@ class BopDataset:
     Attributes:
         folder: of the data set.
         split: its name.
-        layout: ``BOP`` or ``Linemod_preprocessed``.
+        layout: a key of ``LAYOUTS``.
         instances: what is annotated, in the order of scene, image and place.
         mesh_config: for its models.
         cloud_config: for its clouds.
@@ -147,7 +147,7 @@ def open_bop(
     mesh: MeshConfig | None = None,
     cloud: CloudConfig | None = None,
 ) -> BopDataset:
-    """Open a split of a data set in BOP's layout, or in that of Linemod_preprocessed.
+    """Open a split of a data set in BOP's layout, or in another of ``LAYOUTS``.
 
     Args:
         folder: of the data set, with ``models`` and the splits in it.
@@ -159,16 +159,12 @@ def open_bop(
         InputError: no such folder or split, or an annotation is damaged.
     """
     folder = Path(folder)
-    if is_linemod(folder):
-        layout, instances = "Linemod_preprocessed", list(linemod_instances(folder, split))
-    else:
-        scenes = bop_scenes(folder, split)
-        layout, instances = "BOP", [i for scene in scenes for i in bop_instances(scene)]
+    name, layout = layout_of(folder)
     return BopDataset(
         folder=folder,
         split=split,
-        layout=layout,
-        instances=instances,
+        layout=name,
+        instances=list(layout.instances(folder, split)),
         mesh_config=MeshConfig() if mesh is None else mesh,
         cloud_config=CloudConfig() if cloud is None else cloud,
     )
@@ -176,7 +172,7 @@ def open_bop(
 
 def is_bop(folder: str | Path) -> bool:
     """Whether a folder holds a data set that :func:`open_bop` knows."""
-    return is_linemod(Path(folder)) or bool(bop_splits(Path(folder)))
+    return find_layout(Path(folder)) is not None
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:

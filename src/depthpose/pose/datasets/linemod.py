@@ -25,9 +25,9 @@ SYMMETRIC = (10, 11)
 """Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012)."""
 
 
-def is_linemod(folder: Path) -> bool:
-    """Whether a folder is laid out as Linemod_preprocessed."""
-    return any(folder.glob("data/[0-9][0-9]/gt.yml"))
+def linemod_splits(folder: Path) -> tuple[str, ...]:
+    """Name the splits of a folder; none where it is not laid out as Linemod_preprocessed."""
+    return ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
 
 
 def linemod_symmetries(number: int) -> Symmetries:

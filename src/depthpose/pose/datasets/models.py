@@ -7,7 +7,8 @@ from typing import Any
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import MeshConfig
-from depthpose.pose.datasets.linemod import is_linemod, linemod_symmetries, read_yaml
+from depthpose.pose.datasets.layouts import layout_of
+from depthpose.pose.datasets.linemod import read_yaml
 from depthpose.pose.datasets.parse import entry_number, number, read_mapping
 from depthpose.pose.mesh import read_model, symmetries_from_bop
 from depthpose.pose.types import ObjectModel
@@ -66,7 +67,7 @@ def read_bop_models(
         InputError: a mesh is missing, or something is damaged.
     """
     home = models_folder(folder)
-    infos = read_models_info(home)
+    infos, (_, layout) = read_models_info(home), layout_of(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
         path = model_path(home, wanted)
@@ -74,8 +75,8 @@ def read_bop_models(
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
         info, source = infos.get(wanted, {}), f"{home / 'models_info.json'}: object {wanted}"
         symmetries = symmetries_from_bop(info, source=source)
-        if symmetries.is_none and is_linemod(folder):
-            symmetries = linemod_symmetries(wanted)
+        if symmetries.is_none:
+            symmetries = layout.symmetries(wanted)
         model = read_model(
             path,
             "mm",

@@ -1,4 +1,4 @@
-"""Writing a data set in BOP's layout: what is made can be shared, checked and read back."""
+"""Writing a data set in BOP's layout: what is written can be shared, checked and read back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class BopObject:
     Attributes:
         number: its ``obj_id``.
         camera_from_model: its pose.
-        visible: its pixels that nothing hides.
-        silhouette: all its pixels in the image, hidden ones too.
+        visible: its pixels that nothing occludes.
+        silhouette: all its pixels in the image, occluded ones too.
     """
 
     number: int

@@ -26,7 +26,7 @@ _NAMED = 0.02
 """Candidates of a smaller share are not named."""
 _STEP = math.pi / 16
 _ICP_POINTS = 250
-"""Of the cloud, by which candidates slide."""
+"""Points of the cloud that refine candidates."""
 _POINTS = 100
 _ALONG = math.cos(math.radians(15))
 _LONGER = 1.15
@@ -148,7 +148,7 @@ def _refined(
     surface: Surface,
     config: IcpConfig | None,
 ) -> list[Candidate]:
-    """Let starts slide, all at once; those that meet nothing are left out."""
+    """Refine starts, all at once; those near no surface are left out."""
     if config is None:
         return [best._replace(pose=Rigid(R, t_m))
                 for R, t_m in zip(starts.R, starts.t_m, strict=True)]  # fmt: skip
@@ -179,7 +179,7 @@ def evidence_of(
     """Give the signals by which candidates are compared.
 
     The directions are compared with those to the nearest copy that the network could not learn to
-    tell from the pose: which one it points at is chance.
+    distinguish from the pose: which one it points at is chance.
     """
     every = (pose @ copies.trained).apply(
         model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)

@@ -14,8 +14,8 @@ from depthpose.pose.estimator.prepare import Prepared
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
 from depthpose.pose.types import PoseFit
 
-_JUDGED = 1000
-"""At most so many points of the cloud are judged, evenly taken."""
+_SAMPLED = 1000
+"""At most so many points of the cloud are used, evenly taken."""
 _THINNED = 500
 """Of so many points 20 neighbours reach about 0.08 diameters: far enough for normals that a real
 sensor's noise, alike from pixel to pixel, does not turn."""
@@ -31,7 +31,7 @@ SIGNALS: dict[str, str] = {
     "tilt": "the cloud's normals differ from the posed surface's (1 - cosine {:.2g})",
     "gap": "the points lie {:.1%} of the diameter off the posed surface",
     "far": "{:.0%} of the points are nowhere near the posed surface",
-    "front": "the posed surface would hide {:.0%} of the points that were seen",
+    "front": "the posed surface would occlude {:.0%} of the points that were seen",
     "unseen": "{:.0%} of the posed surface that faces the camera has no point",
     "few": "the cloud fills few voxels: ten are {:.1%} of it",
 }
@@ -68,10 +68,10 @@ def surface_signals(
     """Say how well the posed surface explains the cloud, and the cloud the surface.
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
-    be hidden by something else.
+    be occluded by something else.
     """
     limit_m = NEAR * surface.diameter_m
-    points_m = take_evenly(cloud_m.double(), _JUDGED)
+    points_m = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, _ = _nearest(points_m, pose, surface)
     near_m = distance_m[distance_m < limit_m]
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
@@ -86,15 +86,15 @@ def surface_signals(
     }
 
 
-def hold_of(
+def observability(
     cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, free: Float[Tensor, "m 6"]
 ) -> tuple[float, Float64[Tensor, "6"]]:
-    """Say how firmly the seen surface holds the object: 0 where it may slide along itself.
+    """Measure how well the seen surface determines the pose: 0 where a motion is unobservable.
 
     A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
-    normal ``n`` across itself by ``n . v + (a x n) . w``. The hold is the root mean square of that
-    over the points near the surface, for the unit motion that moves it least (Gelfand et al.,
-    Geometrically Stable Sampling for the ICP Algorithm, 2003).
+    normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
+    of that over the points near the surface, for the unit motion that moves it least (Gelfand et
+    al., Geometrically Stable Sampling for the ICP Algorithm, 2003).
 
     Args:
         cloud_m: of the object, in the camera frame.
@@ -104,10 +104,10 @@ def hold_of(
             are left out.
 
     Returns:
-        The hold, and the weakest motion: (rotation, translation at the middle of the cloud), unit
-        length after scaling.
+        The observability, and the weakest motion: (rotation, translation at the middle of the
+        cloud), unit length after scaling.
     """
-    points = take_evenly(cloud_m.double(), _JUDGED)
+    points = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, index = _nearest(points, pose, surface)
     near = distance_m < NEAR * surface.diameter_m
     weakest = torch.zeros(6, dtype=torch.float64)

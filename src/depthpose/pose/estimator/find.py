@@ -27,7 +27,7 @@ _CRUMB = 0.03
 _HIDDEN = 0.5
 """Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
 _REST = 0.25
-"""A region of which so large a share is unexplained is asked again without the rest."""
+"""A region of which so large a share is unexplained is tried again without the rest."""
 _LEAST_POINTS = 60
 _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
@@ -94,10 +94,10 @@ class _Answer:
 def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
-    Regions are asked for every object whose size they may have; so are pairs of them that may be
+    Regions are tried for every object whose size they may have; so are pairs of them that may be
     parts of one object, and parts of one that is too long. Where several objects answer they share
     the probability of one by what speaks against each. What an answer leaves unexplained of its
-    region is asked once more. An answer is left out through whose surface the camera saw, or that
+    region is tried once more. An answer is left out through whose surface the camera saw, or that
     lies behind a plane that was seen, or that explains not quite all of its region; of answers that
     explain the same points the best stays.
 
@@ -157,42 +157,42 @@ def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
 
 def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
     """Ask every cloud for every object of its size; give the best answer of each cloud."""
-    asked: list[tuple[int, CloudInput]] = []
+    inputs: list[tuple[int, CloudInput]] = []
     for k, cloud in enumerate(clouds):
         size_m = extent_m(cloud)
-        asked += [
+        inputs += [
             (k, CloudInput(name=f"{scene.view.name}_{k}", points_m=cloud, object=name))
             for name, model in known.models.items()
             if _SMALLEST * model.diameter_m <= size_m <= _LARGEST * model.diameter_m
         ]
-    found = known.estimate_many([given for _, given in asked]) if asked else []
+    found = known.estimate_many([given for _, given in inputs]) if inputs else []
     of_cloud: dict[int, list[PoseEstimate]] = {}
-    for (k, _), estimate in zip(asked, found, strict=True):
+    for (k, _), estimate in zip(inputs, found, strict=True):
         if estimate.is_ok and _is_possible(scene, estimate, known):
             of_cloud.setdefault(k, []).append(estimate)
     return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
 
 
-def which_object(asked: Sequence[PoseEstimate], refusal: RefusalConfig) -> PoseEstimate:
-    """Say which object one input shows, from the answers for every object that it may be.
+def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> PoseEstimate:
+    """Choose which object one input shows, from the answers for every object that it may be.
 
     Those that are refused are none; the others share the probability of one.
 
     Args:
-        asked: estimates for the same input, one an object.
+        estimates: for the same input, one an object.
         refusal: how they are compared.
 
     Returns:
         The best, its certainty given the others; refused where none is ok, or where another object
         is too likely.
     """
-    some = [estimate for estimate in asked if estimate.is_ok]
+    some = [estimate for estimate in estimates if estimate.is_ok]
     spent: Counter[str] = Counter()
-    for estimate in asked:
+    for estimate in estimates:
         spent.update(estimate.seconds)
     if not some:
-        least = min(asked, key=lambda one: 1.0 if one.risk is None else one.risk)
-        names = ", ".join(one.object for one in asked)
+        least = min(estimates, key=lambda one: 1.0 if one.risk is None else one.risk)
+        names = ", ".join(one.object for one in estimates)
         reason = f"none of {names} surely; {least.object} comes nearest: {least.reason}"
         return replace(least, reason=reason, seconds=dict(spent))
     shares = share_out([one.signals for one in some], refusal.candidate_slopes)

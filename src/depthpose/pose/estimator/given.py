@@ -1,4 +1,4 @@
-"""What a caller hands over, files, arrays or tensors, to the room's own inputs."""
+"""Files, arrays or tensors to the inputs of a pose estimate."""
 
 import math
 from collections.abc import Mapping
@@ -160,7 +160,7 @@ def _refuse_no_picture(values: Tensor, name: str) -> Shaped[Tensor, "h w"]:
     return values
 
 
-def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller holds
+def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
     if isinstance(values, Tensor):
         return values.detach().cpu()
     array = np.asarray(values)

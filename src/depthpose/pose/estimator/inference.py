@@ -69,13 +69,13 @@ def batches(
 def _in_camera(
     outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n k c"]:
-    """Turn directions back from the network's grid; what stands behind them stays."""
+    """Turn directions back from the network's grid; further components stay."""
     directions = outputs[..., :3] @ grid_from_camera
     return torch.cat([directions, outputs[..., 3:]], -1)
 
 
 class PoseInference:
-    """A network of directions made ready to run, with what is kept of each object.
+    """A network of directions ready to run, with what is kept of each object.
 
     Args:
         weights: the network and the objects that it knows.
@@ -122,7 +122,7 @@ class PoseInference:
 
         Returns:
             The estimate, and the cloud with the outputs in the camera frame; None for them where
-            the network was not asked, as there is too little to pose.
+            the network was not run, as there is too little to pose.
 
         Raises:
             InputError: as for :meth:`estimate_many`.

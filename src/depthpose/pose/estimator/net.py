@@ -95,7 +95,7 @@ class GeoPoseNet(PoseInference):
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths.
             camera: of the depth image, its file of any format that is read, a dict of what such a
-                file holds, or the 3x3 matrix K.
+                file has, or the 3x3 matrix K.
             focal_px: the focal length alone [px], in place of a camera.
             object: which one; None: whichever of those that the weights know it is, if any.
 
@@ -114,8 +114,10 @@ class GeoPoseNet(PoseInference):
 
     def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
         """Estimate one input as each of several objects, and take the one that it shows."""
-        asked = self.estimate_many([replace(given, object=name) for name in names])
-        return asked[0] if len(asked) == 1 else which_object(asked, self.weights.refusal)
+        estimates = self.estimate_many([replace(given, object=name) for name in names])
+        return (
+            estimates[0] if len(estimates) == 1 else which_object(estimates, self.weights.refusal)
+        )
 
     def estimate_instances(
         self,
@@ -159,7 +161,7 @@ class GeoPoseNet(PoseInference):
         """Find and pose known objects in a depth image without masks, the best answer first.
 
         Dominant planes are taken away, the rest is parted where its depth jumps, and every region
-        is asked for every object of its size. What nothing fits, or what is refused, is left out.
+        is tried for every object of its size. What nothing fits, or what is refused, is left out.
 
         Args:
             depth: as for :meth:`estimate`.
@@ -197,14 +199,14 @@ class GeoPoseNet(PoseInference):
     ) -> Iterator[PoseEstimate]:
         """Follow one object through a sequence, each frame from the pose of the one before by ICP.
 
-        Where the camera saw through the posed surface, or little of it, or what is seen holds no
+        Where the camera saw through the posed surface, or little of it, or what is seen fixes no
         pose, the object is looked for anew in the frame; where it is not found either it is lost,
         and looked for in the next.
 
         Args:
             frames: depth images as for :meth:`estimate`, in their order; without a camera clouds in
                 the camera frame, of the object alone or of what is about it too. They are taken one
-                by one, as their estimates are asked for.
+                by one, as their estimates are taken.
             camera: of the depth images.
             object: which one; None where the weights know one alone.
             first: the pose in the first frame, as far as it is known; None: it is looked for.

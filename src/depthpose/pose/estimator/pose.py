@@ -1,4 +1,4 @@
-"""Directions of one cloud to its pose: vote, outvote, fit, slide, judge."""
+"""Directions of one cloud to its pose: vote, drop outliers, fit, refine, check."""
 
 import math
 import time
@@ -20,7 +20,7 @@ from depthpose.pose.estimator.alternatives import (
     share_out,
 )
 from depthpose.pose.estimator.evidence import (
-    hold_of,
+    observability,
     vote_signals,
     without_motions,
 )
@@ -75,7 +75,7 @@ def pose_from_directions(
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> PoseEstimate:
-    """Vote for the keypoints, fit the pose, refine and judge it.
+    """Vote for the keypoints, fit the pose, refine and check it.
 
     Args:
         voted: the cloud and the network's directions (a fourth component is the logit of how far
@@ -132,7 +132,7 @@ def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
 def _fits(
     vote: Vote, model: ObjectModel, config: EstimateConfig, is_judged: bool
 ) -> PoseFit | Refusal:
-    """Fit the keypoints that agree; where a risk judges what comes out, all of them beside."""
+    """Fit the keypoints that agree; where a risk decides, also all of them."""
     found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
     total = len(found)
     if int(found.sum()) < _LEAST:
@@ -151,7 +151,7 @@ def _fits(
         return Refusal(
             status="keypoints do not fit",
             reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
-            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it hidden",
+            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
         )
     count = len(choices)
     return fit_pose(
@@ -175,7 +175,7 @@ def _refine(
     others = _none_of(fit.camera_from_model)
     if config.with_icp:
         best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
-        scatter = 1.0  # where ICP meets nothing, nothing speaks for the pose
+        scatter = 1.0  # where ICP finds no near surface, nothing supports the pose
         if float(best.refined.inlier_share) > 0:
             fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
             others = best.others
@@ -241,16 +241,16 @@ def _doubt(
     risk = risk_of(found.signals, config)
     if risk is not None and risk > config.max_risk:
         return Refusal(status="doubtful", reason=reason_of(found.signals, risk, config))
-    hold, motion = hold_of(cloud.cloud_m, found.pose, surface, free)
-    if hold >= config.min_hold:
+    observable, motion = observability(cloud.cloud_m, found.pose, surface, free)
+    if observable >= config.min_hold:
         return None
     turn = float(motion[:3].norm())
-    what = "turn" if turn > math.sqrt(0.5) else "slide"
+    what = "turn" if turn > math.sqrt(0.5) else "shift"
     return Refusal(
         status="not observable",
         reason=f"the seen part of the object may {what} along itself: that moves its surface "
-        f"across itself by {hold:.1%} of the motion alone, and no declared symmetry allows it. "
-        "Declare the symmetry, or look from a side that shows more",
+        f"across itself by {observable:.1%} of the motion alone, and no declared symmetry allows "
+        "it. Declare the symmetry, or look from a side that shows more",
     )
 
 

@@ -16,9 +16,9 @@ _RIDGE = 3.0
 """Of the slopes in units of each signal's spread: no signal decides alone."""
 _CANDIDATE_RIDGE = 3.0
 _LEARNT = tuple(name for name in SIGNALS if name != "gap")
-"""How far points lie off the surface is the sensor's noise as much as the pose's error. On made
-views it tells right from wrong best of all; a real sensor that is noisier than the made one would
-have its right answers refused by it, as LineMOD's cat was."""
+"""How far points lie off the surface is the sensor's noise as much as the pose's error. On
+synthetic views it separates right from wrong best of all; a real sensor that is noisier than the
+simulated one would have its right answers refused by it, as LineMOD's cat was."""
 
 
 def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None:
@@ -65,14 +65,14 @@ def calibrate_refusal(
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
     The risk is a logistic regression on the logarithms of the signals but ``gap``; no slope is
-    negative (more of a bad sign is never better), and a ridge holds them. The limit is chosen by
-    risks that each fifth of the data got from the other four: the largest at which
+    negative (more of a bad sign is never better), and a ridge keeps them small. The limit is chosen
+    by risks that each fifth of the data got from the other four: the largest at which
     ``(wrong + 1) / (answered + 1)`` is still ``max_wrong_share`` at most; where the data are too
     few for that, the largest at which nothing is wrong.
 
     Args:
-        estimates: made with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for its
-            risk; on views that training has not seen, the hard ones too.
+        estimates: computed with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for
+            its risk; on views that training has not seen, the hard ones too.
         is_right: whether each is right; what was refused anyhow does not count.
         max_wrong_share: of the answers that are given.
 
@@ -117,8 +117,8 @@ def fit_candidate_slopes(
 
     Args:
         cases: the signals of all candidates of a view, and the number of the right one.
-        ridge: of the slopes; it keeps shares nearer to each other than made views ask for, as real
-            sensors err alike from pixel to pixel.
+        ridge: of the slopes; it keeps shares nearer to each other than synthetic views give, as
+            real sensors err alike from pixel to pixel.
 
     Raises:
         InputError: there is no case.

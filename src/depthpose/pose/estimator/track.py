@@ -15,7 +15,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, RefusalConfig
-from depthpose.pose.estimator.evidence import hold_of, surface_signals, without_motions
+from depthpose.pose.estimator.evidence import observability, surface_signals, without_motions
 from depthpose.pose.estimator.prepare import AnyInput, Refusal
 from depthpose.pose.refine import Refined, refine_best
 from depthpose.pose.surface import NEAR, Surface, compare_depths
@@ -123,7 +123,7 @@ def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal 
 
 
 def _contradiction(shares: tuple[float, float, float]) -> Refusal | None:
-    """Say why a posed surface of which so much was seen, seen through and hidden is not there."""
+    """Say why a posed surface seen, seen through and occluded to these shares is not there."""
     agrees, through, before = shares
     if through > _THROUGH:
         return Refusal(
@@ -133,13 +133,13 @@ def _contradiction(shares: tuple[float, float, float]) -> Refusal | None:
         return None
     return Refusal(
         status="doubtful",
-        reason=f"{agrees:.0%} of the posed surface was seen, {before:.0%} is hidden, and "
+        reason=f"{agrees:.0%} of the posed surface was seen, {before:.0%} is occluded, and "
         f"{_SEEN:.0%} must be seen",
     )
 
 
 def _follow(given: AnyInput, last: _Last, known: Followed) -> PoseEstimate | Refusal:
-    """Let the last pose and the predicted one slide, and judge the better."""
+    """Refine the last pose and the predicted one, and check the better."""
     surface = known.surface
     starts = _starts(last)
     scene_m = _scene(given, starts, surface)
@@ -150,24 +150,25 @@ def _follow(given: AnyInput, last: _Last, known: Followed) -> PoseEstimate | Ref
             reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
         )
     refined = refine_best(cloud_m, starts, surface, replace(known.icp, starts=1)).refined
-    return _judged(refined, scene_m, known, last)
+    return _accepted(refined, scene_m, known, last)
 
 
-def _judged(
+def _accepted(
     refined: Refined, scene_m: Float64[Tensor, "n 3"], known: Followed, last: _Last
 ) -> PoseEstimate | Refusal:
-    """Believe a pose that the scene agrees with, of which the surface holds it."""
+    """Accept a pose that the scene agrees with and that is observable."""
     surface, pose = known.surface, _doubled(refined.camera_from_model)
     shares = compare_depths(scene_m, pose, surface)
     if (contradiction := _contradiction(shares)) is not None:
         return contradiction
     own_m = _near(scene_m, _batch([pose]), surface, NEAR)
     free = free_motions(known.model.symmetries.continuous, pose)
-    hold, _ = hold_of(own_m, pose, surface, free)
-    if hold < known.refusal.min_hold:
+    observable, _ = observability(own_m, pose, surface, free)
+    if observable < known.refusal.min_hold:
         return Refusal(
             status="not observable",
-            reason=f"what is seen of the object may slide along itself (hold {hold:.1%})",
+            reason="the seen part of the object does not fix its pose (observability "
+            f"{observable:.1%})",
         )
     _, through, before = shares
     signals = {**surface_signals(own_m, pose, surface), "through": through, "before": before}

@@ -1,12 +1,11 @@
-"""The errors of one estimate, as a row."""
+"""The errors of one estimate by each metric, and which estimate answers for which instance."""
 
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +20,13 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import Instance
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import (
+    BOP_PIXELS,
     BOP_SHARES,
     View,
     add_m,
     adds_m,
+    auc,
+    average_recall,
     mspd_px,
     mssd_m,
     rotation_error_rad,
@@ -41,7 +43,7 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ruler:
-    """What of an object its errors are measured with; made once.
+    """What the errors of an object are measured with; computed once.
 
     Attributes:
         model: the object.
@@ -74,39 +76,78 @@ def make_ruler(
     )
 
 
-def measure(
-    estimated: Rigid | None, instance: Instance, ruler: Ruler
-) -> tuple[dict[str, Any], Float[Tensor, "10"] | None]:
-    """Measure one estimate by every error.
+Errors = Float[Tensor, " n"]
+"""One number, or several of which a row shows the mean (VSD: one a tau); float64."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """An error of a pose, and what the rows of objects say of it.
+
+    Attributes:
+        measure: ``(estimated, instance, ruler)``, the first ``camera_from_model``, to the error.
+        missing: the error of an instance without an answer.
+        is_wanted: whether it is measured at all.
+        summaries: columns of the rows of objects: name to a function of the errors (n, t) of all
+            instances and their diameters [m] (n).
+        has_median: whether rows of objects hold the median of the answers, as ``NAME_median``.
+    """
+
+    measure: Callable[[Rigid, Instance, Ruler], Errors | Tensor | float]
+    missing: tuple[float, ...] = (math.inf,)
+    is_wanted: Callable[[Ruler], bool] = lambda _: True
+    summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
+    has_median: bool = False
+
+
+def measure(estimated: Rigid | None, instance: Instance, ruler: Ruler) -> dict[str, Errors]:
+    """Measure one estimate by every metric of ``METRICS`` that is wanted.
 
     Args:
-        estimated: ``camera_from_model``; None where there is no answer: every error is infinite.
+        estimated: ``camera_from_model``; None where there is no answer.
         instance: with its truth.
         ruler: of its object.
-
-    Returns:
-        Errors by name (``mspd_px`` scaled to an image 640 wide, rotation and translation against
-        the nearest symmetric truth), and VSD at BOP's ten taus, or None where it is not measured.
     """
-    if estimated is None:
-        names = ("error_m", "adds_m", "mssd_m", "mspd_px", "rotation_deg", "translation_m")
-        nothing = torch.ones(10, dtype=torch.float64)
-        return dict.fromkeys(names, math.inf), None if ruler.vsd_delta_m is None else nothing
-    true, points = instance.camera_from_model, ruler.model.vertices_m
-    adds = float(adds_m(estimated, true, points))
+    found: dict[str, Errors] = {}
+    for name, metric in METRICS.items():
+        if metric.is_wanted(ruler):
+            error = metric.missing
+            if estimated is not None:
+                error = metric.measure(estimated, instance, ruler)
+            found[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
+    return found
+
+
+def _add(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+    """ADD, or ADD-S where that decides a success [m]."""
+    error_m = adds_m if ruler.is_adds else add_m
+    return error_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
+
+
+def _adds(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+    return adds_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
+
+
+def _mssd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+    true = instance.camera_from_model
+    return mssd_m(estimated, true, ruler.model.vertices_m, ruler.symmetries)
+
+
+def _mspd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+    """MSPD, scaled to an image 640 wide [px]."""
+    true, points_m = instance.camera_from_model, ruler.model.vertices_m
     scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
-    copy = nearest_copy(estimated, true, ruler.symmetries)
-    row = {
-        "error_m": adds if ruler.is_adds else float(add_m(estimated, true, points)),
-        "adds_m": adds,
-        "mssd_m": float(mssd_m(estimated, true, points, ruler.symmetries)),
-        "mspd_px": scale * float(mspd_px(estimated, true, points, ruler.symmetries, instance.K)),
-        "rotation_deg": math.degrees(float(rotation_error_rad(estimated, copy))),
-        "translation_m": float(translation_error_m(estimated, copy)),
-    }
-    if ruler.vsd_delta_m is None:
-        return row, None
-    return row, _vsd(estimated, instance, ruler)
+    return scale * mspd_px(estimated, true, points_m, ruler.symmetries, instance.K)
+
+
+def _rotation(estimated: Rigid, instance: Instance, ruler: Ruler) -> float:
+    copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
+    return math.degrees(float(rotation_error_rad(estimated, copy)))
+
+
+def _translation(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+    copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
+    return translation_error_m(estimated, copy)
 
 
 def nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> Rigid:
@@ -129,7 +170,7 @@ def _vsd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Float[Tensor, "1
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)
     left, top, right, bottom = _window(poses, instance.K, ruler.triangles_m, depth_m)
-    # What neither pose covers has no say: only the window about both is drawn.
+    # What neither pose covers does not count: only the window about both is drawn.
     K = instance.K.double().clone()
     K[0, 2] -= left
     K[1, 2] -= top
@@ -176,6 +217,29 @@ def _read_depth(path: Path, unit_m: float) -> Float[Tensor, "h w"]:
     return read_depth_png(path, unit_m)
 
 
+METRICS = {
+    "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
+    "adds_m": Metric(measure=_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}),
+    "mssd_m": Metric(
+        measure=_mssd,
+        summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
+    ),
+    "mspd_px": Metric(
+        measure=_mspd, summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)}
+    ),
+    "rotation_deg": Metric(measure=_rotation, has_median=True),
+    "translation_m": Metric(measure=_translation, has_median=True),
+    "vsd": Metric(
+        measure=_vsd,
+        missing=(1.0,) * len(BOP_SHARES),
+        is_wanted=lambda ruler: ruler.vsd_delta_m is not None,
+        summaries={"ar_vsd": lambda errors, _: average_recall(errors, BOP_SHARES)},
+    ),
+}
+"""Columns of instances, in order; a new metric is one entry. Rotation and translation are against
+the nearest of the true poses that look alike."""
+
+
 _POINTS = 500
 _NEAR_DIAMETERS = 1.0
 
@@ -187,7 +251,7 @@ def match(
 ) -> dict[str, PoseEstimate]:
     """Give each instance the estimate that answers for it, by the instance's name.
 
-    An estimate that bears an instance's name was made from its very mask, and is its own, unless
+    An estimate with an instance's name was computed from its mask, and is its own, unless
     it says that it belongs elsewhere: in another data set names may be the same. Of the
     others an image with n instances of an object takes the n of the highest scores, as BOP does,
     and sets them against the instances so that the sum of ADD-S, at most a diameter each, is least.

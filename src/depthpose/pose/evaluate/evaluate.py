@@ -1,20 +1,15 @@
-"""Predictions held against a data set: a row an instance, a row an object, the mean."""
+"""Predictions measured on a data set: a row an instance, a row an object, the mean."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.evaluate.errors import Ruler, make_ruler, match, measure
-from depthpose.pose.evaluate.rows import (
-    Row,
+from depthpose.pose.evaluate.rows import Conditions, InstanceRow, ObjectRow, Origin, RiskRow
+from depthpose.pose.evaluate.summary import (
     diameter_of,
     frames_hash,
     is_adds,
@@ -45,9 +40,17 @@ class Evaluation:
         risk: how many answers are wrong if only the surest are given.
     """
 
-    rows: list[dict[str, Any]]
-    per_instance: list[dict[str, Any]]
-    risk: list[dict[str, Any]]
+    rows: list[ObjectRow]
+    per_instance: list[InstanceRow]
+    risk: list[RiskRow]
+
+    def of(self, origin: Origin) -> "Evaluation":
+        """Say in each row whose predictions it measures."""
+        return Evaluation(
+            rows=[replace(row, origin=origin) for row in self.rows],
+            per_instance=[replace(row, origin=origin) for row in self.per_instance],
+            risk=[replace(row, origin=origin) for row in self.risk],
+        )
 
 
 def read_any(path: Path) -> list[Prediction]:
@@ -84,20 +87,15 @@ def evaluate(
     found = match(dataset.instances, predictions, dataset.objects)
     _refuse_strangers(dataset, predictions, found)
     rulers, stages = _rulers(dataset, config), _stages_of(predictions)
-    rows: list[Row] = []
-    vsd: dict[str, Float[Tensor, 10]] = {}
-    for instance in progress(dataset.instances):
-        estimate = found.get(instance.name)
-        row, errors = _instance_row(instance, estimate, rulers[instance.object_id], stages)
-        rows.append(row)
-        if errors is not None:
-            vsd[instance.name] = errors
-    stamp = _stamp(dataset, config)
-    summed = _sum_up(dataset, rows, vsd, rulers)
+    rows = [
+        _instance_row(one, found.get(one.name), rulers[one.object_id], stages)
+        for one in progress(dataset.instances)
+    ]
+    conditions = _conditions(dataset, config)
     return Evaluation(
-        rows=[row | stamp for row in summed],
-        per_instance=[{k: _finite(v) for k, v in row.items()} for row in rows],
-        risk=[row | stamp for row in risk_rows(rows)],
+        rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, rulers)],
+        per_instance=rows,
+        risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
     )
 
 
@@ -115,28 +113,25 @@ def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
 
 def _instance_row(
     instance: Instance, estimate: PoseEstimate | None, ruler: Ruler, stages: list[str]
-) -> tuple[Row, Float[Tensor, "10"] | None]:
+) -> InstanceRow:
     pose = None if estimate is None else estimate.camera_from_model
-    errors, vsd = measure(pose, instance, ruler)
-    row: Row = {
-        "instance": instance.name,
-        "object": ruler.model.name,
-        "status": "missing" if estimate is None else estimate.status,
-        "is_success": errors["error_m"] < SUCCESS_SHARE * ruler.diameter_m,
-        "score": None if estimate is None or pose is None else score_of(estimate),
-        "visible_fraction": instance.visible_fraction,
-        "truth": "annotated" if instance.is_measured else "fitted",
-        "diameter_m": ruler.diameter_m,
-        "metric": "ADD-S" if ruler.is_adds else "ADD",
-    }
-    row |= errors
-    row["vsd"] = None if vsd is None else float(vsd.mean())
+    errors = measure(pose, instance, ruler)
     seconds = {} if estimate is None else estimate.seconds
-    for stage in stages:
-        row[f"ms_{stage}"] = 1000 * seconds[stage] if stage in seconds else None
-    row["ms_total"] = 1000 * sum(seconds.values()) if seconds else None
-    row["reason"] = "" if estimate is None else estimate.reason
-    return row, vsd
+    ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
+    return InstanceRow(
+        instance=instance.name,
+        object=ruler.model.name,
+        status="missing" if estimate is None else estimate.status,
+        is_success=float(errors["error_m"]) < SUCCESS_SHARE * ruler.diameter_m,
+        score=None if estimate is None or pose is None else score_of(estimate),
+        visible_fraction=instance.visible_fraction,
+        truth="annotated" if instance.is_measured else "fitted",
+        diameter_m=ruler.diameter_m,
+        metric="ADD-S" if ruler.is_adds else "ADD",
+        errors=errors,
+        ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
+        reason="" if estimate is None else estimate.reason,
+    )
 
 
 def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
@@ -145,35 +140,26 @@ def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
     return [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
 
 
-def _finite(value: object) -> object:
-    """An answer that is missing has no error that a file could hold."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _sum_up(
-    dataset: BopDataset,
-    rows: list[Row],
-    vsd: dict[str, Float[Tensor, "10"]],
-    rulers: dict[int, Ruler],
-) -> list[Row]:
-    summed: list[Row] = []
+    dataset: BopDataset, rows: list[InstanceRow], rulers: dict[int, Ruler]
+) -> list[ObjectRow]:
+    summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]
     for number, ruler in sorted(rulers.items()):
         own = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        facts = {"metric": own[0]["metric"], "diameter_m": ruler.diameter_m}
-        summed.append(object_row(ruler.model.name, own, vsd) | facts)
+        row = object_row(ruler.model.name, own)
+        summed.append(replace(row, metric=own[0].metric, diameter_m=ruler.diameter_m))
     if len(summed) > 1:
-        summed += [mean_row(summed), object_row("all", rows, vsd)]
+        summed += [mean_row(summed), object_row("all", rows)]
     return summed
 
 
-def _stamp(dataset: BopDataset, config: EvaluationConfig) -> Row:
-    """What a number cannot be compared without."""
-    return {
-        "diameters": config.diameters,
-        "frames": f"{dataset.folder.resolve().name} {dataset.split}",
-        "frames_sha256": frames_hash(dataset.instances)[:12],
-    }
+def _conditions(dataset: BopDataset, config: EvaluationConfig) -> Conditions:
+    return Conditions(
+        diameters=config.diameters,
+        frames=f"{dataset.folder.resolve().name} {dataset.split}",
+        frames_sha256=frames_hash(dataset.instances)[:12],
+    )
 
 
 def _refuse_strangers(

@@ -12,7 +12,7 @@ from depthpose.pose.sparse import SparseConv, kernel_offsets
 
 LEVELS = 4
 MARGIN = 1 << (LEVELS - 1)
-"""Cells about the box: as far as a kernel of 3 looks on the coarsest level (of 7: 3 cells)."""
+"""Cells about the box: as far as a kernel of 3 reads on the coarsest level (of 7: 3 cells)."""
 
 
 class KernelMaps:
@@ -33,23 +33,23 @@ class KernelMaps:
         x = sides.slice([1], [2], [0])
         self._strides = self._graph.op("Concat", x * y * z, y * z, z, [1], axis=0)
         self._cells = sides.op("ReduceProd", [0], keepdims=1)
-        self._standing = [self._cells_of(level) for level in range(LEVELS)]
-        self._rows = [self._table(cells) for cells in self._standing]
+        self._level_cells = [self._cells_of(level) for level in range(LEVELS)]
+        self._rows = [self._table(cells) for cells in self._level_cells]
         self._maps: dict[tuple[int, int, int], Value] = {}
 
-    def rows_met(self, kernel: int, level_in: int, level_out: int) -> Value:
-        """Give the row of ``level_in`` that each voxel of ``level_out`` meets at each offset.
+    def neighbour_rows(self, kernel: int, level_in: int, level_out: int) -> Value:
+        """Give the row of ``level_in`` beside each voxel of ``level_out`` at each offset.
 
         (voxels, kernel^3); one past the last row where there is none.
         """
         key = (kernel, level_in, level_out)
         if key not in self._maps:
             step = 1 << min(level_in, level_out)
-            # Going down the kernel stands on the coarse voxel; going up, on what reads.
+            # Going down the kernel is centred on the coarse voxel; going up, on what reads.
             step = -step if level_out < level_in else step
             offsets = np.array([(0, *offset) for offset in kernel_offsets(kernel)]) * step
             moves = self._graph.op("MatMul", offsets, self._strides)
-            cells = self._standing[level_out].op("Unsqueeze", [1]) + moves
+            cells = self._level_cells[level_out].op("Unsqueeze", [1]) + moves
             self._maps[key] = self._rows[level_in].op("Gather", cells)
         return self._maps[key]
 
@@ -116,9 +116,9 @@ class _Writer:
     def _conv(self, conv: SparseConv, x: Value, level_in: int, level_out: int) -> Value:
         volume, inputs, _ = conv.weight.shape
         if conv.kernel > 1:
-            nobody = np.zeros((1, inputs), np.float32)
-            rows = self.maps.rows_met(conv.kernel, level_in, level_out)
-            met = self.graph.op("Concat", x, nobody, axis=0).op("Gather", rows)
+            empty = np.zeros((1, inputs), np.float32)
+            rows = self.maps.neighbour_rows(conv.kernel, level_in, level_out)
+            met = self.graph.op("Concat", x, empty, axis=0).op("Gather", rows)
             x = met.op("Reshape", [-1, volume * inputs])
         out = x.op("MatMul", _array(conv.weight.flatten(0, 1)))
         return out if conv.bias is None else out + _array(conv.bias)

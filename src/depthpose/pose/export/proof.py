@@ -1,4 +1,4 @@
-"""What is exported of pose weights, and the clouds that it is held to."""
+"""What is exported of pose weights, and the clouds that it is tested on."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -21,7 +21,7 @@ _POINTS = ((1,), (150,), (1500,), (700, 40, 1100))
 
 
 def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
-    """Say what becomes of weights in a file: the network of directions.
+    """Describe what is exported of weights: the network of directions.
 
     Args:
         weights: of the method, not of a baseline.

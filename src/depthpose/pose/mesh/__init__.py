@@ -2,6 +2,8 @@
 
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import make_model as make_model
+from depthpose.pose.mesh.models import mesh_suffixes as mesh_suffixes
+from depthpose.pose.mesh.models import read_geometry as read_geometry
 from depthpose.pose.mesh.models import read_model as read_model
 from depthpose.pose.mesh.near import NearSymmetry as NearSymmetry
 from depthpose.pose.mesh.near import near_symmetries as near_symmetries

@@ -2,7 +2,7 @@
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import AnyPath, read_bytes, read_cloud
+from depthpose.core.files import AnyPath, cloud_suffixes, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.pose.config import MeshConfig, Unit, metres_of
 from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
@@ -45,7 +45,7 @@ def refuse_too_large(path: AnyPath, suffix: str, data: bytes) -> None:
 
 
 def _is_text(suffix: str, data: bytes) -> bool:
-    """Tell text as trimesh does: an STL is binary where its length is that of its triangles."""
+    """Recognise text as trimesh does: an STL is binary if its length is that of its triangles."""
     if suffix == ".ply":
         return b"format ascii" in data[: 2**16]
     if suffix == ".stl" and len(data) >= 84:
@@ -81,8 +81,6 @@ def _values(accessor: Mapping[str, Any]) -> int:
     return abs(int(accessor["count"])) * _WIDTHS[accessor["type"]]
 
 
-MESHES = (".ply", ".stl", ".obj", ".glb")
-CLOUDS = (".pcd", ".npy", ".xyz", ".txt")
 _COARSE = 1000
 """A mesh of fewer points (a CAD box has eight) lends keypoints from inside its faces too."""
 _NO_AREA = 1e-12
@@ -193,10 +191,21 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
         InputError: the file is missing, damaged or of another format, or has no surface.
     """
     suffix = Path(path).suffix.lower()
-    if suffix in CLOUDS:
-        return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
-    if suffix not in MESHES:
-        raise refused_suffix(path, "model", (*MESHES, *CLOUDS))
+    if suffix in MESH_READERS:
+        return MESH_READERS[suffix](path)
+    if suffix not in cloud_suffixes():
+        known = dict.fromkeys((*mesh_suffixes(), *cloud_suffixes()))
+        raise refused_suffix(path, "model", tuple(known))
+    return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
+
+
+def mesh_suffixes() -> tuple[str, ...]:
+    """Name the suffixes of model files that may have faces, in lower case."""
+    return tuple(MESH_READERS)
+
+
+def _read_mesh(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    suffix = Path(path).suffix.lower()
     data = read_bytes(path)
     refuse_too_large(path, suffix, data)
     with refused_as(path, "model", "export it again"):
@@ -215,6 +224,15 @@ def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
             f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
         )
     return vertices, _sound_faces(path, vertices, faces)
+
+
+MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray]]] = {
+    ".ply": _read_mesh,
+    ".stl": _read_mesh,
+    ".obj": _read_mesh,
+    ".glb": _read_mesh,
+}
+"""Suffix to reader of points (n, 3; float64) and faces (f, 3; int64), in the file's unit."""
 
 
 def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

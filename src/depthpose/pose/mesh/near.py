@@ -1,4 +1,4 @@
-"""Near-symmetries: turns of a model that a depth sensor can hardly tell from no turn at all."""
+"""Near-symmetries: turns of a model that a depth sensor hardly distinguishes from none."""
 
 import math
 from collections import OrderedDict
@@ -20,20 +20,20 @@ ALIKE = 0.01
 """Deviation in diameters up to which a symmetry that was found in a scan is one; a copy that
 deviates by more differs in dents that are seen from near by, and is another pose."""
 _TOLERANCE = 0.05
-"""Deviation in diameters at which a sensor's noise begins to hide what tells two poses apart: real
+"""Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
 _SHADOW_RAD = math.radians(35)
 """Turns nearer to each other are one: ICP goes from one to the other."""
 _STEP = math.pi / 8
-"""An axis that nearly is one of revolution stands for eight turns."""
+"""An axis that nearly is one of revolution counts as eight turns."""
 _FINE_STEP = math.pi / 36
 _MOST = 24
 _STARTS = 24
-"""Turns that slide to where they fit."""
+"""Turns that ICP refines."""
 _SLIDES = 20
 _NEAREST = 0.9
-"""Of the points so many count in each step of sliding."""
+"""Points that count in each step of ICP."""
 _KEPT_MODELS = 64
 
 
@@ -120,7 +120,7 @@ def _search(model: ObjectModel) -> _Known:
 
 
 def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
-    """Measure symmetries that were found, and turns that slide to where they fit best.
+    """Measure symmetries that were found, and turns refined to where they fit best.
 
     A scan whose points lie denser on one side has its centre where no symmetry has it.
     """
@@ -158,7 +158,7 @@ def _starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
 
 
 def _slid(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Rigid:
-    """Let the surface, turned about the middle of its box, slide onto itself (ICP)."""
+    """Refine the turn of the surface about the middle of its box onto itself (ICP)."""
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
     turn = Rigid(R, middle - R @ middle)
     for _ in range(_SLIDES):

@@ -110,7 +110,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     exact axis; there, turns of order 2 to 12 and a full circle are measured. Texture does not
     count: neither does it to a method that sees depth alone. Bumps smaller than the tolerance are
     overlooked, so that a cup's handle is seen and its seam is not. Takes some seconds. A sphere is
-    told as two axes of revolution.
+    reported as two axes of revolution.
 
     Args:
         model: the object.
@@ -173,7 +173,7 @@ def with_found_symmetries(
 
     Args:
         model: a mesh, or points with normals.
-        tell: told what was found, taken or not; None looks for nothing that is not taken.
+        tell: called with what was found, taken or not; None: nothing is searched that is not taken.
         is_taken: give the model these symmetries.
         tolerance: as for :func:`propose_symmetries`.
     """
@@ -192,7 +192,7 @@ def with_found_symmetries(
             + (
                 "each copy counts as right"
                 if is_taken
-                else "if that is so, say --symmetries found: no network can tell the copies apart"
+                else "if that is so, say --symmetries found: no network can distinguish the copies"
             )
         )
     return replace(model, symmetries=found) if is_taken else model
@@ -287,7 +287,7 @@ def _measure(
 
 
 def _follow(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Let the turned surface slide onto the surface (ICP about the fixed centre)."""
+    """Refine the turned surface onto the surface (ICP about the fixed centre)."""
     points = surface.many
     weight = torch.ones(2 * len(points), dtype=torch.float64)
     for _ in range(15):

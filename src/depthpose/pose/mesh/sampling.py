@@ -1,4 +1,4 @@
-"""Points that stand for a surface: farthest ones, even ones, and the normals of bare points."""
+"""Points that represent a surface: farthest ones, even ones, and the normals of bare points."""
 
 import math
 

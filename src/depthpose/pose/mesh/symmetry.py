@@ -59,7 +59,7 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
 
-    ``symmetries_found`` is our own word: true where they were found in the geometry.
+    ``symmetries_found`` is ours: true where they were found in the geometry.
 
     Args:
         info: an object's entry of ``models_info.json``.

@@ -8,7 +8,7 @@ _FACTORS = {1000.0: "mm", 39.37: "inches"}
 _LARGEST_SHARE = 1.5
 """A cloud is part of its object; noise and a grown mask may make it somewhat larger."""
 _SMALLEST_SHARE = 0.1
-"""What is hidden to less than a tenth of the diameter cannot be posed anyway."""
+"""What is occluded to less than a tenth of the diameter cannot be posed anyway."""
 _LIKELY_SHARE = 0.3
 """A cloud that is too large is taken for one of another unit if that makes it as long as this."""
 

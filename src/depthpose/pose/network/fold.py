@@ -13,7 +13,7 @@ from depthpose.pose.sparse import Voxels
 def fold_norms(network: ResUNet) -> ResUNet:
     """Give a norm-free network, in eval mode, that answers what ``network.eval()`` answers.
 
-    In eval mode batch norm is ``(x - mean) * scale + shift`` with numbers that stand still, and a
+    In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, and a
     convolution before it absorbs them: ``weight * scale``, ``shift + (bias - mean) * scale``.
     """
     if network.config.norm == "none":
@@ -43,7 +43,7 @@ def _fold(source: ConvNorm, target: ConvNorm) -> None:
 def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     """Give a network with batch norm the weights of one without, so that it can learn on.
 
-    The statistics that folding took are lost; those of ``voxels`` stand in for them. On these the
+    The statistics that folding took are lost; those of ``voxels`` replace them. On these the
     network answers in training and in eval mode what ``folded`` does.
 
     Args:

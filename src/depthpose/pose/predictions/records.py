@@ -226,7 +226,7 @@ def _table(
 
 
 def _numbers(entry: object, width: int, source: str, rows: int | None = None) -> Tensor:
-    """Read a table of ``width`` columns, and of ``rows`` rows where that is told."""
+    """Read a table of ``width`` columns, and of ``rows`` rows where that is given."""
     try:
         return torch.tensor(entry, dtype=torch.float64).reshape(rows or -1, width)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:

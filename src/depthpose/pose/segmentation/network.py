@@ -158,8 +158,8 @@ def read_segmentation(path: Path) -> SegmentationWeights:
             f"{path}: its config names {len(config.objects)} objects and {len(config.numbers)} "
             "numbers; each object has both. Export it again."
         )
-    count, knobs = len(config.objects), config.network
-    network = build_network(lambda: FCN(count, knobs), checkpoint, str(path))
+    count, network_config = len(config.objects), config.network
+    network = build_network(lambda: FCN(count, network_config), checkpoint, str(path))
     return SegmentationWeights(
         network=network.eval(),
         objects=config.objects,

@@ -4,6 +4,7 @@ Every way of computing it is gather, multiply, add up; the ways differ in how mu
 once. A faster kernel would replace :func:`conv` and nothing else.
 """
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -35,7 +36,6 @@ def multiply(
     """Multiply up to ``block`` rows."""
     if len(rows) < block or not _has_onednn(rows):
         return torch.mm(rows, kernel)
-    # The one name by which torch multiplies strided float32 through oneDNN is private to it.
     return torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
 
 
@@ -52,7 +52,23 @@ def add_product(out: Tensor, x: Tensor, kernel: Tensor) -> Tensor:
 
 def _has_onednn(x: Tensor) -> bool:
     is_usable = x.device.type == "cpu" and x.dtype == torch.float32
-    return is_usable and torch.backends.mkldnn.is_available()
+    return is_usable and _has_private_product()
+
+
+@cache
+def _has_private_product() -> bool:
+    """Whether this torch multiplies strided float32 through oneDNN, by an operator private to it.
+
+    Without it every product goes through ``torch.mm``: the same numbers, more slowly.
+    """
+    if not torch.backends.mkldnn.is_available():
+        return False
+    rows, kernel = torch.ones(2, 3, dtype=torch.float32), torch.ones(3, 4, dtype=torch.float32)
+    try:
+        product = torch.ops.mkldnn._linear_pointwise(rows, kernel.T, None, "none", [], "")
+    except (AttributeError, RuntimeError, TypeError):  # renamed, not built in, other arguments
+        return False
+    return torch.equal(product, torch.full_like(product, 3.0))
 
 
 GRID_PRODUCTS = 1 << 20
@@ -130,7 +146,7 @@ def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
 def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     """Gather and add up an offset at a time: its pairs write each row once at most."""
     out = x.new_zeros(m.outputs, weight.shape[2])
-    # Lists of views, each made by one call: slicing one by one costs as much as small products.
+    # Lists of views, each from one call: slicing one by one costs as much as small products.
     kernels = weight.unbind()
     reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
     for offset, read, write in zip(m.filled, reads, writes, strict=True):
@@ -188,7 +204,7 @@ def _gradients_by_offset(
 def _with_centre(
     gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, so_far: Gradients
 ) -> Gradients:
-    """Add the part of the offset at which each voxel meets itself."""
+    """Add the part of the offset at which each voxel is its own neighbour."""
     for_x, for_weight = so_far
     if m.centre is not None and for_x is not None:
         add_product(for_x, gradient, weight[m.centre].T)
@@ -206,7 +222,7 @@ def _read(x: Tensor, slots: Tensor, m: KernelMap) -> Tensor:
 def _table(x: Tensor, m: KernelMap) -> Tensor:
     """Lay out what each output voxel reads: (volume * channels, outputs), 0 where it is empty."""
     padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
-    rows = m.meetings.table
+    rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
 

@@ -1,4 +1,4 @@
-"""Which input voxel meets which output voxel at which offset of a kernel."""
+"""Which input voxel is the neighbour of which output voxel at which offset of a kernel."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,13 +20,13 @@ from depthpose.pose.sparse.keys import (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairList:
-    """Meetings of two levels, offset by offset.
+    """Neighbours of two levels, offset by offset.
 
     Attributes:
         fine: row of each pair in the finer level: where the kernel reads.
-        coarse: row of each pair in the coarser level: where the kernel stands.
+        coarse: row of each pair in the coarser level: where the kernel is centred.
         slot: place of each pair in a grid of (volume, most), where ``most`` is the largest count.
-        filled: offsets that have pairs; nobody need spend time on the others.
+        filled: offsets that have pairs; the others are skipped.
         counts: how many pairs each of them has.
     """
 
@@ -43,14 +43,14 @@ class PairList:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Meetings:
-    """All meetings of a fine and a coarse level, or of a level with itself.
+class NeighbourTable:
+    """Neighbours between a fine and a coarse level, or of a level with itself.
 
     Attributes:
-        table: row of the fine voxel that each coarse one meets at each offset; one past the last
+        table: row of the fine voxel that each coarse one has at each offset; one past the last
             where there is none.
         fine_rows: number of voxels of the finer level.
-        centre: offset at which each voxel meets itself; None across levels.
+        centre: offset at which each voxel is its own neighbour; None across levels.
     """
 
     table: Int32[Tensor, "volume coarse_rows"]
@@ -59,7 +59,7 @@ class Meetings:
 
     @cached_property
     def pairs(self) -> PairList:
-        """The meetings listed, but for the centre: there input and output rows are the same."""
+        """The neighbours listed, but for the centre: there input and output rows are the same."""
         is_pair = self.table < self.fine_rows
         if self.centre is not None:
             is_pair[self.centre] = False
@@ -105,72 +105,72 @@ class Meetings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KernelMap:
-    """Meetings with a direction: what a convolution reads and where it writes.
+    """Neighbours with a direction: what a convolution reads and where it writes.
 
     Attributes:
-        meetings: of the two levels, or of the one.
+        neighbours: of the two levels, or of the one.
         is_transposed: False: fine to coarse (or the level to itself); True: coarse to fine.
     """
 
-    meetings: Meetings
+    neighbours: NeighbourTable
     is_transposed: bool = False
 
     @property
     def transposed(self) -> "KernelMap":
         """The way back: the map of the transposed convolution and of the input's gradient."""
-        return KernelMap(meetings=self.meetings, is_transposed=not self.is_transposed)
+        return KernelMap(neighbours=self.neighbours, is_transposed=not self.is_transposed)
 
     @property
     def volume(self) -> int:
         """Number of offsets of the kernel."""
-        return len(self.meetings.table)
+        return len(self.neighbours.table)
 
     @property
     def centre(self) -> int | None:
-        """Offset at which each voxel meets itself, which the pairs leave out."""
-        return self.meetings.centre
+        """Offset at which each voxel is its own neighbour, which the pairs leave out."""
+        return self.neighbours.centre
 
     @property
     def most(self) -> int:
         """Pairs of the fullest offset."""
-        return self.meetings.pairs.most
+        return self.neighbours.pairs.most
 
     @property
     def filled(self) -> tuple[int, ...]:
         """Offsets that have pairs."""
-        return self.meetings.pairs.filled
+        return self.neighbours.pairs.filled
 
     @property
     def counts(self) -> tuple[int, ...]:
         """Number of pairs of each of these offsets."""
-        return self.meetings.pairs.counts
+        return self.neighbours.pairs.counts
 
     @property
     def rows_in(self) -> Int64[Tensor, " pairs"]:
         """Row that each pair reads."""
-        pairs = self.meetings.pairs
+        pairs = self.neighbours.pairs
         return pairs.coarse if self.is_transposed else pairs.fine
 
     @property
     def rows_out(self) -> Int64[Tensor, " pairs"]:
         """Row that each pair adds to."""
-        pairs = self.meetings.pairs
+        pairs = self.neighbours.pairs
         return pairs.fine if self.is_transposed else pairs.coarse
 
     @property
     def outputs(self) -> int:
         """Number of voxels written."""
-        return self.meetings.fine_rows if self.is_transposed else self.meetings.table.shape[1]
+        return self.neighbours.fine_rows if self.is_transposed else self.neighbours.table.shape[1]
 
     @property
     def grid_in(self) -> Int64[Tensor, " slots"]:
         """Row that each slot of (volume, most) reads; one past the last where it is empty."""
-        return self.meetings.coarse_grid if self.is_transposed else self.meetings.fine_grid
+        return self.neighbours.coarse_grid if self.is_transposed else self.neighbours.fine_grid
 
     @property
     def grid_out(self) -> Int64[Tensor, " slots"]:
         """Row that each slot adds to; one past the last where it is empty."""
-        return self.meetings.fine_grid if self.is_transposed else self.meetings.coarse_grid
+        return self.neighbours.fine_grid if self.is_transposed else self.neighbours.coarse_grid
 
     def sum_by_output(self, products: Tensor) -> Tensor:
         """Add up the slots of each output voxel, always in the same order.
@@ -178,7 +178,7 @@ class KernelMap:
         A gather, not a scatter: the same bits on every run, on CUDA too, and several times faster
         on the CPU than ``index_add_``.
         """
-        order, starts = self.meetings.by_fine if self.is_transposed else self.meetings.by_coarse
+        order, starts = self.neighbours.by_fine if self.is_transposed else self.neighbours.by_coarse
         return torch.nn.functional.embedding_bag(order, products, starts, mode="sum")
 
 
@@ -196,7 +196,7 @@ def _grouped(rows: Tensor, slot: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 class CoordinateCache:
-    """Sorted keys of every level, and the meetings of every kernel that was asked for.
+    """Sorted keys of every level, and the neighbours of every kernel that was used.
 
     Level ``l`` holds coordinates that are multiples of ``2**l``. A transposed convolution lands on
     the stored coordinates of the finer level, never on new ones.
@@ -206,7 +206,7 @@ class CoordinateCache:
         """Begin with the sorted, distinct keys of level 0."""
         self._keys = {0: keys}
         self._indices: dict[int, VoxelIndex] = {}
-        self._meetings: dict[tuple[int, int, int], Meetings] = {}
+        self._neighbours: dict[tuple[int, int, int], NeighbourTable] = {}
 
     def keys(self, level: int) -> Keys:
         """Give the sorted keys of a level."""
@@ -237,14 +237,14 @@ class CoordinateCache:
         fine = level - levels if is_transposed else level
         assert fine >= 0, f"level {level} has no level {levels} finer"
         key = (fine, kernel, levels)
-        if key not in self._meetings:
-            self._meetings[key] = self._meet(*key)
-        return KernelMap(meetings=self._meetings[key], is_transposed=is_transposed)
+        if key not in self._neighbours:
+            self._neighbours[key] = self._find_neighbours(*key)
+        return KernelMap(neighbours=self._neighbours[key], is_transposed=is_transposed)
 
-    def _meet(self, fine: int, kernel: int, levels: int) -> Meetings:
+    def _find_neighbours(self, fine: int, kernel: int, levels: int) -> NeighbourTable:
         assert kernel * 2**fine <= REACH, f"kernel {kernel} at level {fine} reaches too far"
         if fine not in self._indices:
             self._indices[fine] = VoxelIndex(self.keys(fine), 2**fine)
         table = self._indices[fine].find(self.keys(fine + levels), kernel_offsets(kernel))
         centre = None if levels else kernel**3 // 2
-        return Meetings(table=table, fine_rows=len(self.keys(fine)), centre=centre)
+        return NeighbourTable(table=table, fine_rows=len(self.keys(fine)), centre=centre)

@@ -20,7 +20,7 @@ Duplicates = Literal["refuse", "mean"]
 class Voxels:
     """Features of the voxels of one level, of one or several clouds.
 
-    Rows stand in the order of the level's sorted keys, so the order in which points were given
+    Rows are in the order of the level's sorted keys, so the order in which points were given
     changes no bit of any result; :meth:`at_points` answers in the order given.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Made views of known objects: partial clouds and depth windows, and whole frames."""
+"""Synthetic views of known objects: partial clouds and depth windows, and whole frames."""
 
 from depthpose.pose.synthetic.dataset import Objects as Objects
 from depthpose.pose.synthetic.frames import make_frames as make_frames

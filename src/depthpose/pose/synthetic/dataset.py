@@ -1,4 +1,4 @@
-"""Made views of known objects as a dataset."""
+"""Synthetic views of known objects as a dataset."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import ticket_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import (
-    hide,
     measure,
     misjudge_mask,
+    occlude,
     random_levels,
     random_rotation,
     uniform,
@@ -129,7 +129,7 @@ class Objects:
             depth_m = self._before_background(clean, self._shape(number), generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
-            depth_m, visible = hide(depth_m, silhouette, share, generator)
+            depth_m, visible = occlude(depth_m, silhouette, share, generator)
         most = self.config.mask_error_px
         grow_px = whole(generator, 2 * most + 1) - most
         # Pixels of the full image.

@@ -45,7 +45,7 @@ def make_frames(
         first: number of the first.
 
     Raises:
-        InputError: no model, two of one number, or a camera that would stand in an object.
+        InputError: no model, two of one number, or a camera that would be inside an object.
     """
     if not models:
         raise InputError("there is no object to show; give one model at least")

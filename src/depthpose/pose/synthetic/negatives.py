@@ -20,7 +20,7 @@ NegativeKind = Literal[
 SCALES = (0.8, 0.9, 1.1, 1.2)
 """Of a scaled copy."""
 _SIZES = (0.5, 1.1)
-"""Of what has no model, in diameters of the object that is asked for."""
+"""Of what has no model, in diameters of the object that is searched for."""
 
 
 def negative_of(
@@ -33,7 +33,7 @@ def negative_of(
     """Make something that is not an object, and bears its name.
 
     Args:
-        model: the object that will be asked for.
+        model: the object that is searched for.
         kind: of negative.
         others: objects of which another one is taken; where there is none, one of our parts.
         generator: of the chance.

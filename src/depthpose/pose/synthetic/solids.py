@@ -1,4 +1,4 @@
-"""What stands in a scene: triangles with normals, a colour and a pattern."""
+"""Solids of a scene: triangles with normals, a colour and a pattern."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Training of the direction network in the one loop: made views, real frames, or both."""
+"""Training of the direction network in the one loop: synthetic views, real frames, or both."""
 
 from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch

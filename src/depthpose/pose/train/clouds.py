@@ -1,4 +1,4 @@
-"""Partial clouds by ticket, made or of real frames, and their batches."""
+"""Partial clouds by sample index, synthetic or of real frames, and their batches."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -71,15 +71,15 @@ class CloudBatch(NamedTuple):
 
 
 class TrainingClouds:
-    """Each ticket a cloud, made or of a frame.
+    """A cloud by sample index, synthetic or of a frame.
 
     Args:
         models: the objects; class k is ``models[k]``.
-        made: how made views look; None: frames alone.
+        made: how synthetic views look; None: frames alone.
         frames: real frames, and their share.
         cloud: points and voxels.
         seed: of the order of frames and of the choice of points.
-        first_alone: so many made views at the start show the first object.
+        first_alone: so many synthetic views at the start show the first object.
 
     Raises:
         InputError: neither views nor frames, or frames of other objects.
@@ -106,21 +106,21 @@ class TrainingClouds:
             return len(self.made)
         return max(1, round(len(self._real) / self.frames.share))
 
-    def __getitem__(self, ticket: int) -> Cloud:
-        """Make the sample of a ticket; one with too few points gives way to another.
+    def __getitem__(self, index: int) -> Cloud:
+        """Make the sample of an index; one with too few points is replaced by another.
 
         Raises:
             InputError: so many in a row have too few points that the config must be wrong.
         """
-        generator = ticket_generator(ticket, self.seed)
+        generator = ticket_generator(index, self.seed)
         for attempt in range(_TRIES):
             # Far beyond any training, and the same object.
-            sample = self._sample(ticket + attempt * len(self._class_of) * 2**32, generator)
+            sample = self._sample(index + attempt * len(self._class_of) * 2**32, generator)
             points = sample.input.points_m
             if refusal_of(points, self.cloud) is None:
                 return self._voxelised(sample, generator)
         raise InputError(
-            f"ticket {ticket}: {_TRIES} samples in a row have fewer than "
+            f"sample {index}: {_TRIES} samples in a row have fewer than "
             f"{self.cloud.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
@@ -130,14 +130,14 @@ class TrainingClouds:
         """Put clouds one after the other."""
         return collate_clouds(clouds)
 
-    def _sample(self, ticket: int, generator: torch.Generator) -> CloudSample:
+    def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
         # Sample i shows object i modulo their number.
-        index = ticket * len(self._class_of) if ticket < self._first_alone else ticket
+        index = index * len(self._class_of) if index < self._first_alone else index
         if self._real is None or self.frames is None:
             return self.made.sample(index)
         if float(torch.rand((), generator=generator)) >= self.frames.share:
             return self.made.sample(index)
-        sample = self._real[shuffled_index(ticket, len(self._real), self.seed)]
+        sample = self._real[shuffled_index(index, len(self._real), self.seed)]
         angle = 2 * math.pi * float(torch.rand((), generator=generator))
         return _rolled(sample, angle) if self.frames.with_roll else sample
 
@@ -219,7 +219,7 @@ def read_models(
 
     Args:
         config: which.
-        tell: told of symmetries that were found and are not declared, taken or not.
+        tell: called with symmetries that were found and are not declared, taken or not.
 
     Raises:
         InputError: none is named, or of two kinds, two have one name, or a file is damaged.

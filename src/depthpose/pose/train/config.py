@@ -1,11 +1,11 @@
-"""Knobs of a training of the direction network."""
+"""Settings of a training of the direction network."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
+from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
 
 
@@ -23,7 +23,7 @@ class ModelsConfig:
     """Folder of a data set, whose models are taken in place of CAD files."""
 
     parts: tuple[str, ...] = ()
-    """Names of made parts (bracket, flange, mug, connector, spool), in place of either."""
+    """Names of synthetic parts (bracket, flange, mug, connector, spool), in place of either."""
 
     objects: tuple[int, ...] = ()
     """Numbers of the data set's objects; none: all."""
@@ -46,7 +46,7 @@ class ModelsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:
-    """Annotated real frames among the made views."""
+    """Annotated real frames among the synthetic views."""
 
     folder: str = ""
     """Of a data set in BOP's or LineMOD's layout."""
@@ -55,7 +55,7 @@ class FramesConfig:
     """Which part of it."""
 
     share: float = 1.0
-    """Of the samples; the others are made."""
+    """Of the samples; the others are synthetic."""
 
     with_roll: bool = True
     """Turn the camera of a frame about its optical axis at random: as true as the frame."""
@@ -70,13 +70,13 @@ class FramesConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutConfig:
-    """Made views that validation looks at; no training sees one."""
+    """Synthetic views of the validation; no training uses one."""
 
     number: int = 25
     """Of each object at each occlusion."""
 
     occlusions: tuple[float, ...] = (0.0, 0.3)
-    """Shares of the silhouette that are hidden."""
+    """Occluded shares of the silhouette."""
 
     with_ransac: bool = True
     """Vote by RANSAC too."""
@@ -86,19 +86,19 @@ class HeldOutConfig:
         if self.number < 1 or not self.occlusions:
             raise InputError(
                 f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
-                "looked at; take 25 and (0.0, 0.3)"
+                "measured; take 25 and (0.0, 0.3)"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationConfig:
-    """Made views by which the refusal is chosen, after the training."""
+    """Synthetic views by which the refusal is chosen, after the training."""
 
     number: int = 600
     """Of each object; 0: nothing is ever refused for its risk."""
 
     occlusion: tuple[float, float] = (0.0, 0.6)
-    """Hidden shares of the silhouette, from easy to hard."""
+    """Occluded shares of the silhouette, from easy to hard."""
 
     max_wrong_share: float = 0.01
     """Wrong answers among the answers that are given."""
@@ -123,19 +123,19 @@ class PoseTraining:
     """What is learnt."""
 
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    """Made views to learn from."""
+    """Synthetic views to learn from."""
 
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
 
     first_alone: int = 0
-    """Made views at the start that all show the first object. Several objects together take long to
-    get beyond votes for the middle of the cloud; one alone does not, and the others follow it."""
+    """Synthetic views at the start that all show the first object. Several objects together take
+    long to get beyond votes for the middle of the cloud; one alone does not, the others follow."""
 
     cloud: CloudConfig = field(
         default_factory=lambda: CloudConfig(max_points=1000, with_shape=True)
     )
-    """Voxel size, points of a cloud, and what the network is told of each voxel."""
+    """Voxel size, points of a cloud, and what the network gets of each voxel."""
 
     network: ResUNetConfig = field(
         default_factory=lambda: ResUNetConfig(
@@ -147,8 +147,8 @@ class PoseTraining:
     start: str | None = None
     """Weights to begin with; those of other objects give all but the last layer."""
 
-    loss: Literal["mse", "cosine", "l1"] = "mse"
-    """How a direction is punished."""
+    loss: str = "mse"
+    """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
 
     confidence_weight: float = 0.1
     """Of the loss of the confidences, where the network has them."""
@@ -159,7 +159,7 @@ class PoseTraining:
     """The optimiser."""
 
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
-    """What validation looks at."""
+    """Views of the validation."""
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     """By what the refusal is chosen."""
@@ -175,6 +175,7 @@ class PoseTraining:
     """Write the weights in 16 bits."""
 
     def __post_init__(self) -> None:
-        """Refuse a negative number of views."""
+        """Refuse an unknown loss and a negative number of views."""
+        refuse_unknown("loss", self.loss, POINT_LOSSES)
         if self.first_alone < 0:
-            raise InputError(f"first_alone is {self.first_alone}; take 0 or more made views")
+            raise InputError(f"first_alone is {self.first_alone}; take 0 or more synthetic views")

@@ -43,8 +43,8 @@ _SYMMETRY_STEP = 0.2
 """Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
 that this network is left with."""
 _MEASURED = (
-    "Made views that no training saw, by hidden %, posed without ICP: the share with an ADD(-S) "
-    "below a tenth of the diameter (add_10), and the median ADD(-S) in diameters."
+    "Synthetic views that no training saw, by occluded %, posed without ICP: the share with an "
+    "ADD(-S) below a tenth of the diameter (add_10), and the median ADD(-S) in diameters."
 )
 """What the numbers of validation are."""
 
@@ -59,7 +59,7 @@ class CropSample(NamedTuple):
 
 
 class TrainingCrops:
-    """Each ticket a crop of a view, made or of a frame.
+    """A crop of a view, synthetic or of a frame, by sample index.
 
     Args:
         models: the objects; class k is ``models[k]``.
@@ -80,20 +80,20 @@ class TrainingCrops:
             self._real = frames.of_objects(*self._class_of)
 
     def __len__(self) -> int:
-        """Tickets of an epoch: each frame comes once, or as many as views are made."""
+        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
         if self._real is None or self.config.frames is None:
             return len(self.made)
         return max(1, round(len(self._real) / self.config.frames.share))
 
-    def __getitem__(self, ticket: int) -> CropSample:
-        """Make the sample of a ticket; one with too few pixels gives way to another.
+    def __getitem__(self, index: int) -> CropSample:
+        """Make the sample of an index; one with too few pixels is replaced by another.
 
         Raises:
             InputError: so many in a row have too few pixels that the config must be wrong.
         """
         for attempt in range(_TRIES):
             # Far beyond any training, and the same object.
-            sample = self._view(ticket + attempt * len(self.models) * 2**32)
+            sample = self._view(index + attempt * len(self.models) * 2**32)
             number = self._class_of[sample.input.object]
             crop = cut_depth(sample.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
@@ -104,13 +104,13 @@ class TrainingCrops:
             "pixels with a depth; bring the camera nearer (distance_m), or lower min_points"
         )
 
-    def _view(self, ticket: int) -> ViewSample:
+    def _view(self, index: int) -> ViewSample:
         if self._real is None or self.config.frames is None:
-            return self.made.view(ticket)
-        generator = ticket_generator(ticket, self.seed)
+            return self.made.view(index)
+        generator = ticket_generator(index, self.seed)
         if float(torch.rand((), generator=generator)) >= self.config.frames.share:
-            return self.made.view(ticket)
-        place = shuffled_index(ticket, len(self._real), self.seed)
+            return self.made.view(index)
+        place = shuffled_index(index, len(self._real), self.seed)
         return self._real.view(self._real.instances[place])
 
 
@@ -144,7 +144,7 @@ class DepthImageTask:
 
     @torch.no_grad()
     def validate(self) -> Evidence:
-        """Pose held-out views with the network as it stands, without ICP."""
+        """Pose held-out views with the current network, without ICP."""
         cpu = DepthImageNet(self.network.config)
         cpu.load_state_dict(self.network.state_dict())
         weights = PoseWeights(network=cpu, models=self.models, cloud=self.config.cloud,

@@ -1,4 +1,4 @@
-"""Held-out made views: how often does the network as it stands find the pose?"""
+"""Held-out synthetic views: how often does the current network find the pose?"""
 
 import dataclasses
 import math
@@ -30,9 +30,9 @@ _SURFACE = 1000
 
 
 class HeldOut:
-    """Clouds that are made once, and looked at again and again.
+    """Clouds that are rendered once, and measured at each validation.
 
-    Each is a rendering of its own at the full resolution; so many of each object stand at each
+    Each is a rendering of its own at the full resolution; so many of each object are at each
     occlusion. One that shows too few points to be posed counts as a failure.
 
     Args:
@@ -158,7 +158,7 @@ in diameters, None where there is no answer."""
 
 
 def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationConfig) -> PoseWeights:
-    """Choose when answers are withheld, on made views from easy to hard.
+    """Choose when answers are withheld, on synthetic views from easy to hard.
 
     Where not one view is answered there is nothing to choose by, and the weights stay as they are.
     Where none of the first 50 of each object is right, no more are looked at.
@@ -192,7 +192,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     return dataclasses.replace(weights, refusal=refusal)
 
 
-def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:
+def score_held_out(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:
     """Count right, wrong and refused answers of the whole estimator, by occlusion."""
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
@@ -212,16 +212,16 @@ def judged(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> 
 def table_text(table: Table) -> str:
     """Show what was counted, for people."""
     lines = [
-        "Made views that no training saw, posed with voting, ICP and refusal; right is an "
+        "Synthetic views that no training saw, posed with voting, ICP and refusal; right is an "
         "ADD(-S) below a tenth of the diameter.",
         "",
-        "| hidden % | right % | wrong % | refused % | median error, % of diameter |",
+        "| occluded % | right % | wrong % | refused % | median error, % of diameter |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for hidden, row in table.items():
+    for occlusion, row in table.items():
         given = [row[k] for k in ("right", "wrong", "refused", "median")]
         values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
-        lines.append(f"| {hidden} | {values} |")
+        lines.append(f"| {occlusion} | {values} |")
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Annotated images by ticket, randomly changed."""
+"""Annotated images by sample index, randomly changed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -109,7 +109,7 @@ class AnnotatedImages:
 
 
 class TrainingImages:
-    """Each ticket an image, randomly changed and cut.
+    """An image by sample index, randomly changed and cut.
 
     Args:
         images: to draw from.
@@ -132,10 +132,10 @@ class TrainingImages:
         """Images of an epoch."""
         return len(self.images)
 
-    def __getitem__(self, ticket: int) -> LabelledImage:
-        """Make the sample of a ticket."""
-        generator = ticket_generator(ticket, self.seed)
-        given = self.images[shuffled_index(ticket, len(self), self.seed)]
+    def __getitem__(self, index: int) -> LabelledImage:
+        """Make the sample of an index."""
+        generator = ticket_generator(index, self.seed)
+        given = self.images[shuffled_index(index, len(self), self.seed)]
         scale = self._long_side_px / max(given.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
         changed = cut_window(given, scale, self.config.crop_px, generator)
@@ -182,15 +182,15 @@ def jitter_colors(
 def _corner(
     labels: Int[Tensor, "h w"], size: tuple[int, int], generator: torch.Generator
 ) -> tuple[int, int]:
-    room = [side - part for side, part in zip(labels.shape, size, strict=True)]
+    slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
     shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
     if not len(shown):
-        return whole(generator, room[0] + 1), whole(generator, room[1] + 1)
+        return whole(generator, slack[0] + 1), whole(generator, slack[1] + 1)
     chosen = labels == shown[whole(generator, len(shown))]
     middle = chosen.nonzero().float().mean(0).tolist()
     corner = [
         min(max(round(at - part / 2), 0), most)
-        for at, part, most in zip(middle, size, room, strict=True)
+        for at, part, most in zip(middle, size, slack, strict=True)
     ]
     return corner[0], corner[1]
 

@@ -1,4 +1,4 @@
-"""Knobs of the trainings of the baselines: the same views, other networks."""
+"""Settings of the trainings of the baselines: the same views, other networks."""
 
 from dataclasses import dataclass, field
 
@@ -33,7 +33,7 @@ class DepthImageTraining:
     """What is learnt."""
 
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    """Made views to learn from."""
+    """Synthetic views to learn from."""
 
     frames: FramesConfig | None = None
     """Real frames to learn from, beside them."""
@@ -56,7 +56,7 @@ class DepthImageTraining:
     """The optimiser."""
 
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
-    """What validation looks at."""
+    """Views of the validation."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(
@@ -137,7 +137,7 @@ class SegmentationTraining:
     """What is learnt from; pixels that no mask covers are background."""
 
     held_out: ImagesConfig | None = None
-    """Images that validation looks at."""
+    """Images of the validation."""
 
     network: SegmentationConfig = field(default_factory=SegmentationConfig)
     """The network."""

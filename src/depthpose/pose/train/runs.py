@@ -18,7 +18,7 @@ from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import TrainingClouds, read_models
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.depth_image import train_depth_image
-from depthpose.pose.train.held_out import HeldOut, calibrated, judged, table_text
+from depthpose.pose.train.held_out import HeldOut, calibrated, score_held_out, table_text
 from depthpose.pose.train.other_configs import (
     DepthImageTraining,
     PointNetTraining,
@@ -70,7 +70,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         on_step=run.on_step,
     )
     if run.tell is not None:
-        run.tell("trained; now the refusal is calibrated and judged on made views: minutes")
+        run.tell("trained; now the refusal is calibrated and measured on synthetic views: minutes")
     if isinstance(network, PointNet):
         return _leave(run.folder / "pointnet.safetensors", network, models, config, seconds)
     return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
@@ -82,7 +82,7 @@ def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
     Args:
         weights: of a network of directions, with the meshes of its objects.
         out: the file to write.
-        config: how views are made, how many calibrate, and how many judge.
+        config: how views are made, how many calibrate, and how many measure.
 
     Returns:
         What was counted on views that did not calibrate, for people.
@@ -100,12 +100,12 @@ def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
     chosen = calibrated(found, config.objects, config.calibration)
     if chosen is found:
         raise InputError(
-            f"{weights}: answered not one made view, so nothing can be chosen; give the training's "
-            "own --config, whose distances and sensor the views have, or train longer"
+            f"{weights}: answered not one synthetic view, so nothing can be chosen; give the "
+            "training's own --config, whose distances and sensor the views have, or train longer"
         )
     with_half = all(torch.equal(p, p.half().float()) for p in found.network.parameters())
     write_pose_weights(out, chosen, with_half=with_half)
-    return table_text(judged(read_pose_weights(out), config.objects, config.held_out))
+    return table_text(score_held_out(read_pose_weights(out), config.objects, config.held_out))
 
 
 STAGES = {
@@ -124,13 +124,13 @@ def _leave(
     config: PoseTraining,
     seconds: float,
 ) -> Path:
-    """Calibrate the refusal, write the weights, judge what the file holds, and write its card."""
+    """Calibrate the refusal, write the weights, measure the file, and write its card."""
     if find_shard().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     weights = _as_written(packed(network, models, config), with_half=config.with_half)
     weights = calibrated(weights, config.objects, config.calibration)
     write_pose_weights(path, weights, with_half=config.with_half)
-    table = judged(read_pose_weights(path), config.objects, config.held_out)
+    table = score_held_out(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
     leave_card(
         path, train_words(path.stem, config), seconds, card_facts(weights), table_text(table)
@@ -154,7 +154,7 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
     """Copy weights; of other objects, all but the last layer.
 
     Written weights are folded: they have no norms, but biases. Batch norm takes both up. What they
-    were not told of a voxel, they begin by not listening to.
+    were not given for a voxel, they are ignored at first.
 
     Raises:
         InputError: a network of another shape.
@@ -165,10 +165,10 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
-    for knob, value in wanted.items():
-        if knob not in free and given.get(knob) != value:
+    for name, value in wanted.items():
+        if name not in free and given.get(name) != value:
             raise InputError(
-                f"{start}: was trained with {knob} = {given.get(knob)!r}, but the config says "
+                f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
     if (
@@ -176,7 +176,7 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
         and isinstance(found, ResUNet)
         and network.config.norm != "none"
     ):
-        batch = clouds.collate([clouds[ticket] for ticket in range(_LIKE_THOSE_TO_COME)])
+        batch = clouds.collate([clouds[index] for index in range(_LIKE_THOSE_TO_COME)])
         unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
         return
     state = found.state_dict()

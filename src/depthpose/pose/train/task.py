@@ -49,7 +49,7 @@ class PoseTask:
         self._copies_m = keypoint_copies(models)
 
     def step(self, batch: CloudBatch) -> Iterator[Turn]:
-        """One turn: all clouds at once."""
+        """One turn of the loop: all clouds at once."""
         instance = batch.instance
         outputs = self.network.directions(batch.seen).float()
         found, copies_m = outputs[..., :3], self._posed(batch)
@@ -61,7 +61,7 @@ class PoseTask:
         yield Turn("network", loss, facts)
 
     def validate(self) -> Evidence:
-        """Pose held-out views with the network as it stands."""
+        """Pose held-out views with the current network."""
         if self.held_out is None:
             return Evidence()
         self.network.eval()
@@ -97,19 +97,19 @@ def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes cop
 _SAID = 3
 """Turns of an object that look nearly alike, on a card."""
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
-"""Knobs of the loop that change no weight: a resumed run may have others."""
+"""Settings of the loop that change no weight: a resumed run may have others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Where a training lives, and who watches.
+    """Folder of a training, and callbacks.
 
     Attributes:
         folder: the run folder; the weights lie in it, named after what was trained.
         resume: go on from its last state.
         finish: make weights of its last state, without another step.
-        on_step: told after each step.
-        tell: told what a person should know before it begins.
+        on_step: called after each optimiser step.
+        tell: called with what a person should know before it begins.
     """
 
     folder: Path
@@ -120,7 +120,7 @@ class Run:
 
     @property
     def words(self) -> dict[str, Any]:
-        """What the loop is told of it."""
+        """Arguments of the loop."""
         return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
@@ -138,8 +138,8 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     settings = {"stage": type(config).__name__, **config_to_dict(config)}
     settings["loop"] = {k: v for k, v in settings["loop"].items() if k not in _FREE}
     settings["loop"]["processes"] = find_shard().world
-    for judged in ("held_out", "calibration"):  # no weight of the network follows from these
-        settings.pop(judged, None)
+    for unrelated in ("held_out", "calibration"):  # no weight of the network follows from these
+        settings.pop(unrelated, None)
     settings["sha256"] = [file_sha256(Path(path)) for path in files]
     if config.start is not None:
         settings["start_sha256"] = file_sha256(find_weights(config.start))
@@ -150,7 +150,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
 
 
 def train_words(what: str, config: Any) -> str:  # noqa: ANN401
-    """Give the words of the command that trains this, the CAD files among them, for the card."""
+    """Give the command that trains this, with its CAD files, for the card."""
     cad = [word for path in config.models.cad for word in ("--cad", path)]
     unit = ["--unit", config.models.unit] if cad else []
     return shlex.join(["pose", "train", "--what", what, *cad, *unit])
@@ -165,7 +165,9 @@ def packed(
     frames: FramesConfig | None = config.frames
     cloud: CloudConfig = config.cloud
     names = ", ".join(model.name for model in models)
-    source = "made views" if frames is None else f"{Path(frames.folder).name} and made views"
+    source = (
+        "synthetic views" if frames is None else f"{Path(frames.folder).name} and synthetic views"
+    )
     facts = {
         "trained_on": f"{source} of {names}",
         "licence": config.models.licence,

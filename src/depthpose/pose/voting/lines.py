@@ -13,7 +13,7 @@ from depthpose.pose.types import Vote
 _SMALLEST = 1e-12
 _NEAREST = 0.1
 """Points nearer to a keypoint than this share of the mean distance weigh no more: a point on the
-keypoint would outvote all others, and its direction means nothing."""
+keypoint would outweigh all others, and its direction means nothing."""
 
 Lines = tuple[Tensor, Tensor, Tensor]
 """Points (..., 1, 3, n) about their mean, unit directions (..., k, 3, n), weights (..., k, n)."""
@@ -39,7 +39,7 @@ def meet_lines(
     then infinite and the point arbitrary along them.
 
     Args:
-        points_m: where the votes stand.
+        points_m: where the votes start.
         directions: of any length; a zero direction does not vote.
         weight: 0 leaves a vote out (padding, outliers); None counts all alike.
         refinements: steps after the nearest point.

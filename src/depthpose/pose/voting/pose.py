@@ -28,7 +28,7 @@ def fit_pose(
 
     Args:
         keypoints_m: found, in the camera frame.
-        covariance_m2: of each; a floor keeps exact keypoints finite.
+        covariance_m2: of each; a lower bound keeps exact keypoints finite.
         model_keypoints_m: known, in the model frame.
         is_used: which count; None: all. Three at least, not on a line.
 
@@ -63,7 +63,7 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
     """Give the motions of the camera frame that turn the object about its axes of revolution.
 
     Unit vectors of (rotation, translation): along them no observation says anything, the variance
-    is infinite, and the pose stands all the same. Two axes make a ball, which is free to turn
+    is infinite, and the pose is valid all the same. Two axes make a ball, which is free to turn
     about the third too.
     """
     rows = []
@@ -136,8 +136,8 @@ def consistent_keypoints(
     """Outvote keypoints until no pair of those that stay breaks its distance.
 
     In each round the keypoint in most broken pairs goes; of equals the one with the larger sum of
-    errors. Two keypoints that are wrong together by a common motion cannot be told from right ones
-    by this test, except where they are in the minority.
+    errors. Two keypoints that are wrong together by a common motion cannot be distinguished from
+    right ones by this test, except where they are in the minority.
 
     Args:
         keypoints_m: found.

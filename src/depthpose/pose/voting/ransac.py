@@ -1,4 +1,4 @@
-"""RANSAC: pairs of points propose keypoints, all points judge them, those that agree refit."""
+"""RANSAC: pairs of points propose keypoints, all points score them, those that agree refit."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from depthpose.pose.voting.lines import Lines, locate, meet_prepared, prepare_li
 
 _PARALLEL = 1e-6
 _BLOCK = 2**17
-"""Votes judged at a time on a CPU. All blocks of a call share two pieces of memory that stay in its
+"""Votes scored at a time on a CPU. All blocks of a call share two pieces of memory that stay in its
 cache: fresh megabytes for each call cost three times the arithmetic in page faults alone. A GPU is
 given everything at once."""
 
@@ -31,7 +31,7 @@ def vote_ransac(
     then by what those agree on.
 
     Args:
-        points_m: where the votes stand.
+        points_m: where the votes start.
         directions: of any length; a zero direction does not vote.
         weight: 0 leaves a vote out; None counts all alike.
         config: number of hypotheses, test for inliers, seed.
@@ -42,14 +42,14 @@ def vote_ransac(
     config = VotingConfig() if config is None else config
     lines, centre_m = prepare_lines(points_m, directions, weight)
     tried, is_crossing = cross_lines(lines, *draw_pairs(lines[2], config.hypotheses, config.seed))
-    judge = Judge(lines, config)
+    inlier_test = InlierTest(lines, config)
     # Parallel pairs propose nothing, yet score 0 so that one always wins.
-    best = torch.where(is_crossing, judge.score(tried), 0).argmax(-1)[..., None, None]
+    best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
     keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
     # Once toward what the best hypothesis gathered, then with those that agree on that.
-    used, _ = _inliers(lines, judge, keypoint)
+    used, _ = _inliers(lines, inlier_test, keypoint)
     keypoint = locate((*lines[:2], used), min(config.refinements, 1))[..., None, :]
-    used, share = _inliers(lines, judge, keypoint.to(centre_m))
+    used, share = _inliers(lines, inlier_test, keypoint.to(centre_m))
     vote = meet_prepared((*lines[:2], used), centre_m, config.refinements)
     return replace(vote, inlier_share=share)
 
@@ -94,7 +94,7 @@ def cross_lines(
     return ((on_first + on_second) / 2).mT, is_crossing.squeeze(-2)
 
 
-class Judge:
+class InlierTest:
     """Says which lines agree with which hypotheses.
 
     Both tests compare polynomials in the hypothesis h, and so are two products of matrices:
@@ -167,12 +167,12 @@ def _pick(lines: Lines, index: Int64[Tensor, "*batch k h"]) -> tuple[Tensor, Ten
 
 
 def _inliers(
-    lines: Lines, judge: Judge, keypoint: Float[Tensor, "*batch k 1 3"]
+    lines: Lines, inlier_test: InlierTest, keypoint: Float[Tensor, "*batch k 1 3"]
 ) -> tuple[Float[Tensor, "*batch k n"], Float[Tensor, "*batch k"]]:
     """Give the weights of the lines that agree with a keypoint, and their share."""
     w = lines[2]
-    kept = judge.agree(keypoint).squeeze(-2) * w
+    kept = inlier_test.agree(keypoint).squeeze(-2) * w
     is_enough = (kept > 0).sum(-1, keepdim=True) >= 3
-    # Where fewer agree than fix a point with its covariance all votes speak; a share of 0 tells.
+    # Where fewer agree than fix a point with its covariance all votes are used; the share is 0.
     share = torch.where(is_enough, kept, 0).sum(-1) / w.sum(-1)
     return torch.where(is_enough, kept, w), share
