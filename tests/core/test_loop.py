@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from depthpose.core.loop import (
     ticket_generator,
     train,
 )
+from depthpose.core.loop.host import Arithmetic
 
 PROGRAM = Path(__file__).with_name("loop_task.py")
 
@@ -426,6 +428,51 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
 def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'fp16' cannot be used here: it needs a GPU"):
         trained(tmp_path, loop(precision="fp16"))
+
+
+class Scaled(Arithmetic):
+    """The scaler of fp16, but in fp32: times a power of two and back is exact."""
+
+    def __init__(self, config: LoopConfig, device: torch.device) -> None:
+        super().__init__(replace(config, precision="fp32"), device)
+        self.scaler = torch.amp.GradScaler(device.type)
+
+
+def test_scaling_the_loss_changes_no_weight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = trained(tmp_path / "fp32", loop(clip_norm=0.1))
+    monkeypatch.setattr("depthpose.core.loop.loop.Arithmetic", Scaled)
+    assert_equal(weights(exact), weights(trained(tmp_path / "scaled", loop(clip_norm=0.1))))
+    interrupted(tmp_path / "parts", loop(clip_norm=0.1), after=5)
+    assert torch.load(tmp_path / "parts/state.pt", weights_only=True)["scaler"]["scale"] == 65536
+    parts = trained(tmp_path / "parts", loop(clip_norm=0.1), resume=True)
+    assert_equal(weights(exact), weights(parts))
+
+
+@pytest.mark.skipif(not computes_bf16("cpu"), reason="no arithmetic for bf16")
+def test_trainings_of_one_process_may_differ_in_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """accelerate keeps that of the first, and what would change it is private."""
+    monkeypatch.delattr("accelerate.state.AcceleratorState._reset_state")
+    exact = trained(tmp_path / "fp32", loop())
+    rounded = trained(tmp_path / "bf16", loop(precision="bf16"))
+    again = trained(tmp_path / "again", loop())
+    assert_equal(weights(exact), weights(again))
+    pairs = zip(weights(exact).values(), weights(rounded).values(), strict=True)
+    assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_a_device_beside_that_of_an_earlier_training_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise ValueError("AcceleratorState has already been initialized")
+
+    monkeypatch.setattr("accelerate.Accelerator", refuse)
+    with pytest.raises(InputError, match=r"device 'cpu' .* in a process of its own \(Accel"):
+        trained(tmp_path, loop())
 
 
 def test_each_epoch_is_a_shuffle_of_its_own() -> None:

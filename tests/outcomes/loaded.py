@@ -4,8 +4,8 @@ from contextlib import suppress
 from importlib import import_module
 
 for name in (
-    "cli", "core.engine", "core.export", "core.loop", "demo", "depth.estimator",
-    "depth.datasets", "depth.evaluate", "depth.synthetic", "depth.train", "pose.datasets", "pose.estimator",
+    "cli", "core.engine", "core.export", "core.loop", "demo", "depth.datasets", "depth.estimator",
+    "depth.evaluate", "depth.synthetic", "depth.train", "pose.datasets", "pose.estimator",
     "pose.evaluate", "pose.synthetic", "pose.train", "report.depth", "report.pose",
 ):  # fmt: skip
     import_module(f"depthpose.{name}")

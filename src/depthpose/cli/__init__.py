@@ -115,6 +115,10 @@ COMMANDS = {
     "figure 3-4": ("thesis.figures:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis.figures:figure_3_5", "boxes of true and estimated poses"),
 }
+_GONE = {
+    ("export", "--format"): "ONNX is the one format; leave --format away",
+}
+"""Options of before, by the first word of their command, and what to do instead."""
 _THESIS = ("reproduce", "figure")
 """Groups of commands that make the tables and figures of the thesis again."""
 _EXIT_CODES = """exit codes:
@@ -214,6 +218,7 @@ def _split_command(given: list[str]) -> tuple[str | None, list[str]]:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    _refuse_gone(name, rest)
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
@@ -235,6 +240,13 @@ def _run(name: str, rest: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong words (2)
         return int(stop.code or 0)
+
+
+def _refuse_gone(name: str, rest: list[str]) -> None:
+    for word in rest:
+        option = word.partition("=")[0]
+        if remedy := _GONE.get((name.partition(" ")[0], option)):
+            raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
 
 
 def _explain(given: list[str]) -> int:
