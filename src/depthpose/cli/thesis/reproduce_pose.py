@@ -23,19 +23,19 @@ def table_3_1(
     pictures: int = 4,
     device: str = "cpu",
 ) -> int:
-    """Make table 3.1 again: the method beside its baselines, by object, on the same data.
+    """Reproduce table 3.1: the method beside its baselines, by object, on the same data.
 
     Give weights of the method first, then of the baselines (kinds pointnet and depth-image): each
     is run by the estimator of its kind. Writes rows.json, rows.csv, table.md (percent by object),
-    all.json (every number), instances.csv, report.md and report.html. The thesis's own numbers are
-    not in the text that is at hand: the differences are those of the first weights to the others.
+    all.json (every number), instances.csv, report.md and report.html. The thesis's own
+    numbers are not at hand: differences are those of the first weights to the others.
 
         depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
 
     Args:
-        weights: the method's, then those of each baseline; the word open3d is registration by
-            Open3D (an extra), which has none.
-        out: folder for all that is written.
+        weights: the method's, then those of each baseline; open3d is Open3D's registration
+            (an extra), which needs no weights.
+        out: folder to write to.
         linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
         bop: any other data set in BOP's layout.
         split: test, ...
@@ -53,7 +53,9 @@ def table_3_1(
     from depthpose.cli.thesis import views as pose_views
 
     if len(weights) < 2:
-        raise InputError("table 3.1 sets the method beside its baselines: give two weights or more")
+        raise InputError(
+            "table 3.1 compares the method with its baselines: give two weights or more"
+        )
     source = pose_views.Source(linemod=linemod, bop=bop, split=split, objects=objects)
     order = pose_reproducing.make_order("3.1", source, targets, pictures)
     rule = pose_reproducing.Rule(
@@ -79,7 +81,7 @@ def table_3_2(
     pictures: int = 4,
     device: str = "cpu",
 ) -> int:
-    """Make table 3.2 again: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
+    """Reproduce table 3.2: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
 
     Writes rows.json, rows.csv, table.md (percent by object), all.json (every number),
     instances.csv, report.md and report.html. Masks truth and predicted are two rows of ours.
@@ -87,7 +89,7 @@ def table_3_2(
         depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W --out out/table-3.2
 
     Args:
-        out: folder for all that is written.
+        out: folder to write to.
         weights: files or names.
         csv: BOP results of any method, each a row of ours.
         linemod: Linemod_preprocessed, or LineMOD in BOP's layout.
@@ -127,12 +129,12 @@ def table_3_3(
     made: int = 40,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
 ) -> int:
-    """Make table 3.3 again: RANSAC against least squares on the same directions of one network.
+    """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
 
     Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50,
     128 and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:
     success by ADD(-S) without ICP, and milliseconds of the vote alone, all in one process. Without
-    a data set the clouds are made views of the weights' objects.
+    a data set the clouds are synthetic views of the weights' objects.
 
         depthpose reproduce 3.3 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
@@ -143,7 +145,7 @@ def table_3_3(
         bop: any other data set in BOP's layout.
         split: test, ...
         objects: keep these alone, by name or number.
-        made: how many made views where no data set is given.
+        made: number of synthetic views where no data set is given.
         points: at most so many votes of a cloud; a block of rows each.
     """
     from depthpose.cli.thesis import pose_tables as pose_reproducing
