@@ -44,8 +44,8 @@ def reproduce(
         out: folder to write to.
         weights: weights files; 2.2 takes a stereo matcher's too.
         matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
-        train: training folders for two baselines (best depth of each row, nearest image).
-            '--beside' without a name: none.
+        beside: tables 2.1 and 2.3: weights of other methods, a row each; by default those that
+            ship. '--beside' without a name: none.
         train: training folders, for two baselines (best depth of each row, nearest image).
         train_without: names of training frames to leave out.
         protocol: how prediction and truth are compared; eigen-raw is the thesis's.

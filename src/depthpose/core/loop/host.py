@@ -81,13 +81,13 @@ def leave_signals_to_the_loop(_: int) -> None:
 
 
 class Wish:
-    """What whoever runs a training asked it to do, by signals."""
+    """What the user asked a training to do, by signals."""
 
     def __init__(self) -> None:
         self._asked: list[tuple[int, float]] = []
 
     def remember(self, number: int, _: FrameType | None) -> None:
-        """Take a signal; the first Ctrl-C is told what a second one does."""
+        """Remember a signal; at the first Ctrl-C print what a second one does."""
         if not self._asked and number == signal.SIGINT:
             os.write(2, _SECOND.encode())  # print may be at work itself
         self._asked.append((number, time.monotonic()))
@@ -108,8 +108,8 @@ class Wish:
 PATIENCE_S = 3.0
 """Between the first Ctrl-C and the second."""
 _SECOND = (
-    "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: what "
-    "follows the last step is done, and the weights are written.\n"
+    "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: the "
+    "weights of the steps so far are written.\n"
 )
 
 

@@ -37,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """Where a training is, for whoever shows it.
+    """How far a training is.
 
     Attributes:
         step: steps done.
@@ -66,13 +66,13 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
 
     Args:
         task: what is trained.
-        samples: training samples by ticket.
+        samples: training samples by index.
         config: how long and how.
         folder: the run folder.
-        resume: go on from the folder's last state, or, where it is damaged, with a notice from the
-            one before; the result is that of an uninterrupted run.
-        finish: take the steps of that state for all, and go no further.
-        on_step: told after each step, in the main process.
+        resume: go on from the folder's last state; if it is damaged, with a notice from the one
+            before. The result equals that of an uninterrupted run.
+        finish: make weights of that state, without further steps.
+        on_step: called after each step, in the main process.
 
     Returns:
         What it took, in seconds, together with the runs that it resumed.
@@ -233,7 +233,7 @@ class _Run:
         first = self.step * self.config.accumulate
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
-            batch_sampler=_Tickets(self, first),
+            batch_sampler=_SampleIndices(self, first),
             num_workers=self.config.workers,
             collate_fn=getattr(self.samples, "collate", None),
             pin_memory=self.accelerator.device.type == "cuda",
@@ -307,8 +307,8 @@ class _Run:
                     held.copy_(tensor)
 
 
-class _Tickets:
-    """Tickets of this process's micro-batches, from the first that is still to do.
+class _SampleIndices:
+    """Sample indices of this process's micro-batches, from the first that is still to do.
 
     Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N processes
     see in a step what one process sees that accumulates N times as much.

@@ -1,4 +1,4 @@
-"""The last two states of a training: written whole, and looked at before one is taken.
+"""The last two states of a training: written whole, and checked before one is used.
 
 ``state.pt`` is the last, ``state.before.pt`` the one before it.
 """
