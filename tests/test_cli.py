@@ -124,7 +124,9 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
         (["export", "depth", "--weights", "nowhere", "--out", "d.onnx"],
          "neither a file nor the name"),
         (["export", "depth", "--out", "d.engine"], "end the name in .onnx"),
-        (["export", "depth", "--out", "d.onnx", "--format", "engine"], "onnx"),
+        (["export", "depth", "--out", "d.onnx", "--format", "onnx"],
+         "'depthpose export depth' has no --format any more: ONNX is the one format"),
+        (["export", "pose", "--format=onnx", "--out", "p.onnx"], "leave --format away"),
     ],
 )  # fmt: skip
 def test_wrong_words_are_refused(

@@ -32,8 +32,8 @@ def test_doctor_names_what_is_here_and_tries_each_room(
     assert "extra dev" not in said
     assert "weights default: fakestereo, MIT" in said
     assert "weights parts: geoposenet, MIT" in said
-    assert "depth room: a pair shifted by 12 px was matched at 1" in said
-    assert "pose room: a made flange was posed " in said
+    assert "depth: a pair shifted by 12 px was matched at 1" in said
+    assert "pose: a synthetic flange was posed " in said
 
 
 @pytest.mark.parametrize(("plane", "code"), [(3, 0), (0, 1)])
@@ -45,7 +45,7 @@ def test_weights_without_a_matcher_are_tried_on_one_image(
     assert main(["doctor"]) == code
     said = capsys.readouterr()
     if plane:
-        assert "depth room: one image got a depth for 100% of its pixels, 15.0 m" in said.out
+        assert "depth: one image got a depth for 100% of its pixels, 15.0 m" in said.out
     else:
         assert "one image got a depth for 0% of its pixels" in said.err
 
@@ -59,5 +59,5 @@ def test_a_room_that_fails_is_named_and_the_other_is_tried(
     monkeypatch.setattr(GeoPoseNet, "load", refuse)
     assert main(["doctor"]) == 1
     said = capsys.readouterr()
-    assert "depth room: a pair" in said.out
-    assert "pose room: failed: InputError: weights 'parts': damaged" in said.err
+    assert "depth: a pair" in said.out
+    assert "pose: failed: InputError: weights 'parts': damaged" in said.err

@@ -14,8 +14,8 @@ from depthpose.core.loop import (
     LoopConfig,
     Turn,
     make_adam,
+    sample_generator,
     shuffled_index,
-    ticket_generator,
     train,
 )
 
@@ -23,13 +23,13 @@ ADAM = AdamConfig(learning_rate=0.01, schedule="cosine")
 
 
 class ToyTask:
-    """A regressor with dropout and batch norm, and a judge that takes the first turn."""
+    """A regressor with dropout and batch norm, and a discriminator that takes the first turn."""
 
     def __init__(self, pause_s: float = 0.0, factor: float = 1.0) -> None:
         torch.manual_seed(5)
         self.pause_s, self.factor = pause_s, factor
         layers = [nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.3), nn.Linear(8, 1)]
-        self.modules = {"regressor": nn.Sequential(*layers), "judge": nn.Linear(1, 1)}
+        self.modules = {"regressor": nn.Sequential(*layers), "discriminator": nn.Linear(1, 1)}
         self.optimizers = {
             n: (make_adam(m.parameters(), ADAM), ADAM) for n, m in self.modules.items()
         }
@@ -38,9 +38,11 @@ class ToyTask:
         time.sleep(self.pause_s)
         x, y = batch
         found = self.modules["regressor"](x)
-        judge = self.modules["judge"]
-        yield Turn("judge", (judge(found.detach()) - judge(y)).square().mean(), {})
-        loss = (found - y).square().mean() + 0.1 * judge(found).square().mean()
+        discriminator = self.modules["discriminator"]
+        yield Turn(
+            "discriminator", (discriminator(found.detach()) - discriminator(y)).square().mean(), {}
+        )
+        loss = (found - y).square().mean() + 0.1 * discriminator(found).square().mean()
         yield Turn("regressor", self.factor * loss, {"double": 2 * loss.detach()})
 
     def validate(self) -> Evidence:
@@ -52,9 +54,9 @@ class ToySamples:
     def __len__(self) -> int:
         return 20
 
-    def __getitem__(self, ticket: int) -> tuple[Tensor, Tensor]:
-        index = shuffled_index(ticket, 20, 3)
-        noise = torch.randn(3, generator=ticket_generator(ticket, 3))
+    def __getitem__(self, sample_index: int) -> tuple[Tensor, Tensor]:
+        index = shuffled_index(sample_index, 20, 3)
+        noise = torch.randn(3, generator=sample_generator(sample_index, 3))
         x = torch.tensor([index / 20, 1.0, -0.5]) + 0.1 * noise
         return x, x.sum(0, keepdim=True)
 

@@ -294,7 +294,7 @@ def test_terms_are_said_before_a_push(
     assert main(["weights", "push", str(path), "me/part"]) == 2
     said = capsys.readouterr()
     assert "For research alone." in said.out
-    assert "If you may, say --accept-terms" in said.err
+    assert "If you may, add --accept-terms" in said.err
     assert api.calls == []
     assert main(["weights", "push", str(path), "me/part", "--accept-terms"]) == 0
     assert "For research alone." in capsys.readouterr().out

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ from depthpose.core.loop import (
     held_out_text,
     leave_card,
     read_metrics,
+    sample_generator,
     shuffled_index,
-    ticket_generator,
     train,
 )
+from depthpose.core.loop.host import Arithmetic
 
 PROGRAM = Path(__file__).with_name("loop_task.py")
 
@@ -258,21 +260,21 @@ def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
     task = ToyTask()
 
     def note(_: Progress) -> None:
-        path.append(weights(task)["judge.weight"].clone())
+        path.append(weights(task)["discriminator.weight"].clone())
 
-    average = weights(task)["judge.weight"].clone()
+    average = weights(task)["discriminator.weight"].clone()
     config = loop(steps=6, ema_decay=0.8, validate_every_steps=100)
     train(task, ToySamples(), config, tmp_path, on_step=note)
     for step, weight in enumerate(path):
         decay = min(0.8, (1 + step) / (10 + step))
         average = decay * average + (1 - decay) * weight
-    torch.testing.assert_close(weights(task)["judge.weight"], average)
+    torch.testing.assert_close(weights(task)["discriminator.weight"], average)
 
 
 def test_validation_sees_the_average_and_leaves_the_weights(tmp_path: Path) -> None:
     class Watched(ToyTask):
         def validate(self) -> Evidence:
-            seen.append(weights(self)["judge.weight"].clone())
+            seen.append(weights(self)["discriminator.weight"].clone())
             return super().validate()
 
     seen: list[Tensor] = []
@@ -283,9 +285,9 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path: Path) -> N
     assert_equal(weights(plain), weights(task))
     three = trained(tmp_path / "five", loop(steps=12, ema_decay=0.8), on_step=None)
     assert len(seen) == 3
-    torch.testing.assert_close(seen[-1], weights(three)["judge.weight"])
+    torch.testing.assert_close(seen[-1], weights(three)["discriminator.weight"])
     state = torch.load(tmp_path / "watched" / "state.pt", weights_only=True)
-    assert not torch.equal(state["modules"]["judge"]["weight"], seen[-1])
+    assert not torch.equal(state["modules"]["discriminator"]["weight"], seen[-1])
 
 
 def test_a_folder_with_a_state_is_not_overwritten(tmp_path: Path) -> None:
@@ -369,28 +371,43 @@ def test_a_disk_without_links_keeps_two_states_too(
 
 
 def wider(state: dict[str, Any]) -> None:
-    state["modules"]["judge"]["weight"] = torch.zeros(1, 2)
+    state["modules"]["discriminator"]["weight"] = torch.zeros(1, 2)
 
 
 def moved(state: dict[str, Any]) -> None:
-    state["optimizers"]["judge"]["state"][0]["exp_avg"] = torch.zeros(7)
+    state["optimizers"]["discriminator"]["state"][0]["exp_avg"] = torch.zeros(7)
 
 
 def grouped(state: dict[str, Any]) -> None:
-    state["optimizers"]["judge"]["param_groups"][0]["params"] = [0]
+    state["optimizers"]["discriminator"]["param_groups"][0]["params"] = [0]
 
 
 def averaged(state: dict[str, Any]) -> None:
-    state["average"]["judge"]["bias"] = torch.zeros(())
+    state["average"]["discriminator"]["bias"] = torch.zeros(())
 
 
 UNFIT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "shape": (wider, r"judge: weight is \(1, 2\), not \(1, 1\); it is the state of another one"),
-    "optimiser": (moved, r"optimiser of judge: exp_avg of parameter 0 is \(7,\), not \(1, 1\)"),
-    "groups": (grouped, r"optimiser of judge: it moved groups of \[1\] parameters, not of \[2\]"),
-    "average": (averaged, r"average of judge: bias is \(\), not \(1,\)"),
-    "no module": (lambda s: s["modules"].pop("judge"), "not a readable state of this training"),
-    "no tensor": (lambda s: s["modules"]["judge"].pop("bias"), "judge: bias is missing"),
+    "shape": (
+        wider,
+        r"discriminator: weight is \(1, 2\), not \(1, 1\); it is the state of another one",
+    ),
+    "optimiser": (
+        moved,
+        r"optimiser of discriminator: exp_avg of parameter 0 is \(7,\), not \(1, 1\)",
+    ),
+    "groups": (
+        grouped,
+        r"optimiser of discriminator: it moved groups of \[1\] parameters, not of \[2\]",
+    ),
+    "average": (averaged, r"average of discriminator: bias is \(\), not \(1,\)"),
+    "no module": (
+        lambda s: s["modules"].pop("discriminator"),
+        "not a readable state of this training",
+    ),
+    "no tensor": (
+        lambda s: s["modules"]["discriminator"].pop("bias"),
+        "discriminator: bias is missing",
+    ),
     "no scaler": (lambda s: s.pop("scaler"), r"has no \['scaler'\], so it is no state"),
     "step": (lambda s: s.update(step="x"), "its step is 'x', where a whole number belongs"),
     "seconds": (lambda s: s.update(seconds=[]), "not a readable state of this training"),
@@ -428,6 +445,51 @@ def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:
         trained(tmp_path, loop(precision="fp16"))
 
 
+class Scaled(Arithmetic):
+    """The scaler of fp16, but in fp32: times a power of two and back is exact."""
+
+    def __init__(self, config: LoopConfig, device: torch.device) -> None:
+        super().__init__(replace(config, precision="fp32"), device)
+        self.scaler = torch.amp.GradScaler(device.type)
+
+
+def test_scaling_the_loss_changes_no_weight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = trained(tmp_path / "fp32", loop(clip_norm=0.1))
+    monkeypatch.setattr("depthpose.core.loop.loop.Arithmetic", Scaled)
+    assert_equal(weights(exact), weights(trained(tmp_path / "scaled", loop(clip_norm=0.1))))
+    interrupted(tmp_path / "parts", loop(clip_norm=0.1), after=5)
+    assert torch.load(tmp_path / "parts/state.pt", weights_only=True)["scaler"]["scale"] == 65536
+    parts = trained(tmp_path / "parts", loop(clip_norm=0.1), resume=True)
+    assert_equal(weights(exact), weights(parts))
+
+
+@pytest.mark.skipif(not computes_bf16("cpu"), reason="no arithmetic for bf16")
+def test_trainings_of_one_process_may_differ_in_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """accelerate keeps that of the first, and what would change it is private."""
+    monkeypatch.delattr("accelerate.state.AcceleratorState._reset_state")
+    exact = trained(tmp_path / "fp32", loop())
+    rounded = trained(tmp_path / "bf16", loop(precision="bf16"))
+    again = trained(tmp_path / "again", loop())
+    assert_equal(weights(exact), weights(again))
+    pairs = zip(weights(exact).values(), weights(rounded).values(), strict=True)
+    assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_a_device_beside_that_of_an_earlier_training_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise ValueError("AcceleratorState has already been initialized")
+
+    monkeypatch.setattr("accelerate.Accelerator", refuse)
+    with pytest.raises(InputError, match=r"device 'cpu' .* in a process of its own \(Accel"):
+        trained(tmp_path, loop())
+
+
 def test_each_epoch_is_a_shuffle_of_its_own() -> None:
     epochs = [[shuffled_index(20 * e + i, 20, 7) for i in range(20)] for e in range(2)]
     assert [sorted(epoch) for epoch in epochs] == [list(range(20))] * 2
@@ -435,8 +497,8 @@ def test_each_epoch_is_a_shuffle_of_its_own() -> None:
     assert epochs[0] != [shuffled_index(i, 20, 8) for i in range(20)]
 
 
-def test_a_ticket_draws_the_same_numbers_again() -> None:
-    one, again, other = (torch.rand(4, generator=ticket_generator(t, 1)) for t in (5, 5, 6))
+def test_a_sample_index_draws_the_same_numbers_again() -> None:
+    one, again, other = (torch.rand(4, generator=sample_generator(t, 1)) for t in (5, 5, 6))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
 

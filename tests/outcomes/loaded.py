@@ -4,9 +4,9 @@ from contextlib import suppress
 from importlib import import_module
 
 for name in (
-    "cli", "core.engine", "core.export", "core.loop", "core.report", "demo", "depth.estimator",
-    "depth.evaluate", "depth.kitti", "depth.streets", "depth.train", "pose.bop", "pose.estimator",
-    "pose.evaluate", "pose.objects", "pose.train", "pages.depth", "pages.pose",
+    "cli", "core.engine", "core.export", "core.loop", "demo", "depth.datasets", "depth.estimator",
+    "depth.evaluate", "depth.synthetic", "depth.train", "pose.datasets", "pose.estimator",
+    "pose.evaluate", "pose.synthetic", "pose.train", "report.depth", "report.pose",
 ):  # fmt: skip
     import_module(f"depthpose.{name}")
 for name in ("cv2", "onnxscript", "onnxruntime", "accelerate", "skimage", "tyro",

@@ -66,10 +66,10 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
 
 
 def ask(
-    client: TestClient, room: str, folder: Path, names: dict[str, str], **data: str
+    client: TestClient, kind: str, folder: Path, names: dict[str, str], **data: str
 ) -> Response:
     files = {field: (name, (folder / name).read_bytes()) for field, name in names.items()}
-    return client.post(f"/estimate/{room}", files=files, data=data)
+    return client.post(f"/estimate/{kind}", files=files, data=data)
 
 
 def refusal(response: Response) -> tuple[int, str]:
@@ -139,7 +139,7 @@ def test_what_is_sent_in_chunks_has_no_size(page: TestClient) -> None:
     response = page.post("/estimate/depth", headers=headers, content=b"x" * 5)
     status, said = refusal(response)
     assert status == 411
-    assert "send no chunks" in said
+    assert "comes in chunks" in said
 
 
 def test_a_guessed_focal_length_is_called_a_guess(page: TestClient, samples: Path) -> None:
@@ -238,24 +238,24 @@ def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
     found = ask(client, "depth", samples, one).json()
     assert found["said"].endswith(" m. 0% are sky.")
     picture, depth = found["pictures"][:2]
-    assert picture["caption"] == "the picture"
+    assert picture["caption"] == "the image"
     assert picture["size"] == depth["size"]
     assert "grey: sky or no answer" in depth["caption"]
     assert depth["scale"]["title"] == "depth [m]"
     assert [depth["scale"]["marks"][k] for k in (0, -1)] == [[0.0, "3"], [1.0, "80"]]
     assert 'placeholder="0.54"' not in html, "the value that makes depths 1.4 % too large"
     status, text = refusal(ask(client, "depth", samples, {**one, "right": "right.png"}))
-    assert (status, "answer one image alone: leave the right image away" in text) == (400, True)
+    assert (status, "take one image alone: remove the right image" in text) == (400, True)
 
 
 def test_examples_are_what_the_forms_take(page: TestClient, tmp_path: Path) -> None:
-    for room, named in (("depth", "camera image right"), ("pose", "camera depth mask")):
-        found = page.get(f"/examples/{room}").json()
+    for kind, named in (("depth", "camera image right"), ("pose", "camera depth mask")):
+        found = page.get(f"/examples/{kind}").json()
         assert sorted(one["field"] for one in found["files"]) == named.split()
         for one in found["files"]:
             (tmp_path / one["name"]).write_bytes(b64decode(one["data"]))
         files = {one["field"]: one["name"] for one in found["files"]}
-        answer = ask(page, room, tmp_path, files, **found["fields"]).json()
+        answer = ask(page, kind, tmp_path, files, **found["fields"]).json()
         assert answer["ok"], answer["said"]
     assert page.get("/examples/kitchen").status_code == 404
 
@@ -383,8 +383,8 @@ def test_a_depth_image_without_a_mask_is_searched(
 @pytest.mark.parametrize(
     ("files", "data", "said"),
     [
-        ({"depth": "depth.png"}, {"object": PART}, "focal length: a depth image becomes points"),
-        ({"depth": "depth.png", "mask": "mask.png"}, {"object": PART}, "focal length: a depth"),
+        ({"depth": "depth.png"}, {"object": PART}, "focal length: without it a depth image"),
+        ({"depth": "depth.png", "mask": "mask.png"}, {"object": PART}, "focal length: without it"),
         (VIEW | {"mask": "left.png"}, {"object": PART}, "give the mask of this very image"),
         (VIEW, {"object": "teapot"}, "object 'teapot': the weights know"),
         (VIEW | {"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "mm"}, "choose one of"),
@@ -450,7 +450,7 @@ def test_what_is_too_large_is_refused_before_it_is_read(
 def test_a_request_without_a_size_is_refused(page: TestClient) -> None:
     response = page.post("/estimate/depth", content=iter([b"data"]))
     assert refusal(response) == (
-        411, "the request does not say its size (Content-Length alone); add it, and send no chunks"
+        411, "the request has no Content-Length, or comes in chunks; send it whole, with its size"
     )  # fmt: skip
 
 
@@ -481,7 +481,7 @@ def test_only_the_last_answers_are_kept(page: TestClient, samples: Path, truth: 
     assert refusal(page.get("/" + last["folder"] + "..%2Fother"))[0] == 404
 
 
-def test_unknown_rooms_and_fields_are_refused(page: TestClient, samples: Path) -> None:
+def test_unknown_kinds_and_fields_are_refused(page: TestClient, samples: Path) -> None:
     assert refusal(ask(page, "sound", samples, {}, a="b"))[0] == 404
     said = refusal(ask(page, "depth", samples, {"weights": "left.png"}))[1]
     assert "'weights' is no file field of this page" in said

@@ -97,13 +97,13 @@ def take(page: Page, within: str, name: str) -> bytes:
     return Path(waiting.value.path()).read_bytes()
 
 
-def send(page: Page, room: str, files: dict[str, Path]) -> str:
+def send(page: Page, kind: str, files: dict[str, Path]) -> str:
     """Choose files, press the button, and give the sentence that comes back."""
     for field, path in files.items():
-        page.locator(f"#{room} input[name={field}]").set_input_files(path)
-    page.locator(f"#{room} .go").click()
-    page.locator(f"#{room} .answer .said").wait_for()
-    return page.locator(f"#{room} .said").text_content() or ""
+        page.locator(f"#{kind} input[name={field}]").set_input_files(path)
+    page.locator(f"#{kind} .go").click()
+    page.locator(f"#{kind} .answer .said").wait_for()
+    return page.locator(f"#{kind} .said").text_content() or ""
 
 
 def test_depth_good(page: Page, address: str, samples: Path) -> None:
@@ -142,14 +142,14 @@ def test_depth_good(page: Page, address: str, samples: Path) -> None:
     assert picture_of(page, "#depth") != before, "the cloud turns"
 
 
-@pytest.mark.parametrize("room", ["pose", "depth"])
-def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, room: str) -> None:
-    page.goto(address if room == "pose" else f"{address}#depth")
-    assert page.locator(f"#{room}").is_visible(), "poses lead"
-    page.locator(f"#{room} .try").click()
-    page.locator(f"#{room} .answer .said").wait_for()
-    assert page.locator(f"#{room} .said.failed").count() == 0
-    assert page.locator(f"#{room} .drop.has").count() == 3
+@pytest.mark.parametrize("kind", ["pose", "depth"])
+def test_an_example_fills_the_form_and_is_answered(page: Page, address: str, kind: str) -> None:
+    page.goto(address if kind == "pose" else f"{address}#depth")
+    assert page.locator(f"#{kind}").is_visible(), "poses lead"
+    page.locator(f"#{kind} .try").click()
+    page.locator(f"#{kind} .answer .said").wait_for()
+    assert page.locator(f"#{kind} .said.failed").count() == 0
+    assert page.locator(f"#{kind} .drop.has").count() == 3
     page.set_viewport_size({"width": 400, "height": 900})
     page.wait_for_timeout(500)
     width = page.evaluate("document.documentElement.scrollWidth")
@@ -166,16 +166,16 @@ def test_terms_of_the_weights_are_read_with_the_answer(
         const terms = "For <b>research</b> alone";
         return new Response(JSON.stringify({ ...await answer.json(), terms }));
       };""")
-    rooms = {
+    kinds = {
         "depth": {"image": "left.png", "camera": "camera.json"},
         "pose": {"cloud": "cloud.ply"},
     }
-    for room, names in rooms.items():
-        page.goto(f"{address}#{room}")
+    for kind, names in kinds.items():
+        page.goto(f"{address}#{kind}")
         page.reload()
         page.locator("#pose details.box").evaluate("box => { box.open = true; }")
-        send(page, room, {field: samples / name for field, name in names.items()})
-        said = page.locator(f"#{room} [aria-live] .terms").text_content(timeout=5000)
+        send(page, kind, {field: samples / name for field, name in names.items()})
+        said = page.locator(f"#{kind} [aria-live] .terms").text_content(timeout=5000)
         assert said == "Terms of the weights: For <b>research</b> alone"
 
 
@@ -212,7 +212,7 @@ def test_pose_good(page: Page, address: str, samples: Path) -> None:
 def test_pose_bad(page: Page, address: str, samples: Path) -> None:
     page.goto(f"{address}#pose")
     said = send(page, "pose", {"depth": samples / "depth.png"})
-    assert "focal length: a depth image becomes points by it" in said
+    assert "focal length: without it a depth image has no size" in said
     page.reload()
     page.locator("#pose select[name=object]").select_option("spool")
     view = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
@@ -242,17 +242,17 @@ def test_a_report_turns_hides_sorts_and_needs_no_server(page: Page, tmp_path: Pa
         assert page.locator("td:first-child").all_text_contents() == order, click
 
 
-@pytest.mark.parametrize("room", ["depth", "pose"])
+@pytest.mark.parametrize("kind", ["depth", "pose"])
 def test_the_page_of_a_prediction_is_drawn(
-    page: Page, samples: Path, tmp_path: Path, room: str
+    page: Page, samples: Path, tmp_path: Path, kind: str
 ) -> None:
     given = {
         "depth": ["left.png", "--camera", "camera.json"],
         "pose": ["--depth", "depth.png", "--mask", "mask.png", "--camera", "view.json"],
-    }[room]
+    }[kind]
     words = [str(samples / word) if "." in word else word for word in given]
-    words += ["--object", PART] if room == "pose" else []
-    assert main([room, "predict", *words, "--out", str(tmp_path)]) == 0
+    words += ["--object", PART] if kind == "pose" else []
+    assert main([kind, "predict", *words, "--out", str(tmp_path)]) == 0
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.goto((tmp_path / "report.html").as_uri())
@@ -266,7 +266,7 @@ def test_the_page_of_a_prediction_is_drawn(
     assert picture_of(page, "body") != before, "the cloud turns"
     for picture in page.locator("img").all():
         assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)")
-    if room == "pose":
+    if kind == "pose":
         swatches = page.locator(".keys label", has_text="posed model").locator(".swatch")
         ink = swatches.first.evaluate("element => getComputedStyle(element).backgroundColor")
         assert ink == "rgb(38, 89, 255)"

@@ -1,7 +1,7 @@
-"""The command line: parse words, call one room, write what it returns.
+"""The command line: parse arguments, call a package, write what it returns.
 
-Only this room prints. A command's function is imported when it is named and imports what is heavy
-when it runs, so that every ``--help`` answers at once.
+Only commands print. A command's function is imported when it is named and imports what is heavy
+when it runs, so that every ``--help`` is quick.
 """
 
 import errno
@@ -21,10 +21,13 @@ from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest
 COMMANDS = {
     "demo": (
         "demo:demo",
-        "pose made parts, match a real pair, guess a street: out/demo/report.html",
+        "synthetic parts, a real pair, a street from one image: out/demo/report.html",
     ),
-    "doctor": ("doctor:doctor", "what is installed, and a try of each room; or what files are"),
-    "serve": ("serve:serve", "a page in your browser: both rooms, on this machine alone"),
+    "doctor": (
+        "doctor:doctor",
+        "what is installed, and a test of depth and pose; or what files are",
+    ),
+    "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": (
         "pose.commands:predict",
         "a cloud, a masked depth image, or a data set, to poses",
@@ -33,27 +36,27 @@ COMMANDS = {
     "pose train": ("pose.training:train", "your CAD file, or a config, to a network that poses it"),
     "pose calibrate": (
         "pose.training:calibrate",
-        "choose anew when poses of trained weights are withheld",
+        "choose anew how uncertain a pose may be before it is refused",
     ),
     "pose evaluate": ("pose.commands:evaluate", "measure poses on a BOP or LineMOD data set"),
     "depth match": ("depth.commands:match", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth.commands:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
         "depth.training:train",
-        "stages view, select, stereo, finetune: generator, matcher, one through the other",
+        "stages view, select, stereo, finetune: generator, matcher, both together",
     ),
     "depth calibrate": (
         "depth.training:calibrate",
-        "choose when an image is refused as unlike the known",
+        "choose how unlike its training data an image may be",
     ),
     "depth evaluate": ("depth.commands:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
         "data.making:make_streets",
-        "made streets with exact disparity and LiDAR, in KITTI's raw layout",
+        "synthetic streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
     "data make objects": (
         "data.making:make_objects",
-        "made frames of your CAD files on a table, in BOP's layout",
+        "synthetic frames of your CAD files on a table, in BOP's layout",
     ),
     "data rectify": (
         "data.rectifying:rectify",
@@ -61,7 +64,7 @@ COMMANDS = {
     ),
     "data check": (
         "data.commands:check",
-        "walk a dataset before hours of work and name what is wrong",
+        "read a whole data set and list what is wrong",
     ),
     "data label": (
         "data.commands:label",
@@ -77,20 +80,20 @@ COMMANDS = {
     ),
     "data duplicates": (
         "data.commands:duplicates",
-        "find evaluation images that a training set has seen",
+        "find evaluation images that are in a training set",
     ),
-    "weights list": ("weights:list_weights", "name the weights at hand"),
-    "weights show": ("weights:show_weights", "say what a weights file holds"),
+    "weights list": ("weights:list_weights", "list the weights"),
+    "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
     "weights complete": (
         "weights:complete_weights",
-        "put meshes into pose weights that came without",
+        "add meshes to pose weights that came without",
     ),
     "weights push": (
         "weights:push_weights",
         "upload weights and their card to the Hugging Face hub",
     ),
-    "weights import": ("weights:import_weights", "bring in a published checkpoint, safely"),
+    "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
     "reproduce": (
@@ -99,7 +102,7 @@ COMMANDS = {
     ),
     "reproduce all": (
         "thesis.reproduce_all:reproduce_all",
-        "every table of a chapter, trainings and all, from KITTI or LineMOD on disk",
+        "all tables of a chapter, trainings included, from KITTI or LineMOD on disk",
     ),
     "reproduce 3.1": (
         "thesis.reproduce_pose:table_3_1",
@@ -115,8 +118,12 @@ COMMANDS = {
     "figure 3-4": ("thesis.figures:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis.figures:figure_3_5", "boxes of true and estimated poses"),
 }
+_GONE = {
+    ("export", "--format"): "ONNX is the one format; leave --format away",
+}
+"""Options of before, by the first word of their command, and what to do instead."""
 _THESIS = ("reproduce", "figure")
-"""Groups of commands that make the tables and figures of the thesis again."""
+"""Groups of commands that reproduce the thesis."""
 _EXIT_CODES = """exit codes:
   0    done
   1    done, but something in the input failed (it is named)
@@ -125,8 +132,7 @@ _EXIT_CODES = """exit codes:
 
 
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
-"""What a disk refuses where a library writes, or a temporary file; our writers say it themselves.
-"""
+"""Errors of a disk where a library or a temporary file writes; our own writers catch them."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -175,7 +181,7 @@ def _said_of(error: OSError) -> str:
 
 
 def _say_version() -> int:
-    """Say what a report of a problem begins with."""
+    """Print the versions that a bug report needs."""
     from depthpose.cli.doctor import device_names
 
     versions = f"torch {version('torch')}, Python {platform.python_version()}"
@@ -214,6 +220,7 @@ def _split_command(given: list[str]) -> tuple[str | None, list[str]]:
 def _run(name: str, rest: list[str]) -> int:
     import tyro
 
+    _refuse_gone(name, rest)
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
@@ -233,8 +240,15 @@ def _run(name: str, rest: list[str]) -> int:
             args=rest,
             config=(tyro.conf.PositionalMetavarFromFieldName,),
         )
-    except SystemExit as stop:  # tyro has printed help (0) or the wrong words (2)
+    except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
+
+
+def _refuse_gone(name: str, rest: list[str]) -> None:
+    for word in rest:
+        option = word.partition("=")[0]
+        if remedy := _GONE.get((name.partition(" ")[0], option)):
+            raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
 
 
 def _explain(given: list[str]) -> int:

@@ -10,17 +10,16 @@ _OF_DEPTHS = ("scene", "method", "sees", "abs_rel", "rmse", "d1", "epe_px")
 def demo(
     out: Path = Path("out/demo"), weights: str = "default", pose_weights: str = "parts"
 ) -> int:
-    """Pose made parts, estimate depth of a real pair and of a street; write a page about it.
+    """Pose synthetic parts, estimate depth of a real pair and of a street; write a page about it.
 
-    Needs no network and no data. Five made parts on a table are posed from a depth image. The real
-    pair comes with scikit-image (the extra 'demo'); without it the page shows the street alone,
-    whose depth is known exactly: it is estimated from both images and from one, beside OpenCV's
-    StereoSGBM.
+    Needs no network and no data. Five synthetic parts on a table are posed from a depth image. The
+    depth of a synthetic street is estimated from both images and from one, and compared with the
+    truth and with OpenCV's StereoSGBM. The real pair comes with scikit-image (the extra 'demo').
 
     Args:
-        out: folder for the pictures, the maps, the poses and report.html.
+        out: folder for pictures, maps, poses and report.html.
         weights: of the depth networks, by name or file ('depthpose weights list').
-        pose_weights: of a pose network that knows made parts, by name or file.
+        pose_weights: of a pose network for these parts, by name or file.
     """
     from functools import partial
 

@@ -19,27 +19,27 @@ if TYPE_CHECKING:
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
 _EXTRAS_OF_OURS = ("dev",)
-"""Extras that nobody needs who only uses the package."""
+"""Extras for those who develop the package."""
 
 _SHIFT_PX = 12
-"""Of the pair that the depth room is tried on."""
+"""Disparity of the pair that depth is tested with."""
 
 
 def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
-    """Say what this installation has and try each room; or look at the files you mean to use.
+    """Check this installation, or the files that you want to use.
 
-    Without files: versions, devices, extras (and how to install what lacks), weights, and one small
-    estimate of each room. Put what it prints into a report of a problem. With files: what each is,
-    in which unit, and what is odd about it, alone and beside the others: pictures (two of one size
-    are a pair, left first), depth maps, cameras, clouds, meshes, masks. Exit code 1: an estimate
-    failed, or something is odd.
+    Without files: versions, devices, extras (and how to install missing ones), weights, and one
+    small estimate of depth and of a pose; put this into a bug report. With files: what each is, in
+    which unit, and what is odd about it, alone and together with the others: images (two of one
+    size are a pair, left first), depth maps, cameras, clouds, meshes, masks. Exit code 1: an
+    estimate failed, or something is odd.
 
         depthpose doctor
         depthpose doctor left.png right.png camera.yaml
         depthpose doctor depth.png mask.png camera.json part.stl cloud.ply
 
     Args:
-        files: what you are about to use.
+        files: images, cameras, clouds, ... of one job.
     """
     if files:
         from depthpose.cli.doctor_files import look_at_all
@@ -51,8 +51,8 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
     for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
     print(*_extras(), *_weights(), sep="\n")
-    tries = {"depth room": _try_depth, "pose room": _try_pose}
-    works = [_tried(room, work) for room, work in tries.items()]
+    tries = {"depth": _try_depth, "pose": _try_pose}
+    works = [_tried(what, work) for what, work in tries.items()]
     return 0 if all(works) else 1
 
 
@@ -101,19 +101,19 @@ def _weights() -> Iterator[str]:
             yield f"weights {path.stem}: {found.kind}, {found.facts.get('licence', 'no licence')}"
 
 
-def _tried(room: str, work: Callable[[], str]) -> bool:
+def _tried(what: str, work: Callable[[], str]) -> bool:
     began = perf_counter()
     try:
         said = work()
     except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
-        print(f"{room}: failed: {type(error).__name__}: {error}", file=sys.stderr)
+        print(f"{what}: failed: {type(error).__name__}: {error}", file=sys.stderr)
         return False
-    print(f"{room}: {said}, {perf_counter() - began:.1f} s with loading")
+    print(f"{what}: {said}, {perf_counter() - began:.1f} s with loading")
     return True
 
 
 def _try_depth() -> str:
-    """Match a pair whose disparity is known everywhere; or see one image, without a matcher."""
+    """Match a pair of known disparity; without a matcher, take one image."""
     import torch
 
     from depthpose.depth.estimator import FakestereoNet
@@ -134,7 +134,7 @@ def _try_depth() -> str:
 
 
 def _try_one_image(net: "FakestereoNet", image: "Tensor") -> str:
-    """Ask for the depth of an image of which nothing is known."""
+    """Estimate the depth of one image."""
     import torch
 
     from depthpose.core.camera import Camera
@@ -151,7 +151,7 @@ def _try_one_image(net: "FakestereoNet", image: "Tensor") -> str:
 
 
 def _try_pose() -> str:
-    """Pose a part in a view that is made on the spot."""
+    """Pose a part in a synthetic view."""
     from depthpose.pose.config import ObjectsConfig
     from depthpose.pose.estimator import GeoPoseNet
     from depthpose.pose.metrics import adds_m
@@ -162,9 +162,9 @@ def _try_pose() -> str:
     view = Objects((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(0)
     (found,) = net.estimate_many([view.input])
     if found.camera_from_model is None:
-        raise RuntimeError(f"a made view of a flange was refused: {found.reason}")
+        raise RuntimeError(f"a synthetic view of a flange was refused: {found.reason}")
     off_m = adds_m(found.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
-    said = f"a made flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
+    said = f"a synthetic flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
     if off_m > flange.diameter_m / 10:
         raise RuntimeError(said)
     return said

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # --help imports this module and must answer at once
 @group
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """Where the work is done."""
+    """Where the work is done: in this process, or by Ray."""
 
     engine: Literal["here", "ray"] = "here"
     """here: in this process, a file for each result. ray: by workers of a Ray cluster (an extra),
@@ -30,23 +30,23 @@ class EngineOptions:
     address: str | None = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
     workers: int | None = None
-    """at most; by default as many as the cluster has room for."""
+    """at most; by default as many as fit into the cluster."""
     worker_cpus: float = 1.0
-    """cores that each worker asks for."""
+    """cores of each worker."""
     worker_gpus: float = 0.0
-    """GPUs that each worker asks for (with --device cuda); 0.5 lets two share one."""
+    """GPUs of each worker (with --device cuda); with 0.5 two share one."""
     block: int = 64
-    """inputs to a shard: what the death of a worker costs at most."""
+    """inputs of a shard, which are done again when their worker dies."""
     shards: Literal["tar", "parquet"] = "tar"
     """format of the results."""
 
     @property
     def is_ray(self) -> bool:
-        """Whether a cluster does the work; other options mean nothing without."""
+        """Whether a cluster does the work; the other options are refused without."""
         if self.engine == "here" and self != EngineOptions():
             raise InputError(
                 "--address, --workers, --worker-cpus, --worker-gpus, --block and --shards are for "
-                "--engine ray; add it, or leave them away"
+                "--engine ray; add it, or remove them"
             )
         return self.engine == "ray"
 
@@ -64,7 +64,7 @@ class EngineOptions:
                 f"and --worker-gpus {self.worker_gpus}: take at least 1, 1, 0 and 0"
             )
         if not self.worker_cpus + self.worker_gpus:
-            raise InputError("a worker asks for no core and no GPU; give --worker-cpus 1")
+            raise InputError("a worker needs a core or a GPU; give --worker-cpus 1")
         return RayEngine(
             address=self.address,
             workers=self.workers,
@@ -78,7 +78,7 @@ Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What there is to do, found by the words of a command."""
+    """Inputs of a command."""
 
     items: "Sequence[Item]"
     tars: Sequence[str]
@@ -100,7 +100,7 @@ class Inputs:
 
     @contextmanager
     def first(self) -> Iterator[Sequence[Path]]:
-        """Give the files of the first input, to look at before any work."""
+        """Give the files of the first input, to be checked before any work."""
         from depthpose.core.engine import first_sample
 
         with first_sample(self.items, self.tars, self.files) as sample:
@@ -116,7 +116,7 @@ class Weights:
 
     @classmethod
     def read(cls, word: str) -> "Weights":
-        """Read what a path or name means here."""
+        """Read weights by path or name."""
         from depthpose.core.checkpoint import find_weights
 
         path = find_weights(word)
@@ -124,7 +124,7 @@ class Weights:
 
     @contextmanager
     def unpacked(self) -> Iterator[str]:
-        """Give it as a file for as long as the block runs."""
+        """Give it as a file while the block runs."""
         from depthpose.core.files.disk import refused_write
 
         with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
@@ -135,14 +135,14 @@ class Weights:
 
 
 def run(job: "Job", options: EngineOptions, what: str) -> int:
-    """Do a job, name what failed, and give the exit code."""
+    """Run a job, list what failed, and give the exit code."""
     from depthpose.core.engine import run_job
 
     return say(run_job(job, options.build()), job.out, what)
 
 
 def say(every: "Sequence[Done]", out: str, what: str) -> int:
-    """Name what failed, say how much is done, and give the exit code."""
+    """List what failed, print how much is done, and give the exit code."""
     failures = [failure for done in every for failure in done.failures]
     for name, reason in failures[:20]:
         print(f"depthpose: failed: {name}: {reason}", file=sys.stderr)

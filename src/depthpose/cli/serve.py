@@ -10,20 +10,20 @@ def serve(
     pose_weights: str = "parts",
     max_upload_mb: int = 64,
 ) -> int:
-    """A page in your browser: drop an image, a pair, a depth image or a cloud, and look.
+    """Serve a page for your browser: drop an image, a pair, a depth image or a cloud onto it.
 
-    Tab Depth: depth, the drawn right view, confidence and a cloud that turns; tab Pose: votes, the
-    posed model, its covariance, or the reason for none; all files to take away. It needs no
-    network, sends nothing anywhere, keeps nothing on the disk, and answers this machine alone
-    unless --host says otherwise. Needs the extra 'serve'. Ctrl+C stops it.
+    Tab Depth: depth, the synthesised right view, confidence and a cloud. Tab Pose: votes, the posed
+    model and its covariance, or the reason for a refusal. All results can be downloaded. It needs
+    no network, sends nothing anywhere, keeps nothing on the disk, and by default answers this
+    machine alone. Needs the extra 'serve'. Ctrl+C stops it.
 
         depthpose serve
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
 
     Args:
-        host: 127.0.0.1 is this machine alone; 0.0.0.0 lets everyone in who can reach it, under any
-            name: there is no password and no encryption.
-        port: where; 0 takes a free one.
+        host: 127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can
+            use the page: there is no password and no encryption.
+        port: of the page; 0 takes a free one.
         weights: of the depth networks, by name or file ('depthpose weights list').
         pose_weights: of a pose network, by name or file.
         max_upload_mb: all files of one request together [1e6 bytes].

@@ -7,10 +7,10 @@ import tyro
 
 
 def list_weights(folder: Path | None = None) -> int:
-    """Name the weights that came with depthpose, or those in a folder.
+    """List the weights that came with depthpose, or those in a folder.
 
     Args:
-        folder: look here instead.
+        folder: list this one instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.report.tables import plain_table
@@ -18,7 +18,7 @@ def list_weights(folder: Path | None = None) -> int:
     home = folder or SHIPPED
     found = sorted(home.glob("*.safetensors"))
     if not found:
-        print(f"No weights in {home}. 'depthpose weights import' brings in a published checkpoint.")
+        print(f"No weights in {home}. 'depthpose weights import' imports a published checkpoint.")
         return 0
     rows = [
         {
@@ -31,7 +31,7 @@ def list_weights(folder: Path | None = None) -> int:
         for path in found
     ]
     print(plain_table(rows), end="")
-    print("'depthpose weights show NAME' says all of one: origin, terms, settings.")
+    print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
 
 
@@ -41,7 +41,7 @@ def _in_short(text: str, most: int = 34) -> str:
 
 
 def show_weights(weights: tyro.conf.Positional[str]) -> int:
-    """Say what a weights file holds: kind, knobs, parameters, origin, licence, fingerprint.
+    """Print what a weights file holds: kind, settings, parameters, origin, licence, sha256.
 
     Args:
         weights: a .safetensors file, or the name of weights that came with depthpose.
@@ -86,10 +86,10 @@ def import_weights(
             'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
-        align_corners: psmnet: how the checkpoint was trained to upsample, which no file records:
+        align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
             true for the authors' first weights (2018, PyTorch 0.4), false for those of 2021
             (PyTorch 1.8.1). A wrong choice costs about 1 px of disparity.
-        classes: fcgf: how many objects the outputs are directions for; left out where they are
+        classes: fcgf: number of objects, where the outputs are directions; leave it out for
             descriptors.
     """
     from depthpose.core.run import refuse_to_replace
@@ -129,7 +129,7 @@ def pack_weights(
     terms: str = "",
     half: bool = False,
 ) -> int:
-    """Make one file of a generator and a matcher, with what its users must know.
+    """Write a generator and a matcher into one file, with a card for its users.
 
         depthpose weights pack runs/finetune/fakestereo.safetensors --out street.safetensors
             --trained-on 'my drives of 2026' --licence MIT --half
@@ -140,8 +140,8 @@ def pack_weights(
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
         matcher: what matches the two views: weights with a matcher, by name or file.
-        terms: said whenever the weights are loaded; for licences that bind the user. Those of the
-            weights that are packed stay beside them.
+        terms: printed whenever the weights are loaded; for licences that restrict use. Terms of
+            the packed weights are kept too.
         half: store 16-bit floats: half the size.
     """
     from depthpose.core.checkpoint import bound_facts, find_weights, say_terms
@@ -166,7 +166,7 @@ def pack_weights(
 def complete_weights(
     weights: tyro.conf.Positional[str], models: Path, out: Path, unit: Literal["m", "mm"] = "mm"
 ) -> int:
-    """Put meshes into pose weights that came without, as their licence keeps the meshes back.
+    """Add meshes to pose weights that came without, because the meshes may not be passed on.
 
         depthpose weights complete linemod-nc --models lm --out linemod.safetensors
         depthpose weights complete bunny-nc --models bunny.ply --unit m --out bunny.safetensors
@@ -210,9 +210,9 @@ def push_weights(
 
     Args:
         weights: a .safetensors file, its folder, or the name of weights that came with depthpose.
-        repository: OWNER/NAME; made where it is missing.
-        public: let everybody see a repository that is made; else it is private.
-        accept_terms: you have read the terms of weights that have some, and may pass them on.
+        repository: OWNER/NAME; created if missing.
+        public: make a new repository public; by default it is private.
+        accept_terms: you have read the terms of the weights, and may pass them on.
     """
     from depthpose.core import hub
     from depthpose.core.checkpoint import find_weights, read_checkpoint
@@ -226,8 +226,8 @@ def push_weights(
         print(f"{weights}: {terms}")
         if not accept_terms:
             raise InputError(
-                f"{weights}: has terms that bind whoever passes it on, and they are above. "
-                "If you may, say --accept-terms."
+                f"{weights}: has terms for passing it on, printed above. If you may, add "
+                "--accept-terms."
             )
     card = path.with_suffix(".md")
     text = read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))

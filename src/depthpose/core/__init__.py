@@ -1,1 +1,1 @@
-"""The floor: geometry, files, config, checkpoints and reports. It knows neither room."""
+"""What depth and pose share: geometry, files, config, checkpoints, the training loop."""

@@ -14,13 +14,13 @@ Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
 Map = Float[Tensor, "h w"]
-"""One number a pixel; its unit stands in the variable's name (``_m``, ``_px``). NaN: invalid."""
+"""One number a pixel; its unit is in the variable's name (``_m``, ``_px``). NaN: invalid."""
 
 Mask = Bool[Tensor, "h w"]
 """True where a pixel counts."""
 
 Points = Float[Tensor, "n 3"]
-"""Points of a cloud, in the frame and unit that the variable's name says."""
+"""Points of a cloud, in the frame and unit of the variable's name."""
 
 Matrix3 = Float[Tensor, "3 3"]
 """A 3x3 matrix: intrinsics ``K``, fundamental ``F``, essential ``E`` or a rotation ``R``."""

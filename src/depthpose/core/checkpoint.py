@@ -24,7 +24,7 @@ NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 
 class LicenceNotice(Notice):
-    """Weights whose terms bind whoever uses them."""
+    """Weights whose terms restrict their use."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +33,7 @@ class Checkpoint:
 
     Attributes:
         kind: which network the weights belong to, e.g. ``psmnet``.
-        config: the knobs of that network, as :func:`depthpose.core.config.config_to_dict` gives.
+        config: the settings of that network, as :func:`depthpose.core.config.config_to_dict` gives.
         state: tensors by the names of the network's ``state_dict``.
         facts: the card in short: ``trained_on``, ``licence`` and the like.
     """
@@ -52,7 +52,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         )
     metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
-    # Its own writer says of a full disk what only it understands.
+    # safetensors' own writer does not name a full disk.
     write_bytes(path, _in_order(save(state, metadata={**checkpoint.facts, **metadata})))
 
 
@@ -139,7 +139,7 @@ def misfits(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[s
 
 
 def read_torch_file(path: Path) -> Mapping[str, Any]:
-    """Read somebody else's PyTorch checkpoint without running any code in it.
+    """Read a foreign PyTorch checkpoint without running any code in it.
 
     ``torch.load(weights_only=True)`` refuses every pickled object but tensors and containers.
 
@@ -168,7 +168,7 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
 
 
 def read_published(path: Path) -> Mapping[str, Any]:
-    """Read somebody else's checkpoint by its ending: safetensors, or else a PyTorch file.
+    """Read a foreign checkpoint by its suffix: safetensors, or else a PyTorch file.
 
     Raises:
         InputError: missing, damaged, or holding pickled code.
@@ -181,7 +181,7 @@ def read_published(path: Path) -> Mapping[str, Any]:
 
 
 def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
-    """Warn of terms that bind whoever uses the weights, where their card has any."""
+    """Warn of the terms of use of weights that have any."""
     if terms := facts.get("terms", ""):
         warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
 
@@ -213,7 +213,7 @@ def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict
 
 
 def file_sha256(path: Path) -> str:
-    """Fingerprint a file; it stands beside every number that the file made."""
+    """Compute a file's sha256, recorded beside every number that was made with it."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

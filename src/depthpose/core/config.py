@@ -57,13 +57,13 @@ def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source:
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
-    """Give every knob of a config with its value, nested, ready for YAML and JSON."""
+    """Give every setting of a config with its value, nested, ready for YAML and JSON."""
     plain = dataclasses.asdict(config)  # pyright: ignore[reportArgumentType]
     return {name: _plain_value(value) for name, value in plain.items()}
 
 
 def write_config(path: Path, config: object) -> None:
-    """Write every knob of ``config``, defaults too, so that the file is a full record."""
+    """Write every setting of ``config``, defaults too, so that the file is a full record."""
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
 
@@ -71,7 +71,7 @@ def write_config(path: Path, config: object) -> None:
 def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
     """Lay nested differences over the defaults of ``kind``, which may differ from their class's.
 
-    A knob given in place of another (``INSTEAD`` in its class) takes that one's default away.
+    A setting given instead of another (``INSTEAD`` in its class) removes that one's default.
     """
     laid: dict[str, Any] = dict(content)
     for field in dataclasses.fields(kind):

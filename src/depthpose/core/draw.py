@@ -24,7 +24,7 @@ _LEAST_GAP = 0.08
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a picture mean: a bar to stand beside it.
+    """What the colours of a picture mean, for a colour bar.
 
     Attributes:
         title: of what, with its unit.

@@ -1,4 +1,4 @@
-"""One folder per run, which says what made it: settings, versions, machine, commit."""
+"""One folder per run, with what made it: settings, versions, machine, commit."""
 
 import os
 import platform
@@ -114,7 +114,7 @@ def claim_folder(
         folder: made where it is missing.
         settings: JSON values that decide the results; compared with those of an earlier run.
         results: files and folders that the run will write. They are its own where an earlier run
-            has left its record; without a record, somebody else wrote what is there.
+            has left its record; without a record, something else wrote what is there.
 
     Raises:
         InputError: the folder holds a run with other settings (the first difference is named), or
@@ -246,7 +246,7 @@ def _results_there(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
 
 
 def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[str, Any]) -> None:
-    """Refuse a folder whose record says that other settings made what it holds.
+    """Refuse a folder whose record has other settings.
 
     Raises:
         InputError: the first difference is named.
@@ -256,7 +256,7 @@ def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[
         raise InputError(f"{folder}/{RECORD}: not a record of a run. Choose another folder.")
     before, now = _flat(earlier), _flat(settings)
     for name in sorted(before.keys() | now.keys()):
-        # A later version may add knobs: one that either does not know counts as off.
+        # A later version may add settings: one that either does not know counts as off.
         is_off = (name not in before or name not in now) and not (before | now)[name]
         if before.get(name) != now.get(name) and not is_off:
             raise InputError(

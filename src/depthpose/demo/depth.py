@@ -1,4 +1,4 @@
-"""The demo's depth half: a made street and a real pair, estimated and measured."""
+"""Depth in the demo: a synthetic street and a real pair, estimated and measured."""
 
 import math
 from collections.abc import Mapping
@@ -115,22 +115,21 @@ def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
 
 
 def _range_m(sample: StereoSample) -> tuple[float, float]:
-    """Colours of a street reach to 80 m, those of a room to 8."""
+    """Colours reach to 80 m on the street, to 8 m on the motorcycle."""
     return (3.0, 80.0) if sample.input.name == "street" else (1.5, 8.0)
 
 
 _STREET_TEXT = (
-    "A made street, drawn on the spot from a seed that no training has seen; its depth is known "
-    "exactly. Distances from 3 m (bright) to 80 m (dark), grey where there is none: the sky. "
-    "epe_px and d1_all measure disparity, the other columns depth, over all pixels nearer than "
-    "80 m, hidden ones too. Depth from one image is a guess from what streets look like: good for "
-    "road, cars and house fronts at a usual camera's height, too near far away, and of nothing but "
-    "streets."
+    "A synthetic street of a seed that no training used; its depth is known exactly. Distances "
+    "from 3 m (bright) to 80 m (dark); the sky is grey. epe_px and d1_all measure disparity, the "
+    "other columns depth, over all pixels nearer than 80 m, occluded ones too. Depth from one "
+    "image is an estimate from what streets usually look like: good for road, cars and house "
+    "fronts at a usual camera's height, too near far away, and for streets alone."
 )
 _MOTORCYCLE_TEXT = (
     "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "
-    "scikit-image ships it. Distances from 1.5 m to 8 m. The shipped matcher has seen made streets "
-    "alone."
+    "scikit-image ships it. Distances from 1.5 m to 8 m. The shipped matcher was trained on "
+    "synthetic streets alone."
 )
 
 

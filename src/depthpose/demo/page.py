@@ -1,4 +1,4 @@
-"""The demo's work: both halves estimated, measured, and put on a page."""
+"""The demo: poses and depth estimated, measured, and put on a page."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,23 +33,23 @@ def make_demo(
     scale: float = 1.0,
     tell: Callable[[str], None] | None = None,
 ) -> DemoResult:
-    """Estimate the poses of made parts on a table, and depth of a real pair and a made street.
+    """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
 
     Args:
         out: folder for the data, the estimates, the tables and the page ``report.html``.
-        weights: of the depth room, by name or file.
-        parts: of the pose room, by name or file; they know made parts.
+        weights: of the depth networks, by name or file.
+        parts: weights of a pose network for the parts, by name or file.
         scale: size of the street's images as a share of KITTI's.
-        tell: told what is done next.
+        tell: called with what is done next.
 
     Raises:
-        InputError: ``out`` holds files of somebody else that would be written over.
+        InputError: ``out`` holds files that the demo did not write and would replace.
     """
     claim_folder(out, {"command": "demo"}, [*_FOLDERS, *table_files("depths", "poses"), _PAGE])
     tell = tell or (lambda _: None)
-    tell("made parts on a table are posed from a depth image ...")
+    tell("synthetic parts on a table are posed from a depth image ...")
     poses, of_pose = show_poses(out, parts)
-    tell("depth of a real pair and of a made street ...")
+    tell("depth of a real pair and of a synthetic street ...")
     depths, of_depth = show_depth(out, weights, scale)
     write_table(out, depths, name="depths")
     write_table(out, poses, name="poses")

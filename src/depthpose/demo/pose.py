@@ -1,4 +1,4 @@
-"""The demo's pose half: made parts on a table, posed from a depth image and masks."""
+"""Poses in the demo: synthetic parts on a table, posed from a depth image and masks."""
 
 from pathlib import Path
 from typing import Any
@@ -30,20 +30,20 @@ _UNIT_M = 0.0001
 _COLUMNS = ("object", "visible_fraction", "status", "metric", "error_mm", "of_diameter",
             "rotation_deg", "translation_mm", "ms_network", "ms_total", "reason")  # fmt: skip
 _TEXT = (
-    "Five made parts on a table, as a sensor of structured light sees them, with its noise and its "
-    "shadows. The network was trained on made views of these parts alone; the masks are given. "
-    "Blue: the estimated pose, as box and silhouette; green and dashed: the box of the truth. An "
+    "Five synthetic parts on a table, with the noise and the shadows of a structured-light sensor. "
+    "The network was trained on synthetic views of these parts alone; the masks are given. Blue: "
+    "the estimated pose, as box and silhouette; green and dashed: the box of the truth. An "
     "estimate is right below a tenth of the diameter (ADD, or ADD-S where a part is symmetric); "
-    "what the network is not sure of it refuses, and says why."
+    "an uncertain one is refused with a reason."
 )
 
 
 def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Pose the parts of a made frame; give a row for each, and the part of the page.
+    """Pose the parts of a synthetic frame; give a row for each, and the sections of the page.
 
     Args:
         out: folder for the frame, as a BOP data set ``parts``, and for the poses.
-        weights: of a network that knows made parts, by name or file.
+        weights: of a pose network for the parts, by name or file.
     """
     net = GeoPoseNet.load(weights)
     models = {model.number: model for model in net.weights.models}

@@ -52,7 +52,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawing:
-    """A picture that lies on the page alone, small enough for a page of many."""
+    """A picture without a file of its own, small enough for a page of many."""
 
     image: Float[Tensor, "3 h w"]
     caption: str
@@ -76,7 +76,7 @@ class Section:
 
     Attributes:
         title: its heading.
-        text: words.
+        text: a paragraph.
         facts: names and values.
         rows: a table that sorts.
         tables: small tables by what they show, rows of equal length.
@@ -153,7 +153,7 @@ def csv_table(rows: Sequence[Row]) -> str:
 def write_markdown(
     path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
 ) -> None:
-    """Write the words and tables of :func:`write_page` as Markdown, without what is seen."""
+    """Write the text and tables of :func:`write_page` as Markdown, without pictures."""
     parts = [f"# {title}\n"]
     for section in sections:
         parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])

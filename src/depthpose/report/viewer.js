@@ -38,7 +38,7 @@ const showScene = (() => {
     }`;
   const HINT = "drag turns, shift-drag moves, wheel zooms, double click resets";
   const LACKING = "Your browser shows no WebGL, so this 3D view is empty; " +
-    "the same points are in the PLY file that belongs to it.";
+    "the same points are in the PLY file beside it.";
 
   const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];

@@ -1,4 +1,4 @@
-"""The browser page: both rooms behind a form, on this machine alone unless told otherwise."""
+"""The browser page of ``depthpose serve``: depth and pose by a form."""
 
 from depthpose.web.app import Limits as Limits
 from depthpose.web.app import make_app as make_app

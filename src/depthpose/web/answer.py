@@ -22,8 +22,8 @@ class Shown:
 
     Attributes:
         file: its name.
-        caption: says what it shows, with its scale.
-        values: file with a number for each pixel, which the page reads out under the pointer.
+        caption: what it shows, with its scale.
+        values: file with a number for each pixel, which the page shows under the pointer.
         unit: of these numbers.
         scale: what its colours mean.
     """
@@ -40,14 +40,14 @@ class Answer:
     """An estimate, or a refusal.
 
     Attributes:
-        is_ok: whether there is what was asked for.
+        is_ok: whether there is an estimate.
         said: one sentence: the result, or why there is none.
         facts: name and value, in order.
         tables: by title, rows of equal length.
         pictures: some of the files.
         scene: the 3D view.
-        terms: of the weights that were used, where they bind whoever uses them.
-        files: to be taken away, by name.
+        terms: of the weights, where they restrict use.
+        files: to download, by name.
     """
 
     is_ok: bool
@@ -88,8 +88,8 @@ class Form:
     """Fields and files of one request.
 
     Attributes:
-        folder: where its files lie, and where results may; it is removed with the request.
-        fields: words as typed.
+        folder: of its files and results; it is removed with the request.
+        fields: text as typed.
         files: by field.
     """
 

@@ -40,7 +40,7 @@ from depthpose.web.pose import answer_pose, has_registration
 from depthpose.web.queue import Queue, has_gone, paced
 
 TICKET = "x-ticket"
-"""Header of a request: a word of its own, by which the page asks for its place in the queue."""
+"""Header of a request: a random name, by which the page asks for its place in the queue."""
 _RESULTS = 3
 """Answers whose files are kept in memory for downloads."""
 _TYPES = {
@@ -65,8 +65,8 @@ class Limits:
     """Requests whose files may arrive at the same time."""
 
     hosts: tuple[str, ...] | None = LOOPBACK
-    """Names under which a browser may ask for the page; None: any. It keeps other web pages, which
-    a browser has open too, from reading answers by a name of their own (DNS rebinding)."""
+    """Host names under which a browser may request the page; None: any. They keep other web pages
+    in the same browser from reading answers by a name of their own (DNS rebinding)."""
 
 
 class Pages:
@@ -74,7 +74,7 @@ class Pages:
 
     def __init__(self, depth: FakestereoNet, pose: GeoPoseNet, limits: Limits) -> None:
         self._limits = limits
-        self._rooms: dict[str, Callable[[Form], Answer]] = {
+        self._kinds: dict[str, Callable[[Form], Answer]] = {
             "depth": partial(answer_depth, net=depth),
             "pose": partial(answer_pose, net=pose),
         }
@@ -116,10 +116,10 @@ class Pages:
         return Response(text, media_type=media_type)
 
     async def example(self, request: Request) -> Response:
-        """Give files and fields to fill a form with; they are made when first asked for."""
-        make = self._examples.get(request.path_params["room"])
+        """Give files and fields to fill a form with; they are made at the first request."""
+        make = self._examples.get(request.path_params["kind"])
         if make is None:
-            raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
         try:
             made = await self._queue.compute("", make, partial(has_gone, request.receive))
         except InputError as error:
@@ -127,21 +127,21 @@ class Pages:
         return JSONResponse(made)
 
     async def place(self, request: Request) -> Response:
-        """Say how many computations end before that of a ticket; null: none waits here."""
+        """Give the number of computations before that of a ticket; null: it does not wait here."""
         return JSONResponse({"before": self._queue.before(request.path_params["ticket"])})
 
     async def estimate(self, request: Request) -> Response:
-        """Take a form to an answer."""
+        """Answer a form."""
         refuse_size(request, self._limits.upload_bytes)
-        room = self._rooms.get(request.path_params["room"])
-        if room is None:
-            raise HTTPException(404, f"there are the rooms {', '.join(self._rooms)}, and no other")
+        estimate = self._kinds.get(request.path_params["kind"])
+        if estimate is None:
+            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
         self._queue.refuse_full()
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
                 form = await self._upload(request, Path(folder))
                 ticket = request.headers.get(TICKET, "")
-                work = partial(room, form)
+                work = partial(estimate, form)
                 answer = await self._queue.compute(ticket, work, partial(has_gone, request.receive))
             except (InputError, MissingExtraError) as error:
                 raise HTTPException(400, without_paths(str(error), Path(folder))) from error
@@ -202,8 +202,8 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
     """Build the application.
 
     Args:
-        depth: answers the tab Depth.
-        pose: answers the tab Pose.
+        depth: for the tab Depth.
+        pose: for the tab Pose.
         limits: what is refused.
     """
     limits = Limits() if limits is None else limits
@@ -213,8 +213,8 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
         routes=[
             Route("/", pages.home),
             Route("/assets/{name}", pages.asset),
-            Route("/examples/{room}", pages.example),
-            Route("/estimate/{room}", pages.estimate, methods=["POST"]),
+            Route("/examples/{kind}", pages.example),
+            Route("/estimate/{kind}", pages.estimate, methods=["POST"]),
             Route("/queue/{ticket}", pages.place),
             Route("/results/{key}/{name}", pages.download),
         ],

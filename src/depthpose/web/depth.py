@@ -1,4 +1,4 @@
-"""The tab Depth: a picture or a pair, and what is known of its camera, to depth in metres."""
+"""The tab Depth: an image or a pair, and its camera, to depth in metres."""
 
 import math
 import time
@@ -16,9 +16,9 @@ from depthpose.report.depth import depth_facts, depth_scene, said_grey
 from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 _MOST_WORK_PIXELS = 8_000_000
-"""Of the picture as the networks see it, at the focal length that they were trained at."""
+"""Of the image as networks get it, resized to the focal length that they were trained at."""
 _PHONE = 0.75
-"""Focal length of a phone's main camera, in widths of the picture."""
+"""Focal length of a phone's main camera, in widths of the image."""
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
@@ -32,8 +32,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     near_m, far_m = _range_m(form)
     if pair.right is not None and net.matcher is None:
         raise InputError(
-            "the weights of this page answer one image alone: leave the right image away, or start "
-            "'depthpose serve' with --weights that hold a matcher"
+            "the weights of this page take one image alone: remove the right image, or start "
+            "'depthpose serve' with --weights that have a matcher"
         )
     _refuse_work(pair, net)
     found = net.estimate_pair(pair, with_check=True)
@@ -43,7 +43,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     write_estimate(folder, pair, found, (near_m, far_m))
     write_estimate_cloud(folder, pair, found, far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    focal = " (guessed, 0.75 widths: metres are as wrong as it is)" if is_guess else ""
+    focal = " (guessed as 0.75 widths: the metres are as wrong as the guess)" if is_guess else ""
     pictures = _pictures(pair, found, (near_m, far_m))
     if found.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - found.confidence))
@@ -66,7 +66,7 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
     focal_px, baseline_m = form.number("focal_px"), form.number("baseline_m")
     if has_right and baseline_m is None and "camera" not in form.files:
         raise InputError(
-            "baseline: a pair becomes metres by the distance of its two cameras; fill in the "
+            "baseline: the depth of a pair needs the distance of its two cameras; fill in the "
             "baseline in metres (of KITTI's 2011_09_26: 0.5327), or choose a camera file that has "
             "it"
         )
@@ -80,7 +80,7 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
 
 
 def _keys(form: Form, width: int, height: int) -> dict[str, object]:
-    """Give the camera file that the fields amount to."""
+    """Give the keys of a camera file from the fields."""
     focal_px = form.number("focal_px")
     focal_px = _PHONE * width if focal_px is None else focal_px
     middle = ((width - 1) / 2, (height - 1) / 2)
@@ -108,7 +108,7 @@ def _range_m(form: Form) -> tuple[float, float]:
 
 
 def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
-    """Refuse what the networks would see too large: a small focal length enlarges the picture."""
+    """Refuse what is too large for the networks: a small focal length enlarges an image."""
     camera = pair.camera
     assert camera is not None
     rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
@@ -131,7 +131,7 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
     if rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
             f"a focal length of {float(camera.K[0, 0]):g} px for {camera.width}x{camera.height} "
-            f"pixels would be brought to {columns}x{rows}, more than this page computes; is it in "
+            f"pixels would be resized to {columns}x{rows}, more than this page computes; is it in "
             f"millimetres? A phone's is about {_PHONE} widths"
         )
 
@@ -140,7 +140,7 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
     name = pair.name
     colors = f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {said_grey(found)}"
     pictures = [
-        Shown(file=f"{name}.input.jpg", caption="the picture"),
+        Shown(file=f"{name}.input.jpg", caption="the image"),
         Shown(
             file=f"{name}.color.png",
             caption=f"depth: {colors.format(*range_m)}",
@@ -150,12 +150,12 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
         ),
     ]
     if found.right is not None:
-        pictures.append(Shown(file=f"{name}.right.png", caption="right view, as drawn"))
+        pictures.append(Shown(file=f"{name}.right.png", caption="right view, synthesised"))
     if found.confidence is not None:
         pictures.append(
             Shown(
                 file=f"{name}.confidence.png",
-                caption="confidence: bright is sure, dark a guess",
+                caption="confidence: bright is high, dark low",
                 values=f"{name}.confidence.npy",
                 scale=rising_scale("confidence", 1.0),
             )
@@ -171,7 +171,7 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     if len(known_m) == 0:
         why = (
-            ": is the pair rectified, and left where it belongs?"
+            ": is the pair rectified, and are left and right as they should be?"
             if pair.right is not None
             else (f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else ".")
         )

@@ -1,4 +1,4 @@
-"""Inputs to try the page with: made on the spot, so that nothing has to be found first."""
+"""Example inputs of the page, rendered on the spot."""
 
 from base64 import b64encode
 from pathlib import Path
@@ -22,7 +22,7 @@ _UNIT_M = 0.0001
 
 
 def depth_example() -> dict[str, Any]:
-    """Make a street: the left and the right view, and their rig."""
+    """Render a street: left and right image, and their rig."""
     pair = Streets(StreetsConfig(seed=_SEED, scale=_SCALE))[1].input
     assert pair.right is not None
     assert pair.camera is not None
@@ -35,7 +35,7 @@ def depth_example() -> dict[str, Any]:
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:
-    """Make a frame of the first object that the weights know, on a table: depth, mask, camera.
+    """Render a frame of the first object that the weights know, on a table: depth, mask, camera.
 
     Raises:
         InputError: weights without meshes.
@@ -57,7 +57,7 @@ def pose_example(net: GeoPoseNet) -> dict[str, Any]:
 
 
 def _form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:
-    """Give what a form is filled with: each file is called as its field."""
+    """Give the content of a form; each file is named after its field."""
     files = [
         {"field": p.stem, "name": f"example-{p.name}", "data": b64encode(p.read_bytes()).decode()}
         for p in sorted(folder.iterdir())

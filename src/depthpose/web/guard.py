@@ -1,4 +1,4 @@
-"""What comes in over HTTP: who asks, how much is sent, which files; and how errors go out."""
+"""Checks of requests: host and origin, size, files; and how errors are answered."""
 
 import io
 import zipfile
@@ -29,11 +29,11 @@ _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 
 
 class Guard:
-    """Refuses strangers, and says to the browser what the page may do.
+    """Refuses requests from other pages, and tells the browser what this page may load.
 
     Args:
-        app: what answers everybody else.
-        hosts: names under which a browser may ask; None: any.
+        app: what answers all other requests.
+        hosts: host names under which the page may be requested; None: any.
     """
 
     def __init__(self, app: ASGIApp, hosts: tuple[str, ...] | None) -> None:
@@ -75,9 +75,9 @@ def _host_name(host: str) -> str | None:
 
 
 def refuse_size(request: Request, most: int) -> None:
-    """Refuse what is too large before it is read; a server gives no more than was announced.
+    """Refuse what is too large before it is read.
 
-    But what is sent in chunks, it gives as it comes, whatever size was announced beside.
+    A server reads no more than the announced size, except of a body in chunks.
 
     Raises:
         HTTPException: no size, or too large a one.
@@ -86,7 +86,7 @@ def refuse_size(request: Request, most: int) -> None:
     if not text.isdecimal() or "transfer-encoding" in request.headers:
         raise HTTPException(
             411,
-            "the request does not say its size (Content-Length alone); add it, and send no chunks",
+            "the request has no Content-Length, or comes in chunks; send it whole, with its size",
         )
     if int(text) > most:
         raise HTTPException(
@@ -128,15 +128,15 @@ def zip_files(files: Mapping[str, bytes]) -> bytes:
 
 
 async def say_error(_: Request, error: Exception) -> Response:
-    """Answer a refusal with its sentence."""
+    """Answer a refusal with its message."""
     assert isinstance(error, HTTPException)
     return _sentence(error.status_code, error.detail, error.headers)
 
 
 async def say_crash(_: Request, error: Exception) -> Response:
-    """Answer a fault of ours; the trace is on the server's terminal."""
+    """Answer an unexpected error; the trace is on the server's terminal."""
     kind = type(error).__name__
-    return _sentence(500, f"depthpose failed ({kind}: {error}); the terminal says where")
+    return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")
 
 
 def _sentence(status: int, said: str, headers: Mapping[str, str] | None = None) -> Response:

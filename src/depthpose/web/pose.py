@@ -1,4 +1,4 @@
-"""The tab Pose: what a depth sensor saw of a known object to its pose, or why there is none."""
+"""The tab Pose: a depth image or cloud of a known object to its pose, or why there is none."""
 
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -26,15 +26,15 @@ from depthpose.report.scene import Scene
 from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 OWN_CAD = "cad"
-"""The choice of an object that stands for the CAD file."""
+"""The value of the field ``object`` that means the CAD file."""
 _SAME = 0.02
-"""In diameters: a CAD file whose size and keypoints agree so well is the object of the weights."""
+"""In diameters: a CAD file whose size and surface differ by less is the object of the weights."""
 _SURFACE = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Target:
-    """What is looked for, and how: by the network where ``registration`` is None."""
+    """The object, and how it is posed: by the network where ``registration`` is None."""
 
     model: ObjectModel
     how: str
@@ -50,7 +50,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """Pose what a form asks for.
 
     Raises:
-        InputError: a file that cannot be read, an object or a CAD file that nobody knows.
+        InputError: a file that cannot be read, an object or a CAD file that is unknown.
     """
     target = _target(form, net)
     given = _input(form, target.model)
@@ -81,7 +81,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
 def _found_alone(
     given: CloudInput | ViewInput, target: _Target, net: GeoPoseNet
 ) -> tuple[ViewInput, PoseEstimate]:
-    """Search a depth image without a mask; give the best answer, and what it explains as mask.
+    """Search a depth image without a mask; give the best pose, and the pixels that it explains.
 
     Raises:
         InputError: the network does not know the object.
@@ -95,7 +95,7 @@ def _found_alone(
             name=given.name,
             object=target.model.name,
             status="doubtful",
-            reason="nothing beside the planes of the image is surely the object; give its mask",
+            reason="no region of the image is certain enough to be the object; give its mask",
         )
     best = replace(answers[0], name=given.name)
     assert best.camera_from_model is not None
@@ -125,7 +125,7 @@ def _write(
 
 
 def _target(form: Form, net: GeoPoseNet) -> _Target:
-    """Find the object that is meant among those of the weights, or in a CAD file."""
+    """Find the object among those of the weights, or in a CAD file."""
     name, models = form.fields.get("object", ""), net.weights.models
     if name != OWN_CAD:
         known = [model for model in models if model.name == name]
@@ -139,11 +139,11 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
     if not has_registration():
         raise InputError(
             f"{form.file('cad').name}: the weights know {', '.join(net.objects)}, and this is none "
-            "of them (is its unit right?). A network learns a part from its CAD file alone: "
+            "of them (is its unit right?). To train a network for a part from its CAD file alone: "
             "depthpose pose train --cad FILE --unit mm --out my_part. Without training, "
-            f"{install_words('open3d')} poses any CAD file, less surely"
+            f"{install_words('open3d')} poses any CAD file, less reliably"
         )
-    how = "Open3D's FPFH features, RANSAC and ICP: untrained, and it refuses nearly nothing"
+    how = "Open3D's FPFH features, RANSAC and ICP: untrained; it hardly ever refuses"
     return _Target(model=model, how=how, registration=FpfhRegistration(model))
 
 
@@ -171,7 +171,7 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     size = _size(depth)
     camera = form.camera({} if "camera" in form.files else _keys(form, size), size)
     if camera.depth_unit_m is None and is_picture:
-        # ROS, OpenCV and KITTI have no word for it; the field has.
+        # Files of ROS, OpenCV and KITTI do not have it.
         camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
 
@@ -184,12 +184,12 @@ def _size(depth: Path) -> tuple[int, int]:
 
 
 def _keys(form: Form, size: tuple[int, int]) -> dict[str, Any]:
-    """Give the camera file that the fields amount to."""
+    """Give the keys of a camera file from the fields."""
     focal_px = form.number("focal_px")
     if focal_px is None:
         raise InputError(
-            "focal length: a depth image becomes points by it, and a wrong one changes the size of "
-            "what is seen; fill in the depth sensor's (its driver says it), or choose a camera file"
+            "focal length: without it a depth image has no size; fill in that of the depth sensor "
+            "(its driver has it), or choose a camera file"
         )
     width, height = size
     cx, cy = form.number("cx_px"), form.number("cy_px")
@@ -219,7 +219,7 @@ def _scene(
     model: ObjectModel,
     voted: Voted | None,
 ) -> Scene:
-    """Show what was seen, the posed model and the votes."""
+    """Show the cloud, the posed model and the votes."""
     scene = pose_scene(given, points_m, found, model)
     if found.keypoints_m is None or voted is None:
         return scene

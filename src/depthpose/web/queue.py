@@ -1,4 +1,4 @@
-"""Who is computed when: one at a time, first come, first served; and uploads that keep a pace."""
+"""One computation at a time, first come, first served; uploads that are too slow are ended."""
 
 import time
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -11,7 +11,7 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Result = TypeVar("Result")
 
 GRACE_S, LEAST_BYTES_S = 10.0, 20_000
-"""An upload that brings less a second, after so long, is ended: it would hold a place for ever."""
+"""An upload with fewer bytes a second, after so many seconds, is ended: it keeps others waiting."""
 MOMENT_S = 0.02
 _FULL = "too many requests wait for one computation; try again later"
 
@@ -44,15 +44,15 @@ class Queue:
     async def compute(
         self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
     ) -> Result | None:
-        """Compute in a thread when all who came before are done.
+        """Compute in a thread once all earlier computations are done.
 
         Args:
-            ticket: by which the one who waits asks for the place.
+            ticket: name by which the client asks for its place in the queue.
             work: what is computed.
-            is_gone: whether nobody waits for the answer any more.
+            is_gone: whether the client has left.
 
         Returns:
-            None where nobody does: then nothing was computed.
+            The result; None where the client has left: then nothing was computed.
 
         Raises:
             HTTPException: too many wait.

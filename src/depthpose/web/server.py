@@ -41,7 +41,7 @@ def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
 
 
 def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:
-    """Give the names under which a page may be asked for; None: any, as it is open to everyone.
+    """Give the host names under which a page may be requested; None: any, it is open to all.
 
     Args:
         host: the address as the user wrote it. '', '0', '0x0' and '::0' mean all addresses too, so
@@ -52,7 +52,7 @@ def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...
 
 
 def run(app: Starlette, taken: socket.socket) -> None:
-    """Answer until the process is told to stop; nothing is logged but errors."""
+    """Answer requests until the process is stopped; only errors are logged."""
     config = uvicorn.Config(
         app,
         log_level="error",

@@ -1,4 +1,4 @@
-// The page of both rooms: tabs, drop zones, and what comes back. No library, and no other server.
+// The page of depthpose serve: tabs, drop zones, answers. No library, and no other server.
 const made = (name, facts = {}, ...children) => {
   const element = Object.assign(document.createElement(name), facts);
   element.append(...children);
@@ -27,7 +27,7 @@ for (const tab of tabs) {
 }
 choose(tabs.find(tab => `#${tab.getAttribute("aria-controls")}` === location.hash) || tabs[0]);
 
-// Drop zones say which file they hold, and let it go by a button.
+// Drop zones show the chosen file, with a button to remove it.
 for (const zone of document.querySelectorAll(".drop")) {
   const input = zone.querySelector("input"), said = zone.querySelector("output");
   const show = () => {
@@ -52,11 +52,11 @@ function sized(bytes) {
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
 
-// An example fills the form and is sent: what a user would choose, chosen.
+// An example fills the form and submits it.
 for (const button of document.querySelectorAll(".try")) button.addEventListener("click", async () => {
   const form = button.form;
   button.disabled = true;
-  const response = await fetch(`examples/${form.dataset.room}`).catch(() => null);
+  const response = await fetch(`examples/${form.dataset.kind}`).catch(() => null);
   const found = await response?.json().catch(() => null);
   button.disabled = false;
   if (!found?.files) {
@@ -93,7 +93,7 @@ for (const form of document.forms) form.addEventListener("submit", async event =
   answer.setAttribute("aria-busy", "true");
   let found;
   try {
-    const response = await fetch(`estimate/${form.dataset.room}`, {
+    const response = await fetch(`estimate/${form.dataset.kind}`, {
       method: "POST", body: new FormData(form), headers: { "X-Ticket": ticket },
     });
     found = await response.json();
@@ -124,7 +124,7 @@ function show(answer, found) {
       made("figcaption", { textContent: found.scene.caption + note })),
     made("div", { className: "pictures" }, ...found.pictures.map(picture => shown(picture, found.folder))),
     ...Object.entries(found.tables).flatMap(([title, rows]) => [made("h3", { textContent: title }), table(rows)]),
-    made("h3", { textContent: "Take away" }),
+    made("h3", { textContent: "Downloads" }),
     made("ul", { className: "downloads" }, ...[...found.files, { name: "all.zip" }].map(({ name, bytes }) =>
       made("li", {}, made("a", { href: found.folder + encodeURIComponent(name), download: name,
         textContent: bytes === undefined ? name : `${name}, ${sized(bytes)}` })))),

@@ -15,10 +15,10 @@ from depthpose.core.errors import InputError
 def check(
     path: tyro.conf.Positional[Path], split: str | None = None, with_decoding: bool = True
 ) -> int:
-    """Walk a dataset and name everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
+    """Read a data set and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
 
     A line for each file that is missing, truncated or of the wrong size, then a summary. Exit code
-    0: nothing wrong. 1: something is. 2: the folder cannot be understood.
+    0: nothing wrong. 1: something is. 2: the layout of the folder is unknown.
 
     Args:
         path: the dataset's folder.
@@ -54,10 +54,10 @@ def pack(
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
 
-    Whatever takes a data set takes OUT, or a URL to which it was copied (s3://, gs://): a training
-    reads it by index, and a shard of a store comes to this machine, into ~/.cache/depthpose or
-    $DEPTHPOSE_CACHE, when it is first read. Files are copied as they are. index.json is written
-    last; what was stopped before begins again.
+    OUT, or a URL to which it was copied (s3://, gs://), can be used wherever a data set can.
+    Samples are read by index; a remote shard is cached in ~/.cache/depthpose or $DEPTHPOSE_CACHE
+    when it is first read. Files are copied unchanged. index.json is written last; after an
+    interruption packing begins again.
 
         depthpose data pack KITTI --split eigen-train-val --out shards
 
@@ -65,7 +65,7 @@ def pack(
         path: the data set's folder.
         out: a new folder for shards, calibration and index.
         split: pack these frames alone.
-        shard_mb: megabytes of a shard, from which on the next one begins.
+        shard_mb: size from which on the next shard begins [1e6 bytes].
     """
     from tqdm import tqdm
 
@@ -90,17 +90,17 @@ def duplicates(
 ) -> int:
     """List images of one set that show nearly the same as images of another.
 
-    Training on a frame of the evaluation's drives flatters every number. Left images are compared
-    by their fine structure over small shifts and zooms: 1 is the same picture, two streets stay
-    below 0.3. The list is for the eye: look at what it names. Always says the likest pair. Exit
-    code 0: none. 1: some.
+    Training on frames of the evaluation's drives makes every number too good. Left images are
+    compared by their fine structure over small shifts and zooms: 1 is the same image, two streets
+    stay below 0.3. Check the listed images by eye. The most similar pair is always printed. Exit
+    code 0: none listed. 1: some.
 
         depthpose data duplicates my-pairs kitti-eval
 
     Args:
         train: folder of the first set, in any layout that 'data check' knows.
         evaluation: folder of the second set.
-        at_least: list pairs from this likeness on; 0.3 by default.
+        at_least: least similarity of a listed pair; 0.3 by default.
         out: folder to write the list to as well: duplicates.json, .csv and .md.
     """
     from dataclasses import asdict
@@ -139,21 +139,20 @@ def label(
     max_difference_share: float = 0.03,
     min_confidence: float = 0.5,
 ) -> int:
-    """Match pairs that have no truth both ways, and keep as truth what both views agree on.
+    """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
-    What is written is a folder of pairs that every training takes. What comes of such labels is no
-    better than their matcher, and has its blind spots; a matcher that has seen evaluation frames
-    tells them on.
+    Writes a folder of pairs that every training takes. Such labels are no better than their
+    matcher; one that was trained on evaluation frames passes these on.
 
         depthpose data label my-pairs --out my-pairs-labelled
 
     Args:
         path: a dataset with right views and calibration.
         out: folder to write to.
-        weights: weights with a matcher, by name or file; the terms of theirs bind what comes of it.
+        weights: with a matcher, by name or file; their terms hold for the labels too.
         device: cpu, cuda, cuda:1, ...
-        max_difference_px: largest difference of both views' disparities.
-        max_difference_share: the same as a share of the disparity; the larger limit holds.
+        max_difference_px: largest difference of the two views' disparities.
+        max_difference_share: the same as a share of the disparity; the larger limit counts.
         min_confidence: least confidence of the matcher.
     """
     from tqdm import tqdm
@@ -178,7 +177,7 @@ def label(
     net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
     labelled = label_pairs(net, dataset, config, out, settings)
     shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
-    known = f", {sum(shares) / len(shares):.0%} of their pixels are known" if shares else ""
+    known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
     return 0
 
@@ -191,16 +190,16 @@ def export_depth(
     images: Path | None = None,
     scale: float = 1.0,
 ) -> int:
-    """Write depth of 'depth predict' or 'depth match' where COLMAP or nerfstudio look for it.
+    """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 
     colmap: OUT/stereo/depth_maps/IMAGE.geometric.bin; OUT is a dense workspace. COLMAP's
-    stereo_fusion wants normal maps too, which are not written.
+    stereo_fusion needs normal maps too, which are not written.
     nerfstudio: OUT/depths/NAME.png or .npy in millimetres, 0 where nothing is known. Where OUT
     holds transforms.json, transforms_depth.json is written beside it, with depth_file_path of
     each frame: ns-train depth-nerfacto --data OUT/transforms_depth.json.
 
-    A reconstruction from images alone has a scale of its own, and depth is in metres: --scale says
-    how many of its units a metre is.
+    Depth is in metres; a reconstruction from images alone has another unit: --scale is the number
+    of its units in a metre.
 
         depthpose data export-depth out --format colmap --out dense
         depthpose data export-depth out --format nerfstudio --files npy --out data
@@ -209,9 +208,9 @@ def export_depth(
         results: folder of predictions.
         format: whose files.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
-        files: of nerfstudio: png holds 65.535 m at most, what is farther becomes unknown; npy all.
-        images: of colmap: the folder that its names of images count from, if not each one's own.
-        scale: units of the reconstruction a metre.
+        files: of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all.
+        images: of colmap: folder that image names are relative to; by default that of each image.
+        scale: units of the reconstruction in a metre.
     """
     from depthpose.core.run import claim_folder
     from depthpose.depth import exchange
@@ -219,7 +218,7 @@ def export_depth(
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"--scale {scale:g}: units a metre are positive; 1 where metres are meant")
     if images is not None and format != "colmap":
-        raise InputError(f"--images {images} is for --format colmap; leave it away")
+        raise InputError(f"--images {images} is for --format colmap; remove it")
     settings = {"command": "data export-depth", "results": str(results.resolve()), "scale": scale}
     if format == "colmap":
         named = exchange.colmap_files(results, images)
@@ -228,13 +227,13 @@ def export_depth(
         print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
         return 0
     named = exchange.nerfstudio_files(results, files)
-    told = exchange.nerfstudio_frames(out, named)
+    frames = exchange.nerfstudio_frames(out, named)
     own = {**settings, "format": format, "files": files}
     claim_folder(out, own, [*named.values(), exchange.TRANSFORMS_DEPTH])
     lost = sum(_count(exchange.write_nerfstudio(results, out, named, scale), len(named)))
-    if told is not None:
-        exchange.write_transforms(out, told)
-    _say_nerfstudio(out, len(named), lost, is_told=told is not None)
+    if frames is not None:
+        exchange.write_transforms(out, frames)
+    _say_nerfstudio(out, len(named), lost, is_listed=frames is not None)
     return 0
 
 
@@ -244,8 +243,8 @@ def _count(written: "Iterable[Any]", total: int) -> list[Any]:
     return list(tqdm(written, total=total, unit=" frames", leave=False, disable=None))
 
 
-def _say_nerfstudio(out: Path, frames: int, lost: int, *, is_told: bool) -> None:
-    beside = "transforms_depth.json names them" if is_told else "no transforms.json lies there"
+def _say_nerfstudio(out: Path, frames: int, lost: int, *, is_listed: bool) -> None:
+    beside = "transforms_depth.json names them" if is_listed else "there is no transforms.json"
     print(f"{out}: depth of {frames} frames in depths; {beside}")
     if lost:
         print(

@@ -23,9 +23,9 @@ def make_streets(
     with_lidar: bool = True,
     clutter_share: float = 0.0,
 ) -> int:
-    """Make street scenes with exact disparity, in KITTI's raw layout.
+    """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
-    Frames that are there are skipped, so an interrupted run goes on where it was, and several
+    Existing frames are skipped, so an interrupted run can be resumed, and several
     runs with different --first share the work. Each rig of KITTI's five recording days gets a
     date of its own, 2100_01_01 to 2100_01_05, which no real drive has.
 
@@ -33,12 +33,12 @@ def make_streets(
         out: folder to write to.
         number: how many frames.
         first: number of the first one.
-        seed: another seed, other streets; it is the number of the drives too.
-        scale: size of the pictures: 0.5 makes half as many rows and columns.
+        seed: of the random streets, and number of the drives.
+        scale: size of the images: 0.5 gives half as many rows and columns.
         with_antialiasing: smooth edges.
         with_lidar: scan each scene with a LiDAR of 64 beams.
-        clutter_share: share of the scenes that are clutter in place of a street: shapes of all
-            kinds, floating before a ground, a wall or in a box. For matchers.
+        clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
+            instead of a street; for training matchers.
     """
     from tqdm import tqdm
 
@@ -82,24 +82,24 @@ def make_objects(
     sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light",
     symmetries: Literal["none", "found"] = "none",
 ) -> int:
-    """Make frames of objects on a table, with picture, depth, masks and poses, in BOP's layout.
+    """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
 
-    A scene holds 50 frames; scenes that are there are skipped, so an interrupted run goes on where
-    it was. 'depthpose data check OUT' reads what this writes.
+    A scene has 50 frames; existing scenes are skipped, so an interrupted run can be resumed.
+    'depthpose data check OUT' checks the result.
 
         depthpose data make objects --cad part.stl clamp.stl --unit mm --out made --number 500
 
     Args:
-        cad: model files, of any kind that holds a surface or points; the first is object 1.
+        cad: model files with a surface or points; the first is object 1.
         out: folder to write to.
         unit: of the numbers in the files.
         number: how many frames.
         split: name of the part of the data set.
-        seed: another seed, other frames.
+        seed: of the random frames.
         distance: nearest and farthest view [m].
         sensor: whose errors the depth has.
-        symmetries: found looks whether a part looks alike from several sides, and declares it;
-            without, you are told of what is found.
+        symmetries: found: declare the symmetries that are found from a part's shape; none: only
+            print them.
     """
     from tqdm import tqdm
 
@@ -151,7 +151,7 @@ def _fingerprint(path: Path) -> dict[str, str]:
 
 
 def _is_made(split: Path, scene: int, frames: range) -> bool:
-    """Whether a scene is there with all of its frames; its last file says so."""
+    """Whether a scene exists with all of its frames, by the file that is written last."""
     from depthpose.core.files import read_json
 
     path = split / f"{scene:06d}" / "scene_camera.json"

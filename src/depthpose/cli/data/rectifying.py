@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from depthpose.core.camera import EpipolarResidual, RawCamera, RawPair, Rectifier
 
 _LOOKED_AT = 8
-"""Pairs that are rectified and measured before anything is written."""
+"""Pairs that are checked before anything is written."""
 _WARN_PX, _REFUSE_PX = 0.5, 1.0
 _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
@@ -33,9 +33,9 @@ def rectify(
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
     Writes left/NAME.png, right/NAME.png and camera.json, the camera of the rectified pairs: OUT is
-    what 'depth match' and 'data check' take. Up to 8 pairs are looked at before anything is
-    written: how many rows matched features differ by is said (median and 95 %), warned of from
-    0.5 px on and refused from 1 px on. Needs the extra 'opencv'.
+    input for 'depth match' and 'data check'. First, features of up to 8 pairs are
+    matched and the differences of their rows printed (median and 95 %): a warning above 0.5 px,
+    an error above 1 px. Needs the extra 'opencv'.
 
         depthpose data rectify left.png right.png --camera stereo.yaml --out rectified
         depthpose data rectify 'raw/cam0/*.png' 'raw/cam1/*.png' --camera camchain.yaml --out out
@@ -48,8 +48,8 @@ def rectify(
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.
         out: folder for the results.
-        unit: of the translation between the cameras; mm where the board's squares were given so.
-        fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); the files of ROS and Kalibr say it.
+        unit: of the translation between the cameras; mm if the calibration board was given in mm.
+        fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it.
         keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
         check: refuse what is swapped or differs by more than a row.
     """
@@ -107,7 +107,7 @@ def _say_residual(found: "EpipolarResidual", rectifier: "Rectifier", *, is_refus
         f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
     )
     if not found.is_known:
-        _warn(f"only {found.matches} features match, so whether rows agree is not known")
+        _warn(f"only {found.matches} features match, too few to check the rows")
         return
     said = (
         f"epipolar residual: median {found.median_px:.2f} px, 95 % {found.p95_px:.2f} px "

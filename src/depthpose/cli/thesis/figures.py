@@ -16,7 +16,7 @@ def figure_3_2(
 
     The features before the last layer (64 numbers a point) of all clouds are mapped to one number
     by an exact t-SNE and shown in the Spectral scale; the model is black. Without a data set the
-    clouds are synthetic views. Writes figure-3-2.png, panels and report.html.
+    clouds are synthetic views of the weights' objects. Writes figure-3-2.png, panels, report.html.
 
         depthpose figure 3-2 --weights W.safetensors --out out/figure-3-2
 
@@ -50,8 +50,8 @@ def figure_3_4(
     """Draw figure 3-4: true and predicted directions to the keypoint whose vote errs most.
 
     Looks at some views and shows the worst. In the plane of the camera's x and y: a yellow star is
-    the true keypoint, a red cross the voted one. Without a data set the views are synthetic.
-    Writes figure-3-4.png, panels and report.html.
+    the true keypoint, a red cross the voted one. Without a data set the views are synthetic, of the
+    weights' objects. Writes figure-3-4.png, panels and report.html.
 
         depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4
 
@@ -80,8 +80,8 @@ def figure_3_5(
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
 
-    Over the picture, or the depth where there is none. Without a data set the views are
-    synthetic. Writes figure-3-5.png, panels and report.html.
+    Over the picture, or the depth where there is none. Without a data set the views are synthetic,
+    of the weights' objects. Writes figure-3-5.png, panels and report.html.
 
         depthpose figure 3-5 --weights W.safetensors --linemod Linemod_preprocessed --out out
 

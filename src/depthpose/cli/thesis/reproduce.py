@@ -26,26 +26,26 @@ def reproduce(
     comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
     matching: Matching = MatcherOptions(),  # noqa: B008
 ) -> int:
-    """Make a table of the thesis again, from data on disk to published rows, ours and difference.
+    """Reproduce a table of the thesis, from data on disk to published rows, ours and difference.
 
     2.1: depth from one image. 2.2: depth from the real stereo pair. 2.3: depth from one image
     without and with fine-tuning: give two weights, in this order. Writes rows.json, rows.csv,
-    table.md, report.md and report.html (with the frames of figures 2-1 and 2-5), and says protocol,
-    weights, settings and environment. A rerun measures without predicting anew.
+    table.md, report.md and report.html (with the frames of figures 2-1 and 2-5), with protocol,
+    weights, settings and environment. A rerun uses existing predictions.
 
         depthpose reproduce 2.1 --kitti /data/kitti --weights apart.safetensors --out out/table-2.1
 
     Args:
         table: number in the thesis.
         kitti: KITTI raw with LiDAR; or any folder that 'depth evaluate' takes, with --split all.
-        out: folder for all that is written.
+        out: folder to write to.
         weights: weights files; 2.2 takes a stereo matcher's too.
         matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
-        beside: tables 2.1 and 2.3: weights of another method, a row each beside the thesis's; by
-            default those that ship, whose generator selects. '--beside' without a name: none.
-        train: training folders: adds the two floors (best depth of each row, nearest image).
-        train_without: names of training frames to keep out.
-        split: eigen-test (697 frames), another split, a file of frames, or 'all' that is there.
+        beside: tables 2.1 and 2.3: weights of other methods, a row each; by default those that
+            ship. '--beside' without a name: none.
+        train: training folders, for two baselines (best depth of each row, nearest image).
+        train_without: names of training frames to leave out.
+        split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
     from depthpose.cli.depth import evaluating, methods
@@ -69,9 +69,9 @@ def reproduce(
         chosen += [("", other) for other in others if other.name not in names]
     if train:
         training = evaluating.open_training(train, train_without)
-        floors = [methods.floor_method(name, training) for name in ("rows", "nearest")]
-        # A floor looks at no right view, but is measured on the frames of the other rows.
-        chosen += [("", floor._replace(with_right=published.with_right)) for floor in floors]
+        baselines = [methods.floor_method(name, training) for name in ("rows", "nearest")]
+        # A baseline uses no right image, but is measured on the frames of the other rows.
+        chosen += [("", one._replace(with_right=published.with_right)) for one in baselines]
     order = reproducing.Order(
         table=published,
         dataset=dataset,

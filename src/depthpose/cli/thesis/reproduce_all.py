@@ -1,4 +1,4 @@
-"""``depthpose reproduce all``: from a data set on disk to every table of a chapter."""
+"""``depthpose reproduce all``: from a data set on disk to all tables of a chapter."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -14,18 +14,18 @@ _POSE = {
     "thesis-depth-image": "depth-image",
     "thesis-masks": "segmentation",
 }
-"""Configs of chapter 3, and which network each trains; its weights are called so too."""
+"""Configs of chapter 3, the network that each trains, and the name of its weights."""
 
 
 class Step(NamedTuple):
     """One command.
 
     Attributes:
-        what: in words.
-        words: what follows ``depthpose``.
-        makes: the file that is there when it is done.
-        of: files of earlier steps that it reads; where one is newer, it is not done.
-        is_replaced: an older ``makes`` is deleted first, as the command takes the place of nothing.
+        what: its description.
+        words: arguments of ``depthpose``.
+        makes: the file that it writes.
+        of: files of earlier steps that it reads; it is done again if one is newer.
+        is_replaced: an older ``makes`` is deleted first, because the command replaces no file.
     """
 
     what: str
@@ -53,7 +53,7 @@ class Source(NamedTuple):
 
     @property
     def table_device(self) -> str:
-        """What the commands of tables call the device."""
+        """Name of the device for the commands of tables."""
         import torch
 
         return "cuda" if self.device == "auto" and torch.cuda.is_available() else "cpu"
@@ -68,14 +68,13 @@ def reproduce_all(
     protocol: str = "eigen-raw",
     device: Literal["auto", "cpu"] = "auto",
 ) -> int:
-    """Make every table of the thesis again, from data on disk: trainings first, then tables.
+    """Reproduce all tables of the thesis from data on disk: trainings first, then tables.
 
     From KITTI: the generator, the matcher and fine-tuning, then tables 2.1, 2.2 and 2.3. From
     Linemod_preprocessed: the network of directions, its two baselines and the segmentation, then
     tables 3.1, 3.2 and 3.3, with true and with found masks, poses by votes alone as published.
-    Each step is a command of its own, which is printed; what is done is not done again, and a
-    training that was stopped goes on, so the same command again is all that it takes. The thesis's
-    trainings are days of a GPU.
+    Each step is a command, which is printed. Run again, it skips finished steps and resumes an
+    interrupted training. The thesis's trainings take days on a GPU.
 
         depthpose reproduce all --kitti /data/kitti --out out/thesis
         depthpose reproduce all --linemod /data/Linemod_preprocessed --out out/thesis
@@ -86,9 +85,9 @@ def reproduce_all(
         linemod: Linemod_preprocessed.
         configs: folder of depth/view.yaml, stereo.yaml, finetune.yaml, and of pose/thesis.yaml,
             thesis-pointnet.yaml, thesis-depth-image.yaml, thesis-masks.yaml (see the repository).
-        split: KITTI frames of the tables: eigen-test, a file of frames, or 'all' that is there.
+        split: KITTI frames of the tables: eigen-test, a file of frames, or all.
         protocol: how depth is compared; eigen-raw is the thesis's.
-        device: auto takes a GPU where there is one; cpu takes none.
+        device: auto: a GPU where there is one; cpu: none.
     """
     from depthpose.core.run import find_shard
 
@@ -97,7 +96,7 @@ def reproduce_all(
     if find_shard().world > 1:
         raise InputError(
             "'reproduce all' runs its steps one after the other in one process; launch the "
-            "trainings that it prints by themselves, and it goes on from what they leave"
+            "trainings that it prints one by one, then run it again"
         )
     steps: list[Step] = []
     if kitti is not None:
@@ -108,7 +107,7 @@ def reproduce_all(
 
 
 def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
-    """Give the way from KITTI to tables 2.1, 2.2 and 2.3.
+    """List the steps from KITTI to tables 2.1, 2.2 and 2.3.
 
     Raises:
         InputError: frames of the tables are missing, or the folder is that of other settings.
@@ -145,7 +144,7 @@ def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
 
 
 def pose_steps(source: Source) -> list[Step]:
-    """Give the way from Linemod_preprocessed to tables 3.1, 3.2 and 3.3.
+    """List the steps from Linemod_preprocessed to tables 3.1, 3.2 and 3.3.
 
     Raises:
         InputError: test frames are missing, or the folder is that of other settings.
@@ -179,7 +178,7 @@ def pose_steps(source: Source) -> list[Step]:
 
 
 def walk(steps: Sequence[Step]) -> int:
-    """Run what is not done; stop at the first step that cannot be done.
+    """Run the steps that are not done; stop at the first that fails.
 
     Returns:
         The exit code of the commands: the one that stopped, or the largest.
@@ -205,7 +204,7 @@ def walk(steps: Sequence[Step]) -> int:
 def _training(
     source: Source, words: Sequence[str], config: str, makes: Path, of: Sequence[Path] = ()
 ) -> Step:
-    """Make the step of a training, which goes on where it was stopped."""
+    """Make the step of a training, which is resumed if it was stopped."""
     end = ("--config", str(source.configs / config), "--data", str(source.data))
     end += ("--out", str(makes.parent), "--device", source.device, "--resume")
     return Step(f"training by {config}", (*words, *end), makes, of)
@@ -221,7 +220,7 @@ def _table(
 
 
 def _claim(home: Path, source: Source, configs: Sequence[str], settings: Mapping[str, str]) -> None:
-    """Make the folder the home of this data, these configs and this way of measuring."""
+    """Claim the folder for this data, these configs and this protocol."""
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.run import claim_folder
 
@@ -229,7 +228,7 @@ def _claim(home: Path, source: Source, configs: Sequence[str], settings: Mapping
     if missing:
         raise InputError(
             f"{source.configs}: there is no {missing[0]}; give the folder of the thesis's configs, "
-            "which lies in the repository, by --configs"
+            "which is in the repository, by --configs"
         )
     files = {name: file_sha256(source.configs / name) for name in configs}
     claim_folder(home, {"data": str(source.data.resolve()), "configs": files, **settings})

@@ -12,24 +12,26 @@ def table_3_1(
     data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
     estimates: PoseTable = PoseTableOptions(),  # noqa: B008  frozen
 ) -> int:
-    """Make table 3.1 again: the method beside its baselines, by object, on the same data.
+    """Reproduce table 3.1: the method beside its baselines, by object, on the same data.
 
     Give weights of the method first, then of the baselines (kinds pointnet and depth-image): each
     is run by the estimator of its kind. Writes rows.json, rows.csv, table.md (percent by object),
-    all.json (every number), instances.csv, report.md and report.html. The thesis's own numbers are
-    not in the text that is at hand: the differences are those of the first weights to the others.
+    all.json (every number), instances.csv, report.md and report.html. The thesis's own
+    numbers are not at hand: differences are those of the first weights to the others.
 
         depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
 
     Args:
-        weights: the method's, then those of each baseline; open3d is registration by Open3D (an
-            extra), which has none.
-        out: folder for all that is written.
+        weights: the method's, then those of each baseline; open3d is Open3D's registration
+            (an extra), which needs no weights.
+        out: folder to write to.
     """
     from depthpose.cli.thesis.pose_tables import make_order, reproduce_by_object
 
     if len(weights) < 2:
-        raise InputError("table 3.1 sets the method beside its baselines: give two weights or more")
+        raise InputError(
+            "table 3.1 compares the method with its baselines: give two weights or more"
+        )
     return reproduce_by_object(make_order("3.1", data, estimates), weights, estimates, out)
 
 
@@ -40,7 +42,7 @@ def table_3_2(
     data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
     estimates: PoseTable = PoseTableOptions(),  # noqa: B008  frozen
 ) -> int:
-    """Make table 3.2 again: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
+    """Reproduce table 3.2: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
 
     Writes rows.json, rows.csv, table.md (percent by object), all.json (every number),
     instances.csv, report.md and report.html. Masks truth and predicted are two rows of ours.
@@ -48,7 +50,7 @@ def table_3_2(
         depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W --out out/table-3.2
 
     Args:
-        out: folder for all that is written.
+        out: folder to write to.
         weights: files or names.
         csv: BOP results of any method, each a row of ours.
     """
@@ -66,7 +68,7 @@ def table_3_3(
     made: int = 40,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
 ) -> int:
-    """Make table 3.3 again: RANSAC against least squares on the same directions of one network.
+    """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
 
     Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50,
     128 and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:

@@ -1,4 +1,4 @@
-"""Views with truth that tables and figures of the pose room are made of: a data set's, or made."""
+"""Views with truth for tables and figures of poses: of a data set, or synthetic."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from depthpose.report.choose import spread_evenly
 from depthpose.report.overlay import grey_depth
 
 MADE_SEED = 3303
-"""Of made views of tables and figures: no training begins with it."""
+"""Of synthetic views for tables and figures; no training uses it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

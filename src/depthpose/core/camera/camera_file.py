@@ -27,9 +27,9 @@ from depthpose.core.files.text import MAX_LIST_BYTES
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
-    """Read a camera; a :class:`StereoRig` where the file says a baseline.
+    """Read a camera; a :class:`StereoRig` where the file has a baseline.
 
-    The format is told by the content: JSON of ours or of BOP, KITTI, Middlebury, TUM, ROS, OpenCV,
+    The format is recognised by the content: our JSON, BOP, KITTI, Middlebury, TUM, ROS, OpenCV,
     ORB-SLAM (``docs/conventions.md``). A folder may hold the two files of a pair.
 
     Args:
@@ -52,7 +52,7 @@ def read_rig(path: AnyPath, size: Size | None = None) -> StereoRig:
     """Read a stereo rig; see :func:`read_camera`.
 
     Raises:
-        InputError: as there, or the file says no baseline.
+        InputError: as there, or the file has no baseline.
     """
     camera = read_camera(path, size)
     if isinstance(camera, StereoRig):
@@ -200,6 +200,6 @@ def _from_mapping(camera: Mapping[str, Any], size: Size) -> CameraFacts:
     keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
     if {"width", "height"} & keys.keys():
         return facts_from_json(keys)
-    # Without a size of its own the matrix may be that of another resolution: that is looked at.
+    # Without a size of its own the matrix may be that of another resolution: that is checked.
     facts = facts_from_json({"width": size[0], "height": size[1], **keys})
     return replace(facts, size=None)

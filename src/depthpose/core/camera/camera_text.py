@@ -105,7 +105,7 @@ def kitti_matrix(
 
 
 def kitti_size(keys: Mapping[str, list[float]], camera: str = "02") -> Size | None:
-    """Size of the rectified images, where a calibration says it (``S_rect_02``)."""
+    """Size of the rectified images, where a calibration has it (``S_rect_02``)."""
     said = keys.get(f"S_rect_{camera}", [])
     return (int(said[0]), int(said[1])) if len(said) == 2 else None
 

@@ -1,4 +1,4 @@
-"""What a camera file says, and whether it can be: from any format to one :class:`Camera`."""
+"""Values of a camera file, checked: from any format to one :class:`Camera`."""
 
 import json
 from dataclasses import dataclass
@@ -39,15 +39,15 @@ _CORNER = 0.1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraFacts:
-    """What a camera file says, before it is a camera: it may lack the image's size.
+    """Values of a camera file, before it is a camera: the image's size may be missing.
 
     Attributes:
         kind: what the file is, for errors.
         K: intrinsic matrix of the undistorted image [px].
-        size: of the image, where the file says it.
+        size: of the image, where the file has it.
         baseline_m: where there is a rig.
         cx_right_minus_left_px: difference of the principal points of a rig.
-        depth_unit_m: metres a unit of the depth images, where the file says it.
+        depth_unit_m: metres per unit of the depth images, where the file has it.
         distortion: coefficients of the lens; none, or zeros, for a pinhole.
         undistort: what takes the distortion out of an image.
     """
@@ -100,7 +100,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
 
     Args:
-        facts: what the file says.
+        facts: values of the file.
         size: of the image, for files that do not say it.
 
     Raises:
@@ -119,7 +119,7 @@ def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
     """Make a camera, or a rig where there is a baseline, without asking whether it is likely.
 
     Raises:
-        InputError: nobody knows the size, or a value is none of a camera.
+        InputError: the size is missing, or a value is impossible for a camera.
     """
     known = facts.size or size
     if known is None:

@@ -78,7 +78,7 @@ class RawPair:
 
 
 def read_raw_pair(path: AnyPath, *, unit_m: float = 1.0, is_fisheye: bool | None = None) -> RawPair:
-    """Read the calibration of a pair: of OpenCV, ROS or Kalibr, told by its content.
+    """Read the calibration of a pair: of OpenCV, ROS or Kalibr, recognised by its content.
 
     Args:
         path: the file, or the folder of the pair's two files.

@@ -78,7 +78,7 @@ def numbers(value: object) -> list[float] | None:
 
 
 class _Loader(YAML_LOADER):
-    """Plain values, OpenCV's tags taken for what they stand on."""
+    """Plain values, OpenCV's tags ignored."""
 
 
 def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: ANN401 - yaml's

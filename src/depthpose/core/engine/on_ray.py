@@ -27,7 +27,7 @@ class RayEngine:
     Attributes:
         address: of a running cluster, ``auto`` for the one of this machine; None starts one here,
             and ends it afterwards.
-        workers: at most; None: as many as the cluster has room for when the job begins.
+        workers: at most; None: as many as fit into the cluster when the job begins.
         worker_cpus: cores that a worker asks for.
         worker_gpus: GPUs that it asks for; a part lets workers share one.
     """
@@ -43,7 +43,7 @@ class RayEngine:
         """Do blocks, and give what became of each as it is done.
 
         Raises:
-            InputError: no cluster at the address, or no room in it for one worker.
+            InputError: no cluster at the address, or one worker does not fit into it.
             MissingExtraError: Ray is not installed.
         """
         ray = _import_ray()
@@ -80,15 +80,15 @@ class RayEngine:
         """Say how many workers fit into the cluster."""
         there: Mapping[str, float] = ray.cluster_resources()
         asked = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
-        room = min(int(there.get(name, 0) / n) for name, n in asked.items() if n > 0)
-        if room < 1:
+        most = min(int(there.get(name, 0) / n) for name, n in asked.items() if n > 0)
+        if most < 1:
             had = ", ".join(f"{there.get(name, 0):g} {name}" for name in asked)
             wanted = ", ".join(f"{n:g} {name}" for name, n in asked.items())
             raise InputError(
                 f"a worker asks for {wanted}, but the cluster has {had}; ask for less by "
                 "--worker-cpus and --worker-gpus"
             )
-        return room
+        return most
 
 
 class _Worker:
@@ -141,7 +141,7 @@ def _cause(error: BaseException) -> BaseException:
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
-    """Import Ray, which sends no statistics of its use unless it is told to.
+    """Import Ray, which sends no statistics of its use unless it is set to.
 
     Raises:
         MissingExtraError: it is not installed.

@@ -153,7 +153,7 @@ def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
 
 
 def _beside(path: str, folder: str) -> str:
-    """Read a relative path from where its manifest lies."""
+    """Read a relative path from its manifest's folder."""
     return path if is_url(path) or path.startswith("/") else absolute(join(folder, path))
 
 

@@ -22,13 +22,13 @@ from depthpose.core.run import environment, refuse_to_replace
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What becomes a file, and what holds it to account.
+    """What is written, and what it is compared with.
 
     Attributes:
         graph: writes the graph.
         cases: makes the inputs and PyTorch's answers.
         limits: how far each output may be off.
-        facts: what a user of the file must know; they stand in its metadata.
+        facts: for users of the file, in its metadata.
     """
 
     graph: Callable[[], Graph]
@@ -73,12 +73,12 @@ def freeze(path: Path, export: Export) -> list[Row]:
 
 
 def proof_path(path: Path) -> Path:
-    """Give the place of a graph's proof; NAME.json may be somebody's camera."""
+    """Give the path of a graph's proof; NAME.json may be a camera."""
     return path.with_suffix(".proof.json")
 
 
 MOST = 1 << 10
-"""Largest multiple of a side that the exporter is told of; the graph itself has no bound."""
+"""Largest multiple of a side that is given to the exporter; the graph itself has no bound."""
 
 
 def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
@@ -109,7 +109,7 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep back what the exporter says of its own insides; the proof is the judge."""
+    """Suppress the exporter's internal messages; the proof decides."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

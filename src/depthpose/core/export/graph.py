@@ -1,4 +1,4 @@
-"""A graph of ONNX operators, written line by line: what stands around and between networks.
+"""A graph of ONNX operators around and between exported networks.
 
 Operators are those of opset 18 (https://onnx.ai/onnx/operators), the first whose Resize averages
 where it shrinks.
@@ -15,11 +15,11 @@ from depthpose.core.errors import MissingExtraError
 
 OPSET = 18
 Shape = Sequence[int | str]
-"""Sides of a tensor; a word is a side that is known only when the graph runs."""
+"""Sides of a tensor; text names a side that is known only when the graph runs."""
 
 
 class Value:
-    """A tensor of a graph that is being written; arithmetic on it adds nodes."""
+    """A tensor of a graph; arithmetic on it adds nodes."""
 
     def __init__(self, graph: "Graph", name: str) -> None:
         self.graph = graph
@@ -107,7 +107,7 @@ class Graph:
         """Close the graph.
 
         Args:
-            facts: what a user of the file must know; each stands in its metadata, as text or JSON.
+            facts: for users of the file, each in its metadata, as text or JSON.
         """
         helper = self._onnx.helper
         graph = helper.make_graph(

@@ -39,7 +39,7 @@ class Limit:
         of: the largest difference, or the mean one where the answer itself jumps.
         is_relative: differences are shares of what PyTorch answers.
         flips: share of the numbers that may be off by more, or be NaN in one answer alone, and are
-            left out of the differences: where a decision lies on its border.
+            left out of the differences: where a decision is at its limit.
     """
 
     value: float

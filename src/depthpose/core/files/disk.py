@@ -59,7 +59,7 @@ def _refuse_irregular(path: AnyPath, status: os.stat_result, most: int) -> None:
 
 
 _ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")
-"""What Python shows of an object in memory, which nobody else can look at."""
+"""What Python shows of an object in memory."""
 _PART = ".part-"
 """Begins the names of files that are being written."""
 
@@ -152,6 +152,6 @@ def _sync(path: Path) -> None:
 
 
 def refused_suffix(path: AnyPath, kind: str, known: tuple[str, ...]) -> InputError:
-    """Make the error for a file name whose suffix says nothing to us."""
+    """Make the error for a file name with an unknown suffix."""
     suffix = Path(path).suffix or "no suffix"
     return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(known)}")

@@ -62,7 +62,7 @@ def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, i
 
 
 def _fetch(shard: Path) -> None:
-    """Bring a shard from where its folder says that it lies."""
+    """Fetch a shard from its folder's location."""
     from depthpose.core.files.store import fetch, join  # fsspec takes time to load
 
     source = shard.parent / SOURCE

@@ -31,7 +31,7 @@ def local_path(url: str) -> Path | None:
 
 
 def join(folder: str, *names: str) -> str:
-    """Name what lies in a folder."""
+    """List a folder."""
     return "/".join([folder.rstrip("/"), *names])
 
 

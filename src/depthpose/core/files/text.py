@@ -76,7 +76,7 @@ def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> 
     Args:
         path: of the file, for the error.
         data: its content.
-        memory_of: bytes that a value takes once it is read, by the sign that stands beside it.
+        memory_of: bytes that a value takes once it is read, by the sign that marks it.
 
     Raises:
         InputError: together they are more than is allowed.
@@ -109,7 +109,7 @@ def parse_yaml(path: AnyPath, text: str) -> object:
 def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references.
 
-    What is no YAML passes: the parser that comes next says so.
+    What is no YAML passes: the parser refuses it.
 
     Raises:
         InputError: that is so.

@@ -27,7 +27,7 @@ class Video:
     Attributes:
         path: the file.
         fps: frames a second.
-        frames: how many the file says it has; 0 where it does not say.
+        frames: the number in the file's header; 0 where it has none.
     """
 
     path: Path
@@ -127,7 +127,7 @@ def _encode(
     finally:
         if writer is not None:
             writer.release()
-    found = _count_frames(cv2, part)  # the encoder says nothing of a full disk
+    found = _count_frames(cv2, part)  # the encoder does not report a full disk
     if count == 0 or found != count:
         raise InputError(
             f"{path}: the encoder wrote {found} of {count} frames; free the space if the disk is "

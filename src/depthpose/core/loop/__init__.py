@@ -10,7 +10,15 @@ from depthpose.core.loop.journal import (
     run_files,
 )
 from depthpose.core.loop.loop import Interrupted, Progress, train
-from depthpose.core.loop.task import Evidence, Samples, Task, Turn, shuffled_index, ticket_generator
+from depthpose.core.loop.task import (
+    Evidence,
+    Samples,
+    Task,
+    Turn,
+    sample_generator,
+    shuffled_index,
+    ticket_generator,
+)
 
 __all__ = [
     "AdamConfig",
@@ -28,6 +36,7 @@ __all__ = [
     "make_adam",
     "read_metrics",
     "run_files",
+    "sample_generator",
     "shuffled_index",
     "ticket_generator",
     "train",

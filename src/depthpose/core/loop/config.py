@@ -72,10 +72,10 @@ class AdamConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig:
-    """How long and how a task is trained; the task says what."""
+    """How a task is trained, and for how long."""
 
     INSTEAD: ClassVar[dict[str, str]] = {"steps": "epochs", "epochs": "steps"}
-    """A config file that gives one of these takes the other's default away."""
+    """A config file that gives one of these removes the other's default."""
 
     steps: int | None = None
     """Optimiser steps; or give ``epochs``."""
@@ -100,10 +100,10 @@ class LoopConfig:
     """Decides order, augmentation and dropout; the initial weights are the task's."""
 
     save_every_steps: int = 200
-    """Steps that a kill can cost."""
+    """Steps between two saved states."""
 
     validate_every_steps: int = 1000
-    """Steps between two looks at held-out samples; the last step always looks."""
+    """Steps between two validations; there is always one after the last step."""
 
     log_every_steps: int = 10
     """Steps averaged into one line of metrics."""
@@ -162,7 +162,7 @@ def make_adam(
 
     Args:
         parameters: what it moves; or groups, whose ``rate`` is their share of the learning rate.
-        config: its knobs.
+        config: its settings.
     """
     betas = (config.beta1, config.beta2)
     # One pass over memory: a quarter of the time of torch's other two ways, on a CPU too.

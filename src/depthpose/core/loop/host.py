@@ -15,46 +15,61 @@ from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.loop.config import LoopConfig
 
-_PRECISIONS = {"fp32": "no", "bf16": "bf16", "fp16": "fp16"}
+_TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
-    """Bring up accelerate with the device and precision of a config.
+    """Bring up accelerate for the device and the processes of a training.
 
-    bf16 becomes fp32, with a notice, on a processor without it.
+    Precision is the loop's own (:class:`Arithmetic`): accelerate keeps that of a process's first
+    training, as it keeps the device.
 
     Raises:
         MissingExtraError: accelerate is not installed.
-        InputError: the precision needs a GPU.
+        InputError: a CPU is wanted, and this process has trained on a GPU before.
     """
     try:
         from accelerate import Accelerator
-        from accelerate.state import AcceleratorState
         from accelerate.utils import InitProcessGroupKwargs
     except ImportError as error:
         raise MissingExtraError("accelerate", "train", "training") from error
-    # A second training of this process may have another precision; accelerate keeps the first.
-    AcceleratorState._reset_state()
-    # The others wait while rank 0 looks at the held-out samples.
-    precision = usable_precision(config.precision, _device(config))
+    # The other processes wait while rank 0 validates.
     patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
-    accelerator = Accelerator(
-        cpu=config.device == "cpu",
-        mixed_precision=_PRECISIONS[precision],
-        kwargs_handlers=[patience],
-    )
-    if config.precision == "fp16" and accelerator.scaler is None:
+    on_cpu = config.device == "cpu"
+    try:
+        return Accelerator(mixed_precision="no", cpu=on_cpu, kwargs_handlers=[patience])
+    except ValueError as error:
         raise InputError(
-            "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has too."
-        )
-    return accelerator
+            f"device {config.device!r} cannot be used in this process, which has trained on "
+            f"another; start this training in a process of its own ({error})"
+        ) from error
 
 
-def _device(config: LoopConfig) -> torch.device:
-    """Give what accelerate will choose."""
-    is_accelerated = config.device != "cpu" and torch.accelerator.is_available()
-    found = torch.accelerator.current_accelerator() if is_accelerated else None
-    return found or torch.device("cpu")
+class Arithmetic:
+    """Autocast, and the scaling of the loss that fp16 needs."""
+
+    def __init__(self, config: LoopConfig, device: torch.device) -> None:
+        """Take the precision of a config; bf16 becomes fp32, with a notice, where it is unknown.
+
+        Args:
+            config: whose precision is taken.
+            device: where networks are.
+
+        Raises:
+            InputError: fp16 on a CPU.
+        """
+        if config.precision == "fp16" and device.type == "cpu":
+            raise InputError(
+                "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has "
+                "too."
+            )
+        self._device = device.type
+        self._type = _TYPES[usable_precision(config.precision, device)]
+        self.scaler = torch.amp.GradScaler(self._device, enabled=self._type is torch.float16)
+
+    def autocast(self) -> torch.autocast:
+        """Give the context of a forward pass."""
+        return torch.autocast(self._device, self._type, enabled=self._type is not None)
 
 
 def leave_signals_to_the_loop(_: int) -> None:
@@ -66,13 +81,13 @@ def leave_signals_to_the_loop(_: int) -> None:
 
 
 class Wish:
-    """What whoever runs a training asked it to do, by signals."""
+    """What the user asked a training to do, by signals."""
 
     def __init__(self) -> None:
         self._asked: list[tuple[int, float]] = []
 
     def remember(self, number: int, _: FrameType | None) -> None:
-        """Take a signal; the first Ctrl-C is told what a second one does."""
+        """Remember a signal; at the first Ctrl-C print what a second one does."""
         if not self._asked and number == signal.SIGINT:
             os.write(2, _SECOND.encode())  # print may be at work itself
         self._asked.append((number, time.monotonic()))
@@ -93,8 +108,8 @@ class Wish:
 PATIENCE_S = 3.0
 """Between the first Ctrl-C and the second."""
 _SECOND = (
-    "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: what "
-    "follows the last step is done, and the weights are written.\n"
+    "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: the "
+    "weights of the steps so far are written.\n"
 )
 
 

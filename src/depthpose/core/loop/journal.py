@@ -2,7 +2,7 @@
 
 ::
 
-    config.yaml        every knob (written by the caller)
+    config.yaml        every setting (written by the caller)
     run.json           settings, versions, machine, commit
     metrics.jsonl      one line each log step
     pictures/          what validation drew
@@ -187,7 +187,7 @@ def held_out_text(folder: Path, sentence: str) -> str:
 
     Args:
         folder: of the run.
-        sentence: what was looked at, and what the numbers mean.
+        sentence: what was evaluated, and what the numbers mean.
     """
     found = [
         {name: value for name, value in row.items() if name.startswith(_HELD_OUT)}

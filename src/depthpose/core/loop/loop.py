@@ -1,8 +1,8 @@
 """The loop itself, on Hugging Face accelerate.
 
-Accelerate brings devices, processes and precision. Gradients are averaged here, after the backward
-pass: that way a step may run any network any number of times (a discriminator sees a real and a
-fake pair), and N processes equal one that accumulates N micro-batches.
+Accelerate brings devices and processes, torch the precision. Gradients are averaged here, after the
+backward pass: that way a step may run any network any number of times (a discriminator is given a
+real and a fake pair), and N processes equal one that accumulates N micro-batches.
 """
 
 import math
@@ -19,7 +19,13 @@ from torch.utils.data import DataLoader
 from depthpose.core.errors import InputError
 from depthpose.core.hold import release_folders
 from depthpose.core.loop.config import LoopConfig
-from depthpose.core.loop.host import Wish, leave_signals_to_the_loop, make_accelerator, polite_stop
+from depthpose.core.loop.host import (
+    Arithmetic,
+    Wish,
+    leave_signals_to_the_loop,
+    make_accelerator,
+    polite_stop,
+)
 from depthpose.core.loop.journal import Journal
 from depthpose.core.loop.state import Parts, restore_last, saved_states
 from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
@@ -31,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """Where a training is, for whoever shows it.
+    """How far a training is.
 
     Attributes:
         step: steps done.
@@ -60,13 +66,13 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
 
     Args:
         task: what is trained.
-        samples: training samples by ticket.
+        samples: training samples by index.
         config: how long and how.
         folder: the run folder.
-        resume: go on from the folder's last state, or, where it is damaged, with a notice from the
-            one before; the result is that of an uninterrupted run.
-        finish: take the steps of that state for all, and go no further.
-        on_step: told after each step, in the main process.
+        resume: go on from the folder's last state; if it is damaged, with a notice from the one
+            before. The result equals that of an uninterrupted run.
+        finish: make weights of that state, without further steps.
+        on_step: called after each step, in the main process.
 
     Returns:
         What it took, in seconds, together with the runs that it resumed.
@@ -96,6 +102,8 @@ class _Run:
     def __init__(self, task: Task, samples: Samples, config: LoopConfig, folder: Path) -> None:
         self.task, self.samples, self.config = task, samples, config
         self.accelerator = make_accelerator(config)
+        self.arithmetic = Arithmetic(config, self.accelerator.device)
+        self.scaler = self.arithmetic.scaler
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
@@ -112,10 +120,7 @@ class _Run:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
         for module in self.task.modules.values():
             module.to(self.accelerator.device)
-        self.optimizers = {
-            name: self.accelerator.prepare(optimizer)
-            for name, (optimizer, _) in self.task.optimizers.items()
-        }
+        self.optimizers = {name: adam for name, (adam, _) in self.task.optimizers.items()}
         if not saved:
             self._agree_on_weights()
         if self.config.ema_decay is not None:
@@ -168,7 +173,7 @@ class _Run:
         return Parts(
             modules=self.task.modules,
             optimizers=self.optimizers,
-            scaler=self.accelerator.scaler,
+            scaler=self.scaler,
             average=self.average,
         )
 
@@ -190,13 +195,13 @@ class _Run:
             # Dropout follows the micro-batch, not the process that happens to hold it.
             micro = place * self.world + self.accelerator.process_index
             torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-            with self.accelerator.autocast():
+            with self.arithmetic.autocast():
                 turn = next(walk, None)
             if turn is None:
                 continue
             self._refuse_bad_loss(turn.optimizer, float(turn.loss.detach()))
             parameters = _parameters(self.optimizers[turn.optimizer])
-            self.accelerator.backward(turn.loss / len(walks), inputs=parameters)
+            self.scaler.scale(turn.loss / len(walks)).backward(inputs=parameters)
             self._remember({"loss": turn.loss.detach(), **turn.facts}, turn.optimizer)
             yield turn.optimizer
 
@@ -210,9 +215,10 @@ class _Run:
         if self.world > 1:
             self._average_gradients(parameters)
         if self.config.clip_norm is not None:
-            self.accelerator.unscale_gradients(optimizer)
+            self.scaler.unscale_(optimizer)
             torch.nn.utils.clip_grad_norm_(parameters, self.config.clip_norm)
-        optimizer.step()
+        self.scaler.step(optimizer)
+        self.scaler.update()
         optimizer.zero_grad()
 
     def _average_gradients(self, parameters: list[Tensor]) -> None:
@@ -227,7 +233,7 @@ class _Run:
         first = self.step * self.config.accumulate
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
-            batch_sampler=_Tickets(self, first),
+            batch_sampler=_SampleIndices(self, first),
             num_workers=self.config.workers,
             collate_fn=getattr(self.samples, "collate", None),
             pin_memory=self.accelerator.device.type == "cuda",
@@ -301,8 +307,8 @@ class _Run:
                     held.copy_(tensor)
 
 
-class _Tickets:
-    """Tickets of this process's micro-batches, from the first that is still to do.
+class _SampleIndices:
+    """Sample indices of this process's micro-batches, from the first that is still to do.
 
     Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N processes
     see in a step what one process sees that accumulates N times as much.

@@ -1,4 +1,4 @@
-"""The last two states of a training: written whole, and looked at before one is taken.
+"""The last two states of a training: written whole, and checked before one is used.
 
 ``state.pt`` is the last, ``state.before.pt`` the one before it.
 """
@@ -56,13 +56,13 @@ class Parts:
     Attributes:
         modules: networks by name.
         optimizers: with the averages of gradients that they keep, by name.
-        scaler: of the loss, in fp16 alone.
+        scaler: of the loss; its state is empty but in fp16.
         average: moving averages of the networks' tensors, where there are any.
     """
 
     modules: Mapping[str, nn.Module]
     optimizers: Mapping[str, Any]
-    scaler: Any
+    scaler: torch.amp.GradScaler
     average: Mapping[str, dict[str, Tensor]]
 
     def state(self) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Parts:
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
             "optimizers": {name: adam.state_dict() for name, adam in self.optimizers.items()},
-            "scaler": {} if self.scaler is None else self.scaler.state_dict(),
+            "scaler": self.scaler.state_dict(),
             "average": dict(self.average),
         }
 
@@ -80,7 +80,7 @@ class Parts:
             module.load_state_dict(state["modules"][name])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
-        if self.scaler is not None and state["scaler"]:
+        if self.scaler.is_enabled() and state["scaler"]:
             self.scaler.load_state_dict(state["scaler"])
         for name, held in self.average.items():
             for key, tensor in state["average"][name].items():

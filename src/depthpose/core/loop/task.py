@@ -1,4 +1,4 @@
-"""What a room hands to the loop, and the tickets that name its samples."""
+"""What a training gives to the loop: a task, and samples by index."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from depthpose.core.loop.config import AdamConfig
 
 
 class Turn(NamedTuple):
-    """One optimiser's turn in a step: the loss that it follows, and facts for the log."""
+    """One optimiser's part of a step: the loss that it minimises, and numbers for the log."""
 
     optimizer: str
     loss: Float[Tensor, ""]
@@ -21,7 +21,7 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """What a look at held-out samples found.
+    """What a validation found.
 
     Attributes:
         numbers: metrics by name.
@@ -34,7 +34,7 @@ class Evidence:
 
 @runtime_checkable
 class Task(Protocol):
-    """What is trained. The loop knows no network."""
+    """What is trained."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -43,52 +43,55 @@ class Task(Protocol):
 
     @property
     def optimizers(self) -> Mapping[str, tuple[torch.optim.Optimizer, AdamConfig]]:
-        """Optimisers with their knobs; a parameter belongs to one of them at most."""
+        """Optimisers with their settings; each parameter is in at most one of them."""
         ...
 
     def step(self, batch: Any) -> Iterator[Turn]:  # noqa: ANN401 - the task's own batch
-        """Yield one turn after the other; the optimiser has moved before the next is asked for.
+        """Yield one turn after the other; each optimiser steps before the next turn is computed.
 
         An adversarial task yields the discriminator's turn, then the generator's, whose loss then
-        sees the discriminator that has just learnt.
+        uses the updated discriminator.
         """
         ...
 
     def validate(self) -> Evidence:
-        """Look at held-out samples; the networks' mode is the task's to set and restore."""
+        """Evaluate held-out samples; the task sets and restores the networks' mode."""
         ...
 
 
 @runtime_checkable
 class Samples(Protocol):
-    """Training samples by ticket: the number of a sample in the whole training.
+    """Training samples by their index in the whole training, over all epochs.
 
-    What ticket n gives depends on n alone, so that any process can make it at any time: this is
-    what makes order, resuming and many processes one and the same thing.
+    Sample n depends on n alone, so any process can make it at any time: order, resuming and the
+    number of processes change nothing.
 
-    Where samples differ in size, a method ``collate`` (a list of samples to a batch) may stand
-    beside these two.
+    Where samples differ in size, there may be a method ``collate`` (a list of samples to a batch).
     """
 
     def __len__(self) -> int:
-        """Tickets of one epoch."""
+        """Samples of one epoch."""
         ...
 
-    def __getitem__(self, ticket: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors of the room's own
-        """Make the sample of a ticket."""
+    def __getitem__(self, sample_index: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors
+        """Make a sample."""
         ...
 
 
-def shuffled_index(ticket: int, count: int, seed: int) -> int:
-    """Index of the sample that a ticket draws: each epoch is a shuffle of its own."""
-    epoch, position = divmod(ticket, count)
+def shuffled_index(sample_index: int, count: int, seed: int) -> int:
+    """Turn an index in the whole training into one of the data; each epoch is shuffled anew."""
+    epoch, position = divmod(sample_index, count)
     order = torch.randperm(count, generator=_generator(seed, epoch, 1))
     return int(order[position])
 
 
-def ticket_generator(ticket: int, seed: int) -> torch.Generator:
-    """Random numbers for the augmentation of one ticket."""
-    return _generator(seed, ticket, 2)
+def sample_generator(sample_index: int, seed: int) -> torch.Generator:
+    """Random numbers for the augmentation of one sample."""
+    return _generator(seed, sample_index, 2)
+
+
+ticket_generator = sample_generator
+"""The name of before."""
 
 
 def mixed_seed(*numbers: int) -> int:
