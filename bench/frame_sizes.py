@@ -111,7 +111,7 @@ def measure(dataset: Dataset, net: FakestereoNet) -> dict[str, float]:
         for _ in tqdm(predict(net, readers, names, Path(home) / "p", {}), total=len(names)):
             pass
         (row,) = evaluate(dataset, Path(home) / "p", "eigen-raw-camera", (80.0,)).rows
-    return {name: round(row[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}
+    return {name: round(row.metrics[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}
 
 
 def main() -> None:
