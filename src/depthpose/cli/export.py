@@ -9,7 +9,7 @@ Format = Literal["onnx"]
 def export_depth(
     out: Path,
     weights: str = "default",
-    what: Literal["image", "pair"] | None = None,
+    what: str | None = None,
     format: Format = "onnx",
 ) -> int:
     """Write the depth networks as one file that runs without torch, and prove that it agrees.

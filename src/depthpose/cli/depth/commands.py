@@ -19,7 +19,7 @@ def predict(
     camera: Path | None = None,
     focal_px: float | None = None,
     weights: str = "default",
-    matcher: str = "psmnet",
+    matcher: str | None = None,
     answer: Answer | None = None,
     color_range: tuple[float, float] = (3.0, 80.0),
     device: str = "cpu",
@@ -50,8 +50,8 @@ def predict(
             BOP, ROS or OpenCV. A baseline in it is not looked at: one image has none.
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
         weights: weights with a generator, by name or file ('depthpose weights list').
-        matcher: what matches the drawn view: psmnet (that of the weights), sgbm (OpenCV's), or
-            other weights with a matcher, by name or file.
+        matcher: what matches the drawn view: sgbm (OpenCV's), or other weights with a matcher, by
+            name or file. Left out, or psmnet: that of the weights.
         answer: own: the generator's own disparity; matched: the matcher on left and drawn right
             view; joined: both. Left out: what the weights say; another matcher matches.
         color_range: metres of the brightest and the darkest colour, the same for all pictures.
@@ -67,6 +67,7 @@ def predict(
         engine: where the work is done.
     """
     from depthpose.cli.depth import methods, predicting
+    from depthpose.depth.stereo import is_own_matcher
 
     config = MatcherConfig(
         device=device, precision=precision, max_memory_bytes=methods.parse_bytes(max_memory)
@@ -75,21 +76,24 @@ def predict(
         raise InputError(f"--color-range {color_range}: give near and far metres, near first.")
     if batch < 1:
         raise InputError(f"--batch {batch}: one image at least goes through the networks; take 1.")
-    if matcher != "psmnet" and answer is not None:
+    is_own = is_own_matcher(matcher)
+    if not is_own and answer is not None:
         raise InputError(
             f"--answer {answer} and --matcher {matcher}: another matcher matches the drawn view; "
             "leave one away."
         )
     if matcher == "sgbm" and config != MatcherConfig():
-        raise InputError("--device, --precision and --max-memory are for psmnet; leave them away.")
+        raise InputError(
+            "--device, --precision and --max-memory are for matchers with weights; sgbm takes none."
+        )
     look = predicting.Look(range_m=color_range, with_cloud=cloud, batch=batch)
     if engine.is_ray:
         from depthpose.cli.depth import engine as engine_depth
 
-        if matcher not in ("psmnet", "sgbm"):
+        if not is_own and matcher != "sgbm":
             raise InputError(
-                f"--matcher {matcher}: --engine ray takes psmnet or sgbm; make one file of both by "
-                "'depthpose weights pack G --matcher S --out W'"
+                f"--matcher {matcher}: --engine ray takes sgbm or the weights' own; make one file "
+                "of both by 'depthpose weights pack G --matcher S --out W'"
             )
         recipe = engine_depth.NetRecipe(
             weights=Weights.read(weights),
@@ -120,7 +124,7 @@ def match(
     camera: Path,
     out: str,
     weights: str | None = None,
-    matcher: str = "psmnet",
+    matcher: str | None = None,
     device: str = "cpu",
     speed: Speed = "fine",
     precision: Precision = "fp32",
@@ -150,8 +154,8 @@ def match(
             Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
         out: folder for the results.
         weights: weights with a matcher, by name or file; 'default' unless sgbm matches.
-        matcher: what matches the two views: psmnet (that of the weights), sgbm (OpenCV's, which
-            needs none), or weights with a matcher, by name or file.
+        matcher: what matches the two views: sgbm (OpenCV's, which needs no weights), or weights
+            with a matcher, by name or file. Left out, or psmnet: that of the weights.
         device: cpu, cuda, cuda:1, ...
         speed: quick: at the focal length that the weights were trained at; fine: at up to 280,000
             pixels, for KITTI in 3 to 4 times the time.
@@ -179,7 +183,7 @@ def match(
     if weights is None and config != MatcherConfig():
         raise InputError(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
-            "psmnet; sgbm takes none of them."
+            "matchers with weights; sgbm takes none of them."
         )
     if engine.is_ray:
         return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
@@ -198,9 +202,11 @@ def match(
     return matching.match_all(pairs, method, Path(out), with_cloud=cloud)
 
 
-def _weights_that_match(weights: str | None, matcher: str) -> str | None:
+def _weights_that_match(weights: str | None, matcher: str | None) -> str | None:
     """Name the weights whose matcher matches; None where sgbm does."""
-    if matcher == "psmnet":
+    from depthpose.depth.stereo import is_own_matcher
+
+    if is_own_matcher(matcher):
         return "default" if weights is None else weights
     if weights is not None:
         raise InputError(

@@ -17,7 +17,7 @@ from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig,
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
-from depthpose.depth.stereo import with_usable_precision
+from depthpose.depth.stereo import MATCHERS, is_own_matcher, with_usable_precision
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
@@ -39,7 +39,7 @@ def weights_method(
     config: MatcherConfig,
     *,
     with_right: bool | None = None,
-    matcher: str = "psmnet",
+    matcher: str | None = None,
     with_unlike: bool = True,
     answer: Answer | None = None,
 ) -> Method:
@@ -49,8 +49,8 @@ def weights_method(
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
         with_right: show it the real right view; by default only to a matcher, which needs it.
-        matcher: what matches the drawn view: psmnet (the weights' own), sgbm (OpenCV's), or that
-            of other weights, by name or file.
+        matcher: what matches the drawn view: None or a kind such as psmnet (the weights' own),
+            sgbm (OpenCV's), or that of other weights, by name or file.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
@@ -61,14 +61,15 @@ def weights_method(
     config = with_usable_precision(config)  # what is computed in is what is recorded
     path = find_weights(weights)
     kind = read_checkpoint(path).kind
-    is_shown = kind == "psmnet" if with_right is None else with_right
-    if kind == "psmnet" and not is_shown:
+    is_matcher = kind in MATCHERS
+    is_shown = is_matcher if with_right is None else with_right
+    if is_matcher and not is_shown:
         raise InputError(
             f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
             "synthesise the right view."
         )
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
-    if kind != "psmnet":
+    if not is_matcher:
         facts["sees"] = "both views" if is_shown else "left view"
     if matcher == "sgbm":
         facts["matcher"] += " with sgbm"
@@ -78,8 +79,8 @@ def weights_method(
         )
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
     config = replace(config, device=own_device(config.device))
-    if matcher != "psmnet":
-        other = find_weights(matcher)
+    if not is_own_matcher(matcher):
+        other = find_weights(str(matcher))
         facts["matcher"] += f" with {other.stem}"
         facts["matcher_sha256"] = file_sha256(other)
         net = FakestereoNet.load(
@@ -93,7 +94,7 @@ def weights_method(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
             "weights with one, or sgbm."
         )
-    name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
+    name = f"{path.stem}-both" if is_shown and not is_matcher else path.stem
     if answer is not None:
         facts["answer"] = answer
         name += f"-{answer}"

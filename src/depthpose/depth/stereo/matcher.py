@@ -10,6 +10,7 @@ from torch import Tensor
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.types import Match
 
 
@@ -54,6 +55,21 @@ class CameraMatcher(Matcher, Protocol):
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
         """Rows and columns at which it looks at the images of a camera [px]."""
+        ...
+
+
+@runtime_checkable
+class TiledMatcher(Matcher, Protocol):
+    """A matcher that can match in tiles, and the whole image all the same."""
+
+    config: MatcherConfig
+
+    def match_whole(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair without tiles, whatever the config says.
+
+        Raises:
+            InputError: as for ``match``.
+        """
         ...
 
 

@@ -22,7 +22,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.stereo.inference import PSMNetInference
-from depthpose.depth.stereo.matcher import check_pair
+from depthpose.depth.stereo.matcher import TiledMatcher, check_pair
 from depthpose.depth.stereo.plan import Footprint, Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.types import Match
@@ -243,7 +243,7 @@ def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Mat
     return Match(disparity_px=found.disparity_px, confidence=confidence)
 
 
-def tile_change_px(matcher: PSMNetMatcher, left: Tensor, right: Tensor) -> float:
+def tile_change_px(matcher: TiledMatcher, left: Tensor, right: Tensor) -> float:
     """Mean difference that tiles make to the disparity of a pair [px].
 
     Raises:

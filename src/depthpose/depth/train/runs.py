@@ -33,7 +33,7 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.depth.weights import read_generator, read_psmnet, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Knobs of the loop that change no weight: a resumed run may have others."""
@@ -132,7 +132,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=True)
     matcher = PSMNet(config.matcher)
     if config.start is not None:
-        _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
+        _start_from(matcher, read_psmnet(find_weights(config.start)), config.start)
     facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
 
@@ -147,7 +147,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
                 "train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
-    matcher = read_matcher(find_weights(config.matcher))
+    matcher = read_psmnet(find_weights(config.matcher))
     config = replace(config, pairs=_at_virtual_focal(config.pairs, generator.config))
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)

@@ -13,7 +13,7 @@ from depthpose.core.loop import Evidence, Turn, make_adam, ticket_generator
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
-from depthpose.depth.losses import log_disparity_loss, plane_loss, view_loss
+from depthpose.depth.losses import DISPARITY_LOSSES, plane_loss, view_loss
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.synthesis.selection import log_expectation, mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
@@ -133,14 +133,11 @@ class SelectTask:
     def _truth_loss(
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Float[Tensor, "b h w"]
     ) -> Float[Tensor, ""]:
-        """Punish wrong disparity of one view."""
+        """Losses of the disparity of one view."""
         planes, range_px = self.generator.planes, self.generator.config.disparity_px
         log_px = log_expectation(logits, planes)[:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
-        if self.config.disparity_loss == "log":
-            loss = log_disparity_loss(log_px[:, 0], truth_px, range_px)
-        else:
-            loss = _pixel_loss(log_px[:, 0].exp(), truth_px, range_px[1])
+        loss = DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
         # The nearest point of the four pixels that a logit stands for; unknown is -1.
@@ -158,15 +155,6 @@ class SelectTask:
         evidence = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
         self._train()
         return evidence
-
-
-def _pixel_loss(
-    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], most_px: float
-) -> Float[Tensor, ""]:
-    """Mean absolute disparity error over the pixels with truth, relative to the largest."""
-    is_known = truth_px > 0
-    error = torch.where(is_known, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
-    return error.sum() / is_known.sum().clamp(min=1) / most_px
 
 
 def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> Evidence:
