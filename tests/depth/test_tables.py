@@ -92,7 +92,7 @@ def test_another_protocol_is_said_in_the_difference() -> None:
     }  # fmt: skip
 
 
-def test_floors_and_other_caps_have_no_difference() -> None:
+def test_baselines_and_other_caps_have_no_difference() -> None:
     ours = [("", OURS), ("thesis, Ours", replace(OURS, cap_m=30.0))]
     rows = join_published(find_table("2.2"), ours)
     assert [row.source for row in rows].count("ours") == 2

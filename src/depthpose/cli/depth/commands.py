@@ -7,7 +7,7 @@ import tyro
 
 from depthpose.cli.engine import EngineOptions, Weights
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, FloorName, MatcherConfig, Speed
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
 Precision = Literal["fp32", "bf16"]
 Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
@@ -245,7 +245,7 @@ def evaluate(
     weights: tuple[str, ...] = (),
     matcher: Literal["sgbm"] | None = None,
     predictions: str | None = None,
-    floor: tuple[FloorName, ...] = (),
+    baseline: Annotated[tuple[BaselineName, ...], tyro.conf.arg(aliases=("--floor",))] = (),
     train: tuple[Path, ...] = (),
     train_without: tuple[str, ...] = (),
     protocol: str = "eigen-raw",
@@ -279,9 +279,9 @@ def evaluate(
         matcher: sgbm measures OpenCV's StereoSGBM on both views, and no weights.
         predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
             that 'depth predict|match --engine ray' left, path or URL.
-        floor: what every method must beat: rows (the best constant depth of each image row) or
+        baseline: what every method must beat: rows (the best constant depth of each image row) or
             nearest (the depth of the training image that looks most alike), or both.
-        train: folders with the frames that a floor is fitted to.
+        train: folders with the frames that a baseline is fitted to.
         train_without: names of frames to keep out of them.
         protocol: how prediction and truth are compared.
         cap: metres beyond which truth does not count; a row each.
@@ -301,9 +301,10 @@ def evaluate(
     from depthpose.depth.evaluate import find_protocol
     from depthpose.report.tables import table_files
 
-    if not weights and matcher is None and predictions is None and not floor:
+    if not weights and matcher is None and predictions is None and not baseline:
         raise InputError(
-            "measure --weights FILE, --matcher sgbm, --predictions DIR or --floor rows, or several."
+            "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
+            "several."
         )
     rule = find_protocol(protocol)
     dataset = evaluating.open_frames(data, split)
@@ -313,9 +314,9 @@ def evaluate(
     memory = methods.parse_bytes(max_memory)
     config = MatcherConfig(device=device, speed=speed, precision=precision, max_memory_bytes=memory)
     chosen += [methods.named_method(word, config) for word in weights]
-    if floor:
+    if baseline:
         training = evaluating.open_training(train, train_without)
-        chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
+        chosen += [methods.baseline_method(name, training) for name in dict.fromkeys(baseline)]
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate"}, files)

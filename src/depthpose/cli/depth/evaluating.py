@@ -76,9 +76,11 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str]) -> Dataset:
-    """Open the frames that a floor is fitted to."""
+    """Open the frames that a baseline is fitted to."""
     if not folders:
-        raise InputError("a floor is fitted to training frames: give --train FOLDER, or several.")
+        raise InputError(
+            "a baseline is fitted to training frames: give --train FOLDER, or several."
+        )
     return join_datasets([open_dataset(folder) for folder in folders], without)
 
 

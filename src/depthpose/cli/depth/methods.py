@@ -12,8 +12,8 @@ from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import own_device
-from depthpose.depth.baselines import NearestImageFloor, RowDepthFloor
-from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig, Speed
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConfig, Speed
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
@@ -128,12 +128,12 @@ def sgbm_method(*, with_filled_holes: bool) -> Method:
     return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
 
 
-def floor_method(name: FloorName, training: Dataset) -> Method:
-    """Fit a floor to the truth of training frames."""
-    kinds = {"rows": RowDepthFloor, "nearest": NearestImageFloor}
+def baseline_method(name: BaselineName, training: Dataset) -> Method:
+    """Fit a baseline to the truth of training frames."""
+    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
-        "matcher": f"floor: {name}",
+        "matcher": f"baseline: {name}",
         "sees": "left view" if name == "nearest" else "no image",
         "train": training.name,
         "train_frames": len(training),
@@ -143,7 +143,7 @@ def floor_method(name: FloorName, training: Dataset) -> Method:
     def show(frames: Sequence[int]) -> Iterable[int]:
         return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
 
-    return Method(f"floor-{name}", kinds[name].fit(training, show), settings, with_right=False)
+    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
 
 
 def parse_bytes(text: str | None) -> int | None:

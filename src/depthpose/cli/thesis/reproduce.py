@@ -46,7 +46,7 @@ def reproduce(
         matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
         beside: tables 2.1 and 2.3: weights of another method, a row each beside the thesis's; by
             default those that ship, whose generator selects. '--beside' without a name: none.
-        train: training folders: adds the two floors (best depth of each row, nearest image).
+        train: training folders: adds the two baselines (best depth of each row, nearest image).
         train_without: names of training frames to keep out.
         protocol: how prediction and truth are compared; eigen-raw is the thesis's.
         cap: metres beyond which truth does not count.
@@ -76,9 +76,9 @@ def reproduce(
         chosen += [("", other) for other in others if other.name not in names]
     if train:
         training = evaluating.open_training(train, train_without)
-        floors = [methods.floor_method(name, training) for name in ("rows", "nearest")]
-        # A floor looks at no right view, but is measured on the frames of the other rows.
-        chosen += [("", floor._replace(with_right=published.with_right)) for floor in floors]
+        baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
+        # A baseline uses no right view, but is measured on the frames of the other rows.
+        chosen += [("", one._replace(with_right=published.with_right)) for one in baselines]
     order = reproducing.Order(
         table=published,
         dataset=dataset,
