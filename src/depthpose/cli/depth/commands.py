@@ -47,7 +47,7 @@ def predict(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
         camera: JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D,
-            BOP, ROS or OpenCV. A baseline in it is not looked at: one image has none.
+            BOP, ROS or OpenCV. A baseline in it is ignored: one image has none.
         focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
         weights: weights with a generator, by name or file ('depthpose weights list').
         matcher: what matches the drawn view: sgbm (OpenCV's), or other weights with a matcher, by
@@ -162,10 +162,10 @@ def match(
         precision: fp32, or bf16: faster, at some hundredths of a pixel.
         max_memory: bound on the memory of activations, such as 1GB or 800MB; exact.
         tile: match tiles of so many rows and columns: less memory and approximate. The first
-            pair is matched whole as well, and the change of its disparity is said.
+            pair is matched whole as well, and the change of its disparity is printed.
         left_right_check: match the mirrored pair too, which makes the confidence better.
         cloud: write a coloured point cloud, NAME.cloud.ply.
-        check: look at the first pair for swapped or unrectified images before any work.
+        check: check the first pair for swapped or unrectified images before any work.
         engine: where the work is done.
     """
     from depthpose.cli.depth import matching, methods
@@ -188,7 +188,9 @@ def match(
     if engine.is_ray:
         return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
     if right is None:
-        raise InputError(f"{left}: there is no right image beside it; give it as the second word")
+        raise InputError(
+            f"{left}: there is no right image beside it; give it as the second argument"
+        )
     pairs = matching.Pairs.find(left, right, camera)
     refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
     if check:
@@ -290,7 +292,7 @@ def evaluate(
         holes: sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out
             (then the column 'coverage' says what share was measured).
         device: cpu, cuda, cuda:1, ...
-        speed: of matching real pairs, quick or fine; 'quick:NAME' and 'fine:NAME' say it for one.
+        speed: of matching real pairs, quick or fine; 'quick:NAME' and 'fine:NAME' set it for one.
         precision: fp32 or bf16.
         max_memory: bound on the memory of activations, such as 1GB.
         engine: where --predictions that are shards are measured; the numbers are the same.

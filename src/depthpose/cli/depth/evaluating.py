@@ -141,7 +141,7 @@ def measure_each(
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Let each row say whose predictions it is of.
+    """Write into each row whose predictions it is of.
 
     Args:
         result: of one set of predictions.

@@ -70,7 +70,7 @@ def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
 
 
 def refuse_unusable_first(pairs: Pairs) -> None:
-    """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    """Check the first pair before any work: swapped, unrectified or of the wrong size."""
     refuse_unrectified_pair(pairs.read(0))
 
 

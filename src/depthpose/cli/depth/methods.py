@@ -1,4 +1,4 @@
-"""Methods by their words on the command line, with what decides their results."""
+"""Methods by their names on the command line, with what decides their results."""
 
 import hashlib
 import re
@@ -25,7 +25,7 @@ _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 class Method(NamedTuple):
     """An estimator, what to call it, and the JSON values that decide its results.
 
-    ``with_right`` says whether it is shown the real right view.
+    ``with_right`` says whether it is given the real right view.
     """
 
     name: str
@@ -48,7 +48,7 @@ def weights_method(
     Args:
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
-        with_right: show it the real right view; by default only to a matcher, which needs it.
+        with_right: give it the real right view; by default only to a matcher, which needs it.
         matcher: what matches the drawn view: None or a kind such as psmnet (the weights' own),
             sgbm (OpenCV's), or that of other weights, by name or file.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
@@ -56,7 +56,7 @@ def weights_method(
 
     Raises:
         InputError: a matcher alone is asked to do without the right view, or weights without a
-            matcher to look at it.
+            matcher for it.
     """
     config = with_usable_precision(config)  # what is computed in is what is recorded
     path = find_weights(weights)
@@ -102,7 +102,7 @@ def weights_method(
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:
-    """Build the method of a word: weights by file or name, perhaps with ``both:`` and the like.
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like.
 
     ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
     ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.

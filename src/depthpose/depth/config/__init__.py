@@ -1,4 +1,4 @@
-"""Every knob of the depth room: frozen dataclasses that refuse a value where it is born."""
+"""Settings of depth: frozen dataclasses that refuse unusable values."""
 
 from depthpose.depth.config.data import AugmentConfig as AugmentConfig
 from depthpose.depth.config.data import DegradeConfig as DegradeConfig

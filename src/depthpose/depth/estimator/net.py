@@ -89,7 +89,7 @@ class FakestereoNet:
         self.weights = weights
 
     def __repr__(self) -> str:
-        """Say it in one line: what draws and what matches, weights, device."""
+        """Give one line: what draws and what matches, weights, device."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
         said = [" + ".join(type(part).__name__ for part in parts)]
         said += [f"weights {self.weights!r}"] if self.weights else []
@@ -180,7 +180,7 @@ class FakestereoNet:
                 ``image[..., ::-1]``).
             camera: camera or rig, its file of any format that is read, a dict of what such a file
                 holds, or the 3x3 matrix K. One image needs its focal length, for the image is
-                brought to the rig that the generator imitates; a baseline is not looked at. A pair
+                brought to the rig that the generator imitates; a baseline is ignored. A pair
                 without camera gives disparity only.
             focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
@@ -274,11 +274,11 @@ class FakestereoNet:
             return found
         known = [float(confidence.mean()) for confidence in drawn.confidence]
         return [
-            self._told_apart(image.name, replace(one, familiarity=familiarity))
+            self._checked_familiarity(image.name, replace(one, familiarity=familiarity))
             for image, one, familiarity in zip(images, found, known, strict=True)
         ]
 
-    def _told_apart(self, name: str, found: DepthEstimate) -> DepthEstimate:
+    def _checked_familiarity(self, name: str, found: DepthEstimate) -> DepthEstimate:
         """Refuse an image that is unlike what the weights know, or warn of it."""
         assert self.synthesiser is not None, "checked before"
         assert found.familiarity is not None

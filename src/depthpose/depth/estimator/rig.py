@@ -78,7 +78,7 @@ def from_virtual(
 def join_matches(one: Match, other: Match) -> Match:
     """Take the mean of two disparities in the logarithm, weighed by their confidence.
 
-    Where ``other`` has no answer, or no confidence, ``one`` stands.
+    Where ``other`` has no answer, or no confidence, ``one`` is taken.
     """
     assert one.confidence is not None
     weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence

@@ -1,7 +1,7 @@
-"""The networks of this room as one ONNX graph, with all that the estimator does around them.
+"""The depth networks as one ONNX graph, with all that the estimator does around them.
 
 Sizes stay free: the graph computes them from the images that it is given. Networks come from
-``torch.export``; what stands around them (the virtual rig, padding, and the way back) is written
+``torch.export``; what is around them (the virtual rig, padding, and the way back) is written
 in operators, because sizes there depend on a focal length, which no exporter follows.
 """
 

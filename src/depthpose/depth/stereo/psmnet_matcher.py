@@ -113,7 +113,7 @@ class PSMNetMatcher:
         return max(trained_px, float(camera.K[0, 0]) * min(share, 1.0))
 
     def _reaching(self, focal_px: float) -> PSMNetConfig:
-        """Give the network with the disparities that a larger size asks for."""
+        """Give the network with the disparities that a larger size needs."""
         trained = self.network_config
         assert trained.work_focal_px is not None
         larger = min(focal_px / trained.work_focal_px, _MOST_REACH)
@@ -234,7 +234,7 @@ def pad_top_right(
 def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
-    Halved at least where the point left looks at lies outside the right view: nothing there can
+    Halved at least where the matching point lies outside the right view: nothing there can
     agree, and nothing contradicts.
     """
     difference_px = left_right_difference_px(found.disparity_px, right_px)

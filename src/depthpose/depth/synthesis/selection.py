@@ -72,7 +72,7 @@ class SelectionGenerator(nn.Module):
 
 
 def make_planes(config: SelectionConfig) -> Planes:
-    """Give the disparities that are told apart [px], evenly spaced in their logarithm."""
+    """Give the disparities that are distinguished [px], evenly spaced in their logarithm."""
     low, high = config.disparity_px
     return torch.linspace(math.log(low), math.log(high), config.planes).exp()
 

@@ -56,7 +56,7 @@ class Synthesiser(Protocol):
 
     @property
     def config(self) -> GeneratorConfig | SelectionConfig:
-        """The network's knobs, and its rig."""
+        """The network's settings, and its rig."""
         ...
 
     def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
@@ -136,7 +136,7 @@ def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tens
 def select_views(
     generator: SelectionGenerator, left: Float[Tensor, "b 3 h w"]
 ) -> tuple[Selected, Selected]:
-    """Answer disparity, sky and confidence of the left and of the right view; gradients flow.
+    """Answer disparity, sky and confidence of the left and of the right view, with gradients.
 
     Args:
         generator: the network.
@@ -155,7 +155,7 @@ def select_views(
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Draw right views of any size, RGB in [0, 1]; gradients flow.
+    """Draw right views of any size, RGB in [0, 1], with gradients.
 
     Sides close to a multiple of what the network takes are resized to it, others padded by
     reflection. Mirrored rows move the horizon's place in the image, which tells the ground's depth:

@@ -1,4 +1,4 @@
-"""Knobs of the three stages; the defaults are the thesis's schedules (2.4.2, 2.5.3)."""
+"""Settings of the three stages; the defaults are the thesis's schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -48,10 +48,10 @@ class ViewTraining:
     """The discriminator's optimiser."""
 
     pairs: PairsConfig = field(default_factory=PairsConfig)
-    """Training pairs; their truth is not looked at."""
+    """Training pairs; their truth is not used."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=200.0))
     """How long."""
@@ -114,7 +114,7 @@ class SelectTraining:
     """Changes of the input image alone."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(steps=20_000, batch_size=8, clip_norm=5.0)
@@ -158,7 +158,7 @@ class StereoTraining:
     """Training pairs, with disparity or depth."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=20.0))
     """How long."""
@@ -184,7 +184,7 @@ class FinetuneTraining:
     """Training pairs, with disparity or depth."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""

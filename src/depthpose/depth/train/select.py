@@ -44,12 +44,12 @@ class SelectionSample(NamedTuple):
 
 
 class SelectionSamples:
-    """Samples by ticket: a share of the tickets draws from the second source, evenly spread.
+    """Samples by index: a share of the indices draws from the second source, evenly spread.
 
     Args:
         sources: the pairs that set the length of an epoch; and perhaps others, e.g. real ones
             beside synthetic ones.
-        more_share: share of the tickets that draws from the others.
+        more_share: share of the samples that draws from the others.
         config: changes of the input alone.
         seed: decides the changes.
 
@@ -68,7 +68,7 @@ class SelectionSamples:
         return len(self.sources[0])
 
     def __getitem__(self, ticket: int) -> SelectionSample:
-        """Make the sample of a ticket."""
+        """Make the n-th sample."""
         before, now = int(ticket * self.more_share), int((ticket + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][ticket - before]
         seen = degrade(pair.left, self.config, ticket_generator(ticket, self.seed + 1))
