@@ -15,7 +15,6 @@ from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import (
     Selected,
     SelectionGenerator,
-    find_filled,
     select,
     shift_left,
 )
@@ -40,14 +39,12 @@ class Drawn:
             where it has none.
         confidence: 0 (guess) to 1 (sure) of that.
         is_sky: where the left view shows the sky.
-        is_filled: pixels of the right view that the left image does not show.
     """
 
     right: Float[Tensor, "b 3 h w"]
     disparity_px: Float[Tensor, "b h w"] | None = None
     confidence: Float[Tensor, "b h w"] | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None
-    is_filled: Bool[Tensor, "b h w"] | None = None
 
 
 @runtime_checkable
@@ -93,7 +90,6 @@ class SelectionSynthesiser:
             "disparity_px": seen.disparity_px,
             "confidence": seen.confidence,
             "is_sky": seen.is_sky,
-            "is_filled": find_filled(seen.shift_px, other.shift_px),
         }
         return Drawn(**{name: part.to(left.device) for name, part in parts.items()})
 
