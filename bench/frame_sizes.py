@@ -27,7 +27,7 @@ from depthpose.depth.predictions import predict
 from depthpose.depth.stereo import PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthesis.synthesiser import Drawn, draw_right, pad_to_multiple
-from depthpose.depth.weights import read_depth_weights
+from depthpose.depth.weights import read_depth_weights, read_psmnet
 from depthpose.report.tables import markdown_table
 
 Draw = Callable[[UNetGenerator, Tensor], Tensor]
@@ -111,7 +111,7 @@ def measure(dataset: Dataset, net: FakestereoNet) -> dict[str, float]:
         for _ in tqdm(predict(net, readers, names, Path(home) / "p", {}), total=len(names)):
             pass
         (row,) = evaluate(dataset, Path(home) / "p", "eigen-raw-camera", (80.0,)).rows
-    return {name: round(row[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}
+    return {name: round(row.metrics[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}
 
 
 def main() -> None:
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--without", nargs="*", default=(), help="names of frames to leave out")
     options = parser.parse_args()
     generator = read_depth_weights(find_weights(options.weights)).generator
-    network = read_depth_weights(find_weights(options.matcher)).matcher
+    network = read_psmnet(find_weights(options.matcher))
     assert isinstance(generator, UNetGenerator)
     assert network is not None
     dataset = join_datasets([open_dataset(options.data)], options.without)

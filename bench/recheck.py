@@ -36,9 +36,9 @@ _TRAIN = (
 _DEPTH = {"AbsRel": "abs_rel", "SqRel": "sq_rel", "RMSE": "rmse", "RMSElog": "rmse_log"}
 _DELTAS = {"d1": "d1", "d2": "d2", "d3": "d3"}
 _SGBM = {"SGBM, holes filled": {"method": "sgbm (holes filled)"}}
-_FLOORS = {
-    "best constant depth of each row": {"method": "floor: rows"},
-    "nearest training image's depth": {"method": "floor: nearest"},
+_BASELINES = {
+    "best constant depth of each row": {"method": "baseline: rows"},
+    "nearest training image's depth": {"method": "baseline: nearest"},
 }
 _STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}}
 
@@ -94,7 +94,7 @@ TABLES = (
         after="25 real pairs of six Eigen test drives",
         commands=(
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
-            "--protocol eigen-raw-camera --matcher sgbm --floor rows nearest "
+            "--protocol eigen-raw-camera --matcher sgbm --baseline rows nearest "
             f"{_TRAIN} "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
             "--out OUT/mono",
@@ -103,7 +103,7 @@ TABLES = (
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
-            **_FLOORS,
+            **_BASELINES,
             "one image (default)": {"weights": "default", "sees": "left view"},
             "one image (kitti-nc)": {"weights": "kitti-nc", "sees": "left view"},
             **{
@@ -119,14 +119,14 @@ TABLES = (
         after="Eight more frames, of one other Eigen test drive",
         commands=(
             f"{_EVALUATE}/kitti_raw/2011_09_26/2011_09_26_drive_0052_sync "
-            f"--protocol eigen-raw-camera --floor rows nearest {_TRAIN} --weights default kitti-nc "
-            "--out OUT/mono-0052",
+            f"--protocol eigen-raw-camera --baseline rows nearest {_TRAIN} "
+            "--weights default kitti-nc --out OUT/mono-0052",
         ),
         files=("mono-0052/rows.json",),
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
-            **_FLOORS,
+            **_BASELINES,
             "one image, default": {"weights": "default"},
             "one image, kitti-nc": {"weights": "kitti-nc"},
         },

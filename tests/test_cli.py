@@ -224,7 +224,7 @@ def test_options_of_psmnet_are_refused_with_sgbm(
     pair_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--tile", "64", "64") == 2
-    assert "are for psmnet; sgbm takes none" in capsys.readouterr().err
+    assert "are for matchers with weights; sgbm takes none" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 

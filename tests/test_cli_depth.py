@@ -342,7 +342,7 @@ def test_a_baseline_is_said_to_be_left_alone(
     (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
     image = str(home / "images" / "0.png")
     assert predict(home, tmp_path / "out", image, "--camera", str(tmp_path / "rig.json")) == 0
-    assert "baseline is not looked at" in capsys.readouterr().err
+    assert "baseline is ignored" in capsys.readouterr().err
 
 
 def test_packing_writes_the_card_and_halves_the_file(

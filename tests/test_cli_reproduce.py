@@ -1,4 +1,4 @@
-"""Whole commands on a made street: tables, figures, floors, near-duplicates, several processes."""
+"""Whole commands on a synthetic street: tables, figures, baselines, duplicates, processes."""
 
 import json
 import os
@@ -99,21 +99,29 @@ def test_table_2_2_is_made_by_one_command(
         assert (tmp_path / name).is_file()
     page, markdown = ((tmp_path / f"report.{end}").read_text() for end in ("html", "md"))
     for text in (page, markdown):
-        assert "floor: nearest" in text
+        assert "baseline: nearest" in text
         assert "num_disparities" in text
         assert "torch" in text
     assert "real right image" in page
     assert "## Settings" in markdown
 
 
-def test_floors_know_the_street_they_were_fitted_to(street: Path, tmp_path: Path) -> None:
+def test_the_old_name_of_the_option_baseline_still_works(street: Path, tmp_path: Path) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
-    assert main([*words, "--floor", "rows", "nearest", "--train", str(street)]) == 0
+    assert main([*words, "--floor", "rows", "--train", str(street)]) == 0
+    assert {row["method"] for row in rows_of(tmp_path)} == {"baseline: rows"}
+
+
+def test_baselines_know_the_street_they_were_fitted_to(street: Path, tmp_path: Path) -> None:
+    words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
+    assert main([*words, "--baseline", "rows", "nearest", "--train", str(street)]) == 0
     by_method = {row["method"]: row for row in rows_of(tmp_path) if row["cap_m"] == 80}
-    assert set(by_method) == {"floor: rows", "floor: nearest"}
-    nearest, rows = (float(str(by_method[f"floor: {n}"]["abs_rel"])) for n in ("nearest", "rows"))
+    assert set(by_method) == {"baseline: rows", "baseline: nearest"}
+    nearest, rows = (
+        float(str(by_method[f"baseline: {n}"]["abs_rel"])) for n in ("nearest", "rows")
+    )
     assert nearest < 0.01 < rows < 0.5
-    assert "ause" not in by_method["floor: rows"]
+    assert "ause" not in by_method["baseline: rows"]
     page = read_page(tmp_path / "report.html")
     measured = json.loads((tmp_path / "frames.json").read_text())
     for method in by_method:

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,13 @@ from depthpose.core.files import write_depth_png, write_disparity_png, write_ima
 from depthpose.depth.datasets import Dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import clamped_depth, evaluate, frame_result
+from depthpose.depth.evaluate import (
+    Measured,
+    clamped_depth,
+    evaluate,
+    frame_result,
+    measure_frame,
+)
 from depthpose.depth.predictions import (
     is_finished,
     predict,
@@ -75,18 +82,18 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
 def test_perfect_disparity_has_no_error(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: d)
     result = evaluate(pairs, folder, "kitti-2015")
-    assert result.rows[0]["epe_px"] == 0
-    assert result.rows[0]["d1_all"] == 0
-    assert result.rows[0]["frames"] == 2
+    assert result.rows[0].metrics["epe_px"] == 0
+    assert result.rows[0].metrics["d1_all"] == 0
+    assert result.rows[0].frames == 2
     assert result.skipped == {"c": "no truth of the kind disparity"}
 
 
 def test_perfect_disparity_has_perfect_depth(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: d)
     for row in evaluate(pairs, folder, "eigen-improved").rows:
-        assert row["abs_rel"] < 1e-3  # the truth is stored in steps of 1/256 m
-        assert row["d1"] == 1.0
-        assert row["coverage"] == 1.0
+        assert row.metrics["abs_rel"] < 1e-3  # the truth is stored in steps of 1/256 m
+        assert row.metrics["d1"] == 1.0
+        assert row.coverage == 1.0
 
 
 def test_a_prediction_of_half_the_size_is_scaled(pairs: Dataset, tmp_path: Path) -> None:
@@ -101,7 +108,7 @@ def test_depth_files_of_others_count_as_disparity(pairs: Dataset, tmp_path: Path
     for k, name in enumerate("abc"):
         depth_m = depth_from_disparity(truth_px(k), rig())
         write_map(tmp_path / "p" / f"{name}.depth_m.npy", depth_m)
-    assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0]["epe_px"] < 1e-5
+    assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0].metrics["epe_px"] < 1e-5
 
 
 def test_pixels_without_prediction_lower_the_coverage(pairs: Dataset, tmp_path: Path) -> None:
@@ -109,8 +116,8 @@ def test_pixels_without_prediction_lower_the_coverage(pairs: Dataset, tmp_path: 
         return torch.where(torch.arange(W) < W // 4, torch.nan, d)
 
     row = evaluate(pairs, write_predictions(tmp_path / "p", leave_out), "kitti-2015").rows[0]
-    assert row["coverage"] == 0.75
-    assert row["epe_px"] == 0
+    assert row.coverage == 0.75
+    assert row.metrics["epe_px"] == 0
 
 
 @pytest.mark.parametrize("nothing", [0.0, -3.0])
@@ -123,8 +130,8 @@ def test_depth_of_zero_or_below_is_an_answer_and_a_wrong_one(
         spoilt_m = torch.where(torch.arange(W) < W // 2, nothing, depth_m)
         write_map(tmp_path / "p" / f"{name}.depth_m.npy", spoilt_m)
     for row in evaluate(pairs, tmp_path / "p", "eigen-improved").rows:
-        assert row["coverage"] == 1.0
-        assert row["abs_rel"] == pytest.approx((1 + 0.05) / 2, abs=2e-3)
+        assert row.coverage == 1.0
+        assert row.metrics["abs_rel"] == pytest.approx((1 + 0.05) / 2, abs=2e-3)
 
 
 @pytest.mark.parametrize("protocol", ["eigen-improved", "eigen-improved-garg", "eigen-raw-camera"])
@@ -134,8 +141,8 @@ def test_a_perfect_prediction_has_no_error_at_any_cap(
     """Truth beyond the cap does not count; counted, a clamped perfect prediction was wrong."""
     folder = write_predictions(tmp_path / "p", lambda d: d)
     rows = evaluate(pairs, folder, protocol, caps_m=(80.0, 15.0, 12.0)).rows
-    assert [row["abs_rel"] < 1e-3 for row in rows] == [True] * 3
-    assert rows[0]["pixels"] > rows[1]["pixels"] > rows[2]["pixels"]
+    assert [row.metrics["abs_rel"] < 1e-3 for row in rows] == [True] * 3
+    assert rows[0].pixels > rows[1].pixels > rows[2].pixels
 
 
 def test_a_frame_without_any_usable_pixel_is_said(pairs: Dataset, tmp_path: Path) -> None:
@@ -147,9 +154,9 @@ def test_a_frame_without_any_usable_pixel_is_said(pairs: Dataset, tmp_path: Path
 def test_caps_have_a_row_each_and_clamp(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: torch.full_like(d, 1e-3))
     rows = evaluate(pairs, folder, "eigen-raw-camera", caps_m=(80.0, 50.0, 15.0)).rows
-    assert [row["cap_m"] for row in rows] == [80.0, 50.0, 15.0]
-    assert rows[0]["rmse"] > rows[1]["rmse"] > rows[2]["rmse"]
-    assert rows[2]["pixels"] < rows[0]["pixels"]
+    assert [row.cap_m for row in rows] == [80.0, 50.0, 15.0]
+    assert rows[0].metrics["rmse"] > rows[1].metrics["rmse"] > rows[2].metrics["rmse"]
+    assert rows[2].pixels < rows[0].pixels
 
 
 def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
@@ -160,16 +167,16 @@ def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
     for name in "abc":
         write_map(folder / f"{name}.confidence.npy", 1 - torch.arange(W).expand(H, W) / W)
     result = evaluate(pairs, folder, "kitti-2015")
-    good = result.rows[0]["ause"]
-    assert result.rows[0]["ause_share"] < 0.01
-    errors = [row["epe_px"] for row in result.deciles]
+    good = result.rows[0].metrics["ause"]
+    assert result.rows[0].metrics["ause_share"] < 0.01
+    errors = [row.error["epe_px"] for row in result.deciles]
     assert len(errors) == 10
     assert errors == sorted(errors, reverse=True)
-    assert result.deciles[0]["confidence_decile"] == 1
+    assert result.deciles[0].confidence_decile == 1
     assert len(evaluate(pairs, folder, "eigen-improved").deciles) == 20
     for name in "abc":
         write_map(folder / f"{name}.confidence.npy", torch.arange(W).expand(H, W) / W)
-    assert good < 0.01 < evaluate(pairs, folder, "kitti-2015").rows[0]["ause"]
+    assert good < 0.01 < evaluate(pairs, folder, "kitti-2015").rows[0].metrics["ause"]
 
 
 def test_the_clamp_follows_the_published_script() -> None:
@@ -265,3 +272,27 @@ def test_an_estimate_is_read_back(tmp_path: Path) -> None:
     assert from_rig is not None
     assert torch.allclose(from_rig, depth_m)
     assert read_estimate(tmp_path, "x", None).depth_m is None
+
+
+def test_the_columns_of_a_row_are_its_fields_in_order(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: d)
+    result = evaluate(pairs, folder, "eigen-improved")
+    depth = ["abs_rel", "sq_rel", "rmse", "rmse_log", "d1", "d2", "d3"]
+    first = ["protocol", "dataset"]
+    counts = ["pixels", "coverage"]
+    assert list(result.rows[0].to_dict()) == [*first, "cap_m", "frames", *counts, *depth]
+    assert list(result.per_frame[0].to_dict()) == [*first, "frame", "cap_m", *counts, *depth]
+    (row,) = evaluate(pairs, folder, "kitti-2015").rows
+    assert list(row.to_dict()) == [*first, "frames", *counts, "epe_px", "d1_all"]
+
+
+def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:
+    folder = write_predictions(tmp_path / "p", lambda d: d + 0.1)
+    for name in "ab":
+        write_map(folder / f"{name}.confidence.npy", torch.rand(H, W))
+    for protocol in ("eigen-improved", "kitti-2015"):
+        found = measure_frame(pairs, 0, folder, protocol, (80.0,))
+        assert not isinstance(found, str)
+        again = Measured.from_values(json.loads(json.dumps(found[0].to_values())))
+        assert again.to_values() == found[0].to_values()
+        assert (again.frame, again.cap_m) == ("a", None if protocol == "kitti-2015" else 80.0)

@@ -339,7 +339,7 @@ def test_the_check_of_a_split_names_missing_frames(tmp_path: Path) -> None:
     ("prepare", "message"),
     [
         (lambda _: None, "there is no such folder"),
-        (Path.mkdir, "no layout that is known here. It holds nothing. Known: KITTI raw"),
+        (Path.mkdir, "no layout that is known here. It holds nothing. Known: packed shards"),
         (lambda home: write(home / "notes.txt", ""), r"It holds notes\.txt"),
     ],
 )

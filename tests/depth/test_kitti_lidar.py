@@ -97,13 +97,13 @@ def test_the_reference_metrics_are_reproduced(real: Path, tmp_path: Path) -> Non
         made_px = _made_prediction(row["k"])
         write_map(tmp_path / f"{row['drive']}_{row['frame']}.disparity_px.npy", made_px)
     result = evaluate(dataset, tmp_path, "eigen-raw", caps_m=(80.0, 50.0))
-    ours = {(row["frame"], row["cap_m"]): row for row in result.per_frame}
+    ours = {(row.frame, row.cap_m): row for row in result.per_frame}
     assert len(rows) == len(ours) == 20
     for row in rows:
         own = ours[f"{row['drive']}_{row['frame']}", float(row["cap"])]
-        assert own["pixels"] == row["pixels"]
+        assert own.pixels == row["pixels"]
         names = ("abs_rel", "sq_rel", "rmse", "rmse_log", "d1", "d2", "d3")
-        assert [own[n] for n in names] == pytest.approx([row[n] for n in names], rel=1e-6)
+        assert [own.metrics[n] for n in names] == pytest.approx([row[n] for n in names], rel=1e-6)
     assert all("no truth of the kind velodyne_x" in why for why in result.skipped.values())
     assert len(result.skipped) == 8
 

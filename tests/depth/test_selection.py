@@ -15,7 +15,6 @@ from depthpose.depth.config import SelectionConfig
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.synthesis.lite0 import Lite0Encoder, import_lite0, read_lite0
 from depthpose.depth.synthesis.selection import (
-    find_filled,
     log_expectation,
     make_planes,
     mix_shifts,
@@ -117,21 +116,11 @@ def test_a_sure_mixture_is_one_shift(scale: float) -> None:
     torch.testing.assert_close(mixed, shift_left(left, shifts), rtol=0, atol=1e-5)
 
 
-def test_what_the_left_image_does_not_show_is_marked() -> None:
-    """A box of 6 px before a wall of 2 px: in the right view the wall shows 4 px more beside it."""
-    left = torch.full((1, 1, 40), 2.0)
-    left[..., 20:30] = 6.0
-    right = torch.full((1, 1, 40), 2.0)
-    right[..., 14:24] = 6.0
-    filled = find_filled(left, right)[0, 0].nonzero()[:, 0].tolist()
-    assert filled == [24, 25, 26, 27, 38, 39]
-
-
 @pytest.mark.parametrize("size", [(64, 96), (50, 70), (33, 31), (5, 7)])
 def test_any_size_is_answered_at_its_own_size(size: tuple[int, int]) -> None:
     drawn = make_synthesiser(tiny()).draw(torch.rand(2, 3, *size))
     assert drawn.right.shape == (2, 3, *size)
-    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky, drawn.is_filled):
+    for part in (drawn.disparity_px, drawn.confidence, drawn.is_sky):
         assert part is not None
         assert part.shape == (2, *size)
     assert drawn.disparity_px is not None

@@ -17,6 +17,7 @@ from depthpose.depth.stereo import (
     PSMNetInference,
     PSMNetMatcher,
     Steps,
+    folding,
     normalise,
     tile_change_px,
 )
@@ -76,6 +77,45 @@ def test_inference_equals_the_plain_network(config: PSMNetConfig, size: tuple[in
     assert torch.allclose(found.disparity_px, plain(network, left, right), atol=1e-3)
     assert found.confidence is not None
     assert bool(((found.confidence >= 0) & (found.confidence <= 1)).all())
+
+
+def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = random_network(SMALL)
+    left, right = torch.rand(2, 3, 37, 101)
+    by_name = PSMNetMatcher(network).match(left, right)
+    calls: list[str] = []
+
+    def refuse(*_: object) -> None:
+        calls.append("called")
+        raise RuntimeError("no such operator")
+
+    for operator in ("_onednn_convolved", "_onednn_transposed"):
+        monkeypatch.setattr(folding, operator, refuse)
+    folding.has_onednn_operators.cache_clear()
+    try:
+        documented = PSMNetMatcher(network).match(left, right)
+        assert not folding.has_onednn_operators()
+    finally:
+        folding.has_onednn_operators.cache_clear()
+    assert len(calls) == torch.backends.mkldnn.is_available()
+    assert torch.allclose(by_name.disparity_px, documented.disparity_px, atol=1e-3)
+    assert by_name.confidence is not None
+    assert documented.confidence is not None
+    assert torch.allclose(by_name.confidence, documented.confidence, atol=1e-3)
+
+
+def test_an_onednn_operator_that_answers_otherwise_is_not_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def wrong(rows: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(rows)
+
+    monkeypatch.setattr(folding, "_onednn_transposed", wrong)
+    folding.has_onednn_operators.cache_clear()
+    try:
+        assert not folding.has_onednn_operators()
+    finally:
+        folding.has_onednn_operators.cache_clear()
 
 
 @pytest.mark.parametrize("rows", [2, 4, 6, 10, 64])

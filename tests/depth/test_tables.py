@@ -1,12 +1,25 @@
+from dataclasses import replace
+
 import pytest
 
 from depthpose.core.errors import InputError
+from depthpose.depth.evaluate import MeanRow
 from depthpose.thesis.depth_tables import TABLES, find_table, join_published
 
-OURS = {
-    "method": "net", "weights": "w", "protocol": "eigen-raw", "cap_m": 80.0, "frames": 697,
-    "abs_rel": 0.15, "sq_rel": 1.0, "rmse": 5.0, "rmse_log": 0.2, "d1": 0.8, "d2": 0.9, "d3": 0.95,
-}  # fmt: skip
+OURS = MeanRow(
+    method="net",
+    weights="w",
+    protocol="eigen-raw",
+    dataset="kitti",
+    cap_m=80.0,
+    frames=697,
+    pixels=12,
+    coverage=1.0,
+    metrics={
+        "abs_rel": 0.15, "sq_rel": 1.0, "rmse": 5.0, "rmse_log": 0.2, "d1": 0.8, "d2": 0.9,
+        "d3": 0.95, "right_l1": 0.1,
+    },
+)  # fmt: skip
 
 
 def test_every_printed_row_is_there() -> None:
@@ -47,36 +60,43 @@ def test_tables_2_1_and_2_3_share_the_row_without_fine_tuning() -> None:
 
 def test_our_row_follows_the_printed_ones_and_then_the_difference() -> None:
     rows = join_published(find_table("2.1"), [("thesis, Ours", OURS)])
-    assert [row["source"] for row in rows] == ["published"] * 8 + ["ours", "difference"] + [
+    assert [row.source for row in rows] == ["published"] * 8 + ["ours", "difference"] + [
         "published"
     ] * 4
     difference = rows[9]
-    assert difference["abs_rel"] == pytest.approx(0.15 - 0.141)
-    assert difference["rmse"] == pytest.approx(5.0 - 5.20)
-    assert difference["protocol"] == "eigen-raw"
-    assert rows[8] == {"source": "ours"} | OURS
-    assert list(rows[0])[:10] == list(rows[8])[:10] == list(difference)[:10]
+    assert difference.metrics["abs_rel"] == pytest.approx(0.15 - 0.141)
+    assert difference.metrics["rmse"] == pytest.approx(5.0 - 5.20)
+    assert difference.protocol == "eigen-raw"
+    assert rows[8].to_dict() == {"source": "ours"} | OURS.to_dict()
+    columns = [list(row.to_dict()) for row in (rows[0], rows[8], difference)]
+    assert columns[0] == [
+        "source", "method", "weights", "cap_m", "abs_rel", "sq_rel", "rmse", "rmse_log", "d1",
+        "d2", "d3", "protocol", "note",
+    ]  # fmt: skip
+    assert columns[1] == [*columns[0][:-1], "dataset", "frames", "pixels", "coverage", "right_l1"]
+    assert columns[2] == columns[0][:-1]
 
 
 def test_each_weights_of_table_2_3_has_its_own_row() -> None:
     table = find_table("2.3")
     rows = join_published(table, [(own, OURS) for own in table.own])
-    differences = [row["abs_rel"] for row in rows if row["source"] == "difference"]
+    differences = [row.metrics["abs_rel"] for row in rows if row.source == "difference"]
     assert differences == pytest.approx([0.15 - 0.141, 0.15 - 0.126])
 
 
 def test_another_protocol_is_said_in_the_difference() -> None:
-    other = OURS | {"protocol": "eigen-raw-camera"}
+    other = replace(OURS, protocol="eigen-raw-camera")
     rows = join_published(find_table("2.2"), [("thesis, Ours", other)])
-    assert {row["protocol"] for row in rows} == {
+    assert {row.protocol for row in rows} == {
         "eigen-raw", "eigen-raw-camera", "eigen-raw-camera against eigen-raw",
     }  # fmt: skip
 
 
-def test_floors_and_other_caps_have_no_difference() -> None:
-    rows = join_published(find_table("2.2"), [("", OURS), ("thesis, Ours", OURS | {"cap_m": 30.0})])
-    assert [row["source"] for row in rows].count("ours") == 2
-    assert "difference" not in {row["source"] for row in rows}
+def test_baselines_and_other_caps_have_no_difference() -> None:
+    ours = [("", OURS), ("thesis, Ours", replace(OURS, cap_m=30.0))]
+    rows = join_published(find_table("2.2"), ours)
+    assert [row.source for row in rows].count("ours") == 2
+    assert "difference" not in {row.source for row in rows}
 
 
 def test_the_row_of_other_truth_is_marked() -> None:

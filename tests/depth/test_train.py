@@ -34,7 +34,7 @@ from depthpose.depth.train import (
     train_view,
 )
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
+from depthpose.depth.weights import read_depth_weights, read_psmnet, write_depth_weights
 
 GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
 MATCHER = PSMNetConfig(width=4, max_disparity_px=32, blocks=(1, 1, 1, 1), pools=(4, 2))
@@ -266,7 +266,7 @@ def test_a_matcher_may_start_from_one_of_another_range(pairs: PairsConfig, tmp_p
     first = train_stereo(config, Run(folder=tmp_path / "first"))
     farther = dataclasses.replace(MATCHER, max_disparity_px=MATCHER.max_disparity_px + 16)
     other = dataclasses.replace(config, matcher=farther, start=str(first))
-    second = read_matcher(train_stereo(other, Run(folder=tmp_path / "second")))
+    second = read_psmnet(train_stereo(other, Run(folder=tmp_path / "second")))
     assert second.config == farther
 
 

@@ -1,13 +1,13 @@
 """``depthpose export ...``."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 
 def export_depth(
     out: Path,
     weights: str = "default",
-    what: Literal["image", "pair"] | None = None,
+    what: str | None = None,
 ) -> int:
     """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
 

@@ -1,1 +1,1 @@
-"""The depth room: a stereo pair, real or synthesised, to a metric depth map."""
+"""Depth: a stereo pair, real or synthesised, to a metric depth map."""

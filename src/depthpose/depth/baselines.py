@@ -1,8 +1,8 @@
-"""What can be said without looking closely: two floors that every method must stay above.
+"""Two baselines: the best constant depth of each image row, and the most similar image's depth.
 
 A street scene seen from a car is mostly road below and far things above, so one depth a row is far
-from a bad guess, and the depth of the training image that looks most alike is a better one. What a
-network scores above these two is what it has learnt to see.
+from a bad guess, and the depth of the training image that looks most alike is a better one. A
+network that does not beat both has learnt little about the picture.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,8 +28,8 @@ _NEAR_M, _FAR_M, _STEPS = 1.0, 80.0, 4096
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
-class RowDepthFloor:
-    """The best constant depth of each image row: it sees the camera and not the image.
+class RowDepthBaseline:
+    """The best constant depth of each image row: it uses the camera and not the image.
 
     A row is counted by its slope ``(v - cy) / fy``, not by its number: the road at one slope is
     equally far in every camera of one mounting height, whatever its focal length or crop.
@@ -42,7 +42,7 @@ class RowDepthFloor:
         self.depth_m = depth_m
 
     @classmethod
-    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "RowDepthFloor":
+    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "RowDepthBaseline":
         """Find for each row the constant c that minimises the mean of ``|c - t| / t``.
 
         That is the median of the true depths t weighted by 1 / t (nearest first, where half of the
@@ -79,7 +79,7 @@ class RowDepthFloor:
         return _estimate(depth_m.contiguous(), rig)
 
 
-class NearestImageFloor:
+class NearestImageBaseline:
     """The depth of the training image that looks most alike.
 
     Images are compared as colour thumbnails of 24 x 8 cells, by correlation. The truth of the
@@ -89,12 +89,14 @@ class NearestImageFloor:
     is twice as far.
     """
 
-    def __init__(self, dataset: Dataset, indices: list[int], looks: Float[Tensor, "n d"]) -> None:
-        self.dataset, self.indices, self.looks = dataset, indices, looks
+    def __init__(
+        self, dataset: Dataset, indices: list[int], thumbnails: Float[Tensor, "n d"]
+    ) -> None:
+        self.dataset, self.indices, self.thumbnails = dataset, indices, thumbnails
 
     @classmethod
-    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageFloor":
-        """Look at every training image that has truth and a rig.
+    def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":
+        """Make the thumbnail of every training image that has truth and a rig.
 
         Raises:
             InputError: none has.
@@ -103,8 +105,10 @@ class NearestImageFloor:
         indices = [i for i, frame in enumerate(frames) if frame.calibration and known_truths(frame)]
         if not indices:
             raise _nothing_to_learn(dataset)
-        looks = [_look(read_image(frames[indices[k]].left)) for k in progress(range(len(indices)))]
-        return cls(dataset, indices, torch.stack(looks))
+        thumbnails = [
+            _thumbnail(read_image(frames[indices[k]].left)) for k in progress(range(len(indices)))
+        ]
+        return cls(dataset, indices, torch.stack(thumbnails))
 
     def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
         """Give the left image the depth of its nearest training image.
@@ -113,7 +117,7 @@ class NearestImageFloor:
             InputError: the input has no rig.
         """
         rig, (height, width) = _rig_of(pair), pair.left.shape[1:]
-        nearest = self.indices[int((self.looks @ _look(pair.left)).argmax())]
+        nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
         known_m, other = read_known_depth(self.dataset, nearest), self.dataset.read_rig(nearest)
         assert known_m is not None  # `fit` chose frames that have both
         assert other is not None
@@ -160,7 +164,7 @@ def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"
     return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
 
 
-def _look(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
+def _thumbnail(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
     cells = shrink(image, 8, 24).flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
@@ -177,7 +181,7 @@ def _estimate(depth_m: Float[Tensor, "h w"], rig: StereoRig) -> DepthEstimate:
 def _rig_of(pair: StereoInput) -> StereoRig:
     if not isinstance(pair.camera, StereoRig):
         raise InputError(
-            f"{pair.name}: has no rig, and a floor is measured as disparity; give a camera with "
+            f"{pair.name}: has no rig, and a baseline is measured as disparity; give a camera with "
             "baseline_m"
         )
     return pair.camera

@@ -25,7 +25,7 @@ Kind = Literal["png", "npy"]
 """Files of nerfstudio's depth: 16-bit PNG, or float32."""
 
 NERFSTUDIO_UNIT = 0.001
-"""What nerfstudio multiplies depth files of either kind by, unless told otherwise."""
+"""What nerfstudio multiplies depth files of either kind by, by default."""
 TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
 _DEPTH = ".depth_m.npy"
 _PNG_MOST = 65535
@@ -110,8 +110,8 @@ def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | N
     is_list = isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
     if not isinstance(content, dict) or not is_list:
         raise InputError(f"{path}: has no list of 'frames'; give one that ns-process-data wrote")
-    told = [{**frame, "depth_file_path": _depth_of(path, frame, files)} for frame in frames or ()]
-    return {**content, "frames": told, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
+    given = [{**frame, "depth_file_path": _depth_of(path, frame, files)} for frame in frames or ()]
+    return {**content, "frames": given, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
 
 
 def _depth_of(path: Path, frame: Mapping[str, Any], files: Mapping[str, str]) -> str:

@@ -1,38 +1,39 @@
-"""What the networks of the depth room are punished for."""
+"""Losses of the depth networks."""
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-GanMode = Literal["vanilla", "lsgan"]
 HEAD_WEIGHTS = (0.5, 0.7, 1.0)
 """Weights of the three heads of PSMNet (Chang and Chen 2018)."""
 
 
 def adversarial_loss(
-    logits: Float[Tensor, "b 1 rows columns"], mode: GanMode, *, is_real: bool
+    logits: Float[Tensor, "b 1 rows columns"], mode: str, *, is_real: bool
 ) -> Float[Tensor, ""]:
-    """Punish logits that do not say ``is_real`` (eq. 2.4 of the thesis).
+    """Loss of a discriminator's logits against the label ``is_real`` (eq. 2.4 of the thesis).
 
-    ``vanilla`` is binary cross entropy, ``lsgan`` the squared distance from 1 or 0 (Mao et al.
-    2017). For the generator, ``is_real`` is what it wants the discriminator to say.
+    ``mode`` is a key of ``ADVERSARIAL_LOSSES``. The generator trains with ``is_real=True``.
     """
-    wanted = torch.full_like(logits, float(is_real))
-    if mode == "lsgan":
-        return F.mse_loss(logits, wanted)
-    return F.binary_cross_entropy_with_logits(logits, wanted)
+    return ADVERSARIAL_LOSSES[mode](logits, torch.full_like(logits, float(is_real)))
+
+
+ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "vanilla": F.binary_cross_entropy_with_logits,
+    "lsgan": F.mse_loss,  # Mao et al. 2017
+}
+"""Losses of logits and labels by their names in configs: a new one is one entry here."""
 
 
 def discriminator_loss(
     real: Float[Tensor, "b 1 rows columns"],
     fake: Float[Tensor, "b 1 rows columns"],
-    mode: GanMode,
+    mode: str,
 ) -> Float[Tensor, ""]:
-    """Half the sum of both mistakes, which slows the discriminator (pix2pix)."""
+    """Half the sum of both losses, which slows the discriminator (pix2pix)."""
     real_loss = adversarial_loss(real, mode, is_real=True)
     return (real_loss + adversarial_loss(fake, mode, is_real=False)) / 2
 
@@ -92,6 +93,25 @@ def log_disparity_loss(
     counts = is_known.sum((1, 2))
     means = error.sum((1, 2)) / counts.clamp(min=1)
     return means.sum() / (counts > 0).sum().clamp(min=1)
+
+
+def pixel_disparity_loss(
+    found_log_px: Float[Tensor, "b h w"],
+    truth_px: Float[Tensor, "b h w"],
+    range_px: tuple[float, float],
+) -> Float[Tensor, ""]:
+    """Mean absolute error of disparity over the pixels with truth, as a share of the largest."""
+    is_known = truth_px > 0
+    error = torch.where(is_known, (found_log_px.exp() - truth_px.nan_to_num(0.0)).abs(), 0.0)
+    return error.sum() / is_known.sum().clamp(min=1) / range_px[1]
+
+
+DISPARITY_LOSSES: dict[str, Callable[[Tensor, Tensor, tuple[float, float]], Tensor]] = {
+    "log": log_disparity_loss,
+    "pixel": pixel_disparity_loss,
+}
+"""Losses of a generator that selects, by their names in configs: a new one is a function of the
+log of disparity, the true disparity (NaN: unknown, 0: sky) and its range, and one entry here."""
 
 
 def plane_loss(

@@ -3,7 +3,10 @@
 All arithmetic is float64, so that a mean does not depend on the order of its terms.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +16,28 @@ from depthpose.core.errors import InputError
 
 SMALLEST_DEPTH_M = 1e-3
 """Predicted depth of zero or below becomes this, as in the published script of the Eigen split."""
+
+Quantity = Literal["depth", "disparity", "disparity_noc"]
+"""Depth [m]; disparity [px] of all pixels with truth, or of those that both views see."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """One number over the pixels of a frame that have truth: a column of every table.
+
+    Attributes:
+        name: of the column.
+        of: the values that are compared.
+        function: from the predicted and the true values, each ``(n,)`` float64.
+        better: which values are the better ones.
+        is_printed: whether the printed table has it; files have all.
+    """
+
+    name: str
+    of: Quantity
+    function: Callable[[Tensor, Tensor], float]
+    better: Literal["lower", "higher"] = "lower"
+    is_printed: bool = True
 
 
 @dataclass(frozen=True)
@@ -82,31 +107,36 @@ class ConfidenceScore:
     ause_share: float
 
 
-def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
-    """Measure predicted against true depth, pixel by pixel.
+def measure(
+    of: Quantity, predicted: Float[Tensor, " n"], true: Float[Tensor, " n"]
+) -> dict[str, float]:
+    """Give every metric of a kind, in the order of ``METRICS``.
 
     Args:
-        predicted_m: positive and finite, already clamped as the protocol says.
-        true_m: positive and finite.
+        of: what the values are.
+        predicted: of depth positive and finite, already clamped as the protocol says.
+        true: of depth positive and finite.
 
     Raises:
-        InputError: no pixel at all, or a value that is not positive and finite.
+        InputError: no pixel at all, or a depth that is not positive and finite.
     """
-    _refuse_unusable(predicted_m, "predicted")
-    _refuse_unusable(true_m, "true")
-    p, t = predicted_m.double(), true_m.double()
-    ratio = torch.maximum(p / t, t / p)
-    square = (p - t) ** 2
-    within = [float((ratio < 1.25**k).double().mean()) for k in (1, 2, 3)]
-    return DepthErrors(
-        abs_rel=float(((p - t).abs() / t).mean()),
-        sq_rel=float((square / t).mean()),
-        rmse=float(square.mean().sqrt()),
-        rmse_log=float(((p.log() - t.log()) ** 2).mean().sqrt()),
-        d1=within[0],
-        d2=within[1],
-        d3=within[2],
-    )
+    if predicted.numel() == 0:
+        raise InputError(f"{of}: there is no pixel to compare; the truth may be empty.")
+    if of == "depth":
+        _refuse_unusable(predicted, "predicted")
+        _refuse_unusable(true, "true")
+    p, t = predicted.double(), true.double()
+    return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
+
+
+def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
+    """Measure predicted against true depth by the seven numbers of Eigen et al.
+
+    Raises:
+        InputError: as :func:`measure`.
+    """
+    found = measure("depth", predicted_m, true_m)
+    return DepthErrors(**{name: found[name] for name in DepthErrors.__dataclass_fields__})
 
 
 def disparity_errors(
@@ -117,11 +147,60 @@ def disparity_errors(
     Raises:
         InputError: no pixel at all.
     """
-    if predicted_px.numel() == 0:
-        raise InputError("disparity_errors: there is no pixel to compare; the truth may be empty.")
-    error = (predicted_px.double() - true_px.double()).abs()
-    is_bad = (error > 3) & (error > 0.05 * true_px.double())
-    return DisparityErrors(float(error.mean()), float(is_bad.double().mean()))
+    found = measure("disparity", predicted_px, true_px)
+    return DisparityErrors(epe_px=found["epe_px"], d1_all=found["d1_all"])
+
+
+def _abs_rel(p: Tensor, t: Tensor) -> float:
+    return float(((p - t).abs() / t).mean())
+
+
+def _sq_rel(p: Tensor, t: Tensor) -> float:
+    return float(((p - t) ** 2 / t).mean())
+
+
+def _rmse(p: Tensor, t: Tensor) -> float:
+    return float(((p - t) ** 2).mean().sqrt())
+
+
+def _rmse_log(p: Tensor, t: Tensor) -> float:
+    return _rmse(p.log(), t.log())
+
+
+def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
+    return float((torch.maximum(p / t, t / p) < factor).double().mean())
+
+
+def _end_point_error(p: Tensor, t: Tensor) -> float:
+    return float((p - t).abs().mean())
+
+
+def _share_bad(p: Tensor, t: Tensor) -> float:
+    error = (p - t).abs()
+    return float(((error > 3) & (error > 0.05 * t)).double().mean())
+
+
+_within_1, _within_2, _within_3 = (partial(_share_within, factor=1.25**k) for k in (1, 2, 3))
+METRICS = {
+    metric.name: metric
+    for metric in (
+        Metric(name="abs_rel", of="depth", function=_abs_rel),
+        Metric(name="sq_rel", of="depth", function=_sq_rel),
+        Metric(name="rmse", of="depth", function=_rmse),
+        Metric(name="rmse_log", of="depth", function=_rmse_log),
+        Metric(name="d1", of="depth", function=_within_1, better="higher"),
+        Metric(name="d2", of="depth", function=_within_2, better="higher", is_printed=False),
+        Metric(name="d3", of="depth", function=_within_3, better="higher", is_printed=False),
+        Metric(name="epe_px", of="disparity", function=_end_point_error),
+        Metric(name="d1_all", of="disparity", function=_share_bad),
+        Metric(name="epe_noc_px", of="disparity_noc", function=_end_point_error, is_printed=False),
+        Metric(name="d1_noc", of="disparity_noc", function=_share_bad, is_printed=False),
+    )
+}
+"""Metrics by name, in the order of the columns: a new one is a function and one entry here."""
+
+RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
+"""The metric by which frames are ranked, and whose error is set beside the confidence."""
 
 
 def sparsification_area(
@@ -148,7 +227,7 @@ def sparsification_area(
 def score_confidence(
     error: Float[Tensor, " n"], confidence: Float[Tensor, " n"]
 ) -> ConfidenceScore:
-    """Hold a confidence against an oracle and against chance; see :func:`sparsification_area`.
+    """Compare a confidence with an oracle and with chance; see :func:`sparsification_area`.
 
     Where all errors are equal every order is as good as the oracle's, and the share is 0.
     """
@@ -199,11 +278,9 @@ def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float
 
 
 def _refuse_unusable(depth_m: Float[Tensor, " n"], role: str) -> None:
-    if depth_m.numel() == 0:
-        raise InputError("depth_errors: there is no pixel to compare; the truth may be empty.")
     if not bool((torch.isfinite(depth_m) & (depth_m > 0)).all()):
         raise InputError(
-            f"depth_errors: the {role} depth holds values that are not positive and finite; mask "
+            f"the {role} depth holds values that are not positive and finite; mask "
             "or clamp them first, as the protocol says."
         )
 

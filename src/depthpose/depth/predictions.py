@@ -30,7 +30,7 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 
 @runtime_checkable
 class Estimator(Protocol):
-    """What predicts: :class:`FakestereoNet`, a floor, or anybody's."""
+    """What predicts: :class:`FakestereoNet`, a baseline, or anybody's."""
 
     def estimate_pair(self, pair: StereoInput, /) -> DepthEstimate:
         """Estimate depth of one input whose images are read already."""

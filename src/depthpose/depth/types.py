@@ -1,4 +1,4 @@
-"""What flows through the depth room: input apart from truth, and the estimate."""
+"""Types of depth: input apart from truth, and the estimate."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ from depthpose.core.files import Cloud
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StereoInput:
-    """What a depth estimate may look at. There is no truth here, so none can leak.
+    """What a depth estimate may use. There is no truth here, so none can leak.
 
     Attributes:
         name: what the files made from this input are called.

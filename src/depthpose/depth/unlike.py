@@ -16,11 +16,11 @@ _KIND = "selection"
 
 
 def measure_familiarity(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
-    """Give the mean confidence of each image that the generator is shown, 0..1.
+    """Give the mean confidence of each image that the generator is given, 0..1.
 
     Args:
         net: with a generator that selects, and ``with_unlike``.
-        images: right views are not looked at.
+        images: right views are ignored.
 
     Raises:
         InputError: the generator has no confidence, or an image cannot be used.

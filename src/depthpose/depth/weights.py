@@ -1,4 +1,4 @@
-"""Weights of the depth room on disk: a generator, a matcher, or both in one file."""
+"""Weights of depth on disk: a generator, a matcher, or both in one file."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
-from depthpose.depth.stereo import PSMNet
-from depthpose.depth.stereo.published import KIND as PSMNET
+from depthpose.depth.config import GeneratorConfig, SelectionConfig
+from depthpose.depth.stereo import MATCHERS, PSMNet
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"
@@ -21,9 +20,11 @@ _GENERATORS: dict[str, tuple[type, type]] = {
     "generator": (GeneratorConfig, UNetGenerator),
     "selection": (SelectionConfig, SelectionGenerator),
 }
-_MATCHERS: dict[str, tuple[type, type]] = {PSMNET: (PSMNetConfig, PSMNet)}
-_NETWORKS = _GENERATORS | _MATCHERS
-"""Config and network of each kind of weights."""
+
+
+def _networks() -> dict[str, tuple[type, type]]:
+    """Config and network of each kind of weights."""
+    return _GENERATORS | {name: (kind.config, kind.network) for name, kind in MATCHERS.items()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,39 +33,40 @@ class DepthWeights:
 
     Attributes:
         generator: left view to right view, or None in a file of the matcher alone.
-        matcher: pair to disparity, or None in a file of the generator alone.
+        matcher: pair to disparity, of any kind of ``stereo.MATCHERS``, or None in a file of the
+            generator alone.
         facts: the card in short.
     """
 
     generator: Generator | None
-    matcher: PSMNet | None
+    matcher: nn.Module | None
     facts: Mapping[str, str]
 
 
 def read_depth_weights(path: Path) -> DepthWeights:
-    """Read a weights file of any kind of this room.
+    """Read a weights file of any kind of generator or matcher.
 
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = read_checkpoint(path)
-    if checkpoint.kind not in (*_NETWORKS, BOTH):
+    if checkpoint.kind not in (*_networks(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _NETWORKS))} or {BOTH!r}."
+            f"{', '.join(map(repr, _networks()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, str(path)) if is_both else {checkpoint.kind: checkpoint}
     built = {kind: _build(part, str(path)) for kind, part in parts.items()}
     return DepthWeights(
         generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
-        matcher=next((built[kind] for kind in _MATCHERS if kind in built), None),
+        matcher=next((built[kind] for kind in MATCHERS if kind in built), None),
         facts=checkpoint.facts,
     )
 
 
 def _build(part: Checkpoint, source: str) -> Any:  # noqa: ANN401 - any network of this package
-    kind_of_config, kind_of_network = _NETWORKS[part.kind]
+    kind_of_config, kind_of_network = _networks()[part.kind]
     config = config_from_dict(part.config, kind_of_config, source=source)
     return build_network(lambda: kind_of_network(config), part, source).eval()
 
@@ -81,8 +83,8 @@ def read_generator(path: Path) -> Generator:
     return generator
 
 
-def read_matcher(path: Path) -> PSMNet:
-    """Read the matcher of a weights file.
+def read_matcher(path: Path) -> nn.Module:
+    """Read the matcher of a weights file, of any kind.
 
     Raises:
         InputError: the file holds none.
@@ -93,11 +95,34 @@ def read_matcher(path: Path) -> PSMNet:
     return matcher
 
 
+def read_psmnet(path: Path) -> PSMNet:
+    """Read the matcher of a weights file, which must be PSMNet.
+
+    Raises:
+        InputError: the file holds none, or another network.
+    """
+    return as_psmnet(read_matcher(path), str(path))
+
+
+def as_psmnet(matcher: nn.Module, source: str) -> PSMNet:
+    """Give a matcher's network where it is PSMNet, for what no other kind can do.
+
+    Raises:
+        InputError: it is another network.
+    """
+    if not isinstance(matcher, PSMNet):
+        raise InputError(
+            f"{source}: the matcher is {type(matcher).__name__}, and only PSMNet is trained and "
+            "exported here; give weights of a psmnet."
+        )
+    return matcher
+
+
 def write_depth_weights(
     path: Path,
     *,
     generator: Generator | None = None,
-    matcher: PSMNet | None = None,
+    matcher: nn.Module | None = None,
     facts: Mapping[str, str],
     with_half: bool = False,
 ) -> None:
@@ -110,7 +135,9 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
-    parts = {_kind_of(part): part for part in (generator, matcher) if part is not None}
+    parts: dict[str, Any] = {
+        _kind_of(part): part for part in (generator, matcher) if part is not None
+    }
     assert parts, "a weights file holds a network at least"
     states = {name: _state(module, with_half=with_half) for name, module in parts.items()}
     configs = {name: config_to_dict(module.config) for name, module in parts.items()}
@@ -124,13 +151,13 @@ def write_depth_weights(
 
 
 def _kind_of(network: nn.Module) -> str:
-    return next(kind for kind, (_, made) in _NETWORKS.items() if isinstance(network, made))
+    return next(kind for kind, (_, made) in _networks().items() if isinstance(network, made))
 
 
 def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
     """Take a file of several networks apart; its config names them."""
     parts: dict[str, Checkpoint] = {}
-    for kind in (kind for kind in _NETWORKS if kind in checkpoint.config):
+    for kind in (kind for kind in _networks() if kind in checkpoint.config):
         state = {
             key.removeprefix(f"{kind}."): tensor
             for key, tensor in checkpoint.state.items()
@@ -141,7 +168,7 @@ def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
             raise InputError(f"{source}: its config has no {kind!r}; the file is damaged.")
         parts[kind] = Checkpoint(kind=kind, config=config, state=state)
     if not any(kind in parts for kind in _GENERATORS) or not any(
-        kind in parts for kind in _MATCHERS
+        kind in parts for kind in MATCHERS
     ):
         raise InputError(
             f"{source}: its config names {sorted(checkpoint.config)}, but it should hold a "

@@ -1,15 +1,16 @@
 """Tables 2.1, 2.2 and 2.3 of the thesis as data, and our rows joined to them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import Literal
 
 from depthpose.core.errors import InputError, nearest_name
+from depthpose.depth.evaluate import MeanRow, Row
+from depthpose.depth.evaluate.rows import Cell
 from depthpose.depth.metrics import DepthErrors
 
-Row = dict[str, Any]
-
 _METRICS = tuple(DepthErrors.__dataclass_fields__)
+_FIRST = ("method", "weights", "cap_m", "protocol", *_METRICS)
 _DENSE = "post-processed truth"
 
 
@@ -51,6 +52,27 @@ class PublishedTable:
     with_right: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class JoinedRow(Row):
+    """A printed row, one of ours, or the difference (ours minus the thesis's).
+
+    Attributes:
+        source: which of the three.
+        method, weights, cap_m, protocol: as in :class:`~depthpose.depth.evaluate.MeanRow`; of a
+            difference across two protocols both are named.
+        metrics: the seven numbers.
+        others: further columns: the note of a printed row, all others of ours.
+    """
+
+    source: Literal["published", "ours", "difference"]
+    method: str
+    weights: str = ""
+    cap_m: float
+    metrics: Mapping[str, float]
+    protocol: str
+    others: Mapping[str, Cell] = field(default_factory=dict)
+
+
 def find_table(number: str) -> PublishedTable:
     """Give a table by its number in the thesis.
 
@@ -62,65 +84,68 @@ def find_table(number: str) -> PublishedTable:
     return TABLES[number]
 
 
-def join_published(
-    table: PublishedTable, ours: Sequence[tuple[str, Mapping[str, Any]]]
-) -> list[Row]:
+def join_published(table: PublishedTable, ours: Sequence[tuple[str, MeanRow]]) -> list[JoinedRow]:
     """Set our rows beside the printed ones, cap by cap: published, ours, difference.
 
     Args:
         table: the printed table.
         ours: for each of our rows the name of the thesis's own method that it stands for (one of
-            ``table.own``, or empty where it stands for none, as a floor), and the row as
-            ``depth.evaluate`` gives it, with ``method``.
-
-    Returns:
-        Rows with ``source``: ``published``, ``ours``, or ``difference`` (ours minus the thesis's).
-        Every row names its protocol; a difference across two protocols names both.
+            ``table.own``, or empty where it stands for none, as a baseline), and the row.
     """
     printed_caps = [row.cap_m for row in table.rows]
-    caps = sorted({*printed_caps, *(row["cap_m"] for _, row in ours)}, reverse=True)
-    rows: list[Row] = []
+    caps = sorted({*printed_caps, *(_cap_m(row) for _, row in ours)}, reverse=True)
+    rows: list[JoinedRow] = []
     for cap_m in caps:
         rows += [_published(row) for row in table.rows if row.cap_m == cap_m]
         for own, row in ours:
-            if row["cap_m"] == cap_m:
-                rows.append(_ordered("ours", row))
+            if row.cap_m == cap_m:
+                rows.append(_ours(row))
                 rows += [_difference(row, printed) for printed in table.rows
                          if printed.method == own and printed.cap_m == cap_m]  # fmt: skip
     return rows
 
 
-def _published(row: PublishedRow) -> Row:
-    facts = {
-        "method": row.method,
-        "weights": "",
-        "cap_m": row.cap_m,
-        "protocol": row.protocol,
-        "note": row.note,
-    }
-    return _ordered("published", facts | asdict(row.errors))
+def _cap_m(row: MeanRow) -> float:
+    assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
+    return row.cap_m
 
 
-def _difference(ours: Mapping[str, Any], printed: PublishedRow) -> Row:
+def _published(row: PublishedRow) -> JoinedRow:
+    return JoinedRow(
+        source="published",
+        method=row.method,
+        cap_m=row.cap_m,
+        metrics=asdict(row.errors),
+        protocol=row.protocol,
+        others={"note": row.note},
+    )
+
+
+def _ours(row: MeanRow) -> JoinedRow:
+    return JoinedRow(
+        source="ours",
+        method=row.method or "",
+        weights=row.weights or "",
+        cap_m=_cap_m(row),
+        metrics={name: row.metrics[name] for name in _METRICS},
+        protocol=row.protocol,
+        others={name: cell for name, cell in row.to_dict().items() if name not in _FIRST},
+    )
+
+
+def _difference(ours: MeanRow, printed: PublishedRow) -> JoinedRow:
     errors = asdict(printed.errors)
-    protocol = ours["protocol"]
+    protocol = ours.protocol
     if protocol != printed.protocol:
         protocol = f"{protocol} against {printed.protocol}"
-    facts = {
-        "method": f"{ours['method']} - {printed.method}",
-        "weights": ours.get("weights", ""),
-        "cap_m": printed.cap_m,
-        "protocol": protocol,
-    }
-    return _ordered("difference", facts | {name: ours[name] - errors[name] for name in _METRICS})
-
-
-def _ordered(source: str, row: Mapping[str, Any]) -> Row:
-    """Columns in one order: whose, the seven numbers, how they were measured, the rest."""
-    first = ("method", "weights", "cap_m", *_METRICS, "protocol")
-    row = {"weights": ""} | dict(row)
-    rest = [name for name in row if name not in first]
-    return {"source": source} | {name: row[name] for name in (*first, *rest)}
+    return JoinedRow(
+        source="difference",
+        method=f"{ours.method} - {printed.method}",
+        weights=ours.weights or "",
+        cap_m=printed.cap_m,
+        metrics={name: ours.metrics[name] - errors[name] for name in _METRICS},
+        protocol=protocol,
+    )
 
 
 def _row(

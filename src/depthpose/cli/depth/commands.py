@@ -1,7 +1,6 @@
 """``depthpose depth ...``."""
 
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -11,6 +10,8 @@ from depthpose.cli.depth.options import (
     Matching,
     MatchMatching,
     MatchOptions,
+    MethodOptions,
+    Methods,
     Networks,
     Output,
     PairMatching,
@@ -21,7 +22,7 @@ from depthpose.cli.depth.options import (
 )
 from depthpose.cli.engine import Engine, EngineOptions, Weights
 from depthpose.core.errors import InputError
-from depthpose.depth.config import FloorName, MatcherConfig
+from depthpose.depth.config import MatcherConfig
 
 
 def predict(
@@ -83,11 +84,12 @@ def _predict_on_ray(
     on: EngineOptions,
 ) -> int:
     from depthpose.cli.depth import engine
+    from depthpose.depth.stereo import is_own_matcher
 
-    if networks.matcher not in ("psmnet", "sgbm"):
+    if networks.matcher != "sgbm" and not is_own_matcher(networks.matcher):
         raise InputError(
-            f"--matcher {networks.matcher}: --engine ray takes psmnet or sgbm; make one file of "
-            "both by 'depthpose weights pack G --matcher S --out W'"
+            f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
+            "file of both by 'depthpose weights pack G --matcher S --out W'"
         )
     recipe = engine.NetRecipe(
         weights=Weights.read(networks.weights),
@@ -107,7 +109,7 @@ def match(
     camera: Path,
     out: str,
     weights: str | None = None,
-    matcher: str = "psmnet",
+    matcher: str | None = None,
     matching: MatchMatching = MatchOptions(),  # noqa: B008  frozen
     cloud: bool = False,
     check: bool = True,
@@ -132,8 +134,8 @@ def match(
             Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
         out: folder for the results.
         weights: weights with a matcher, by name or file; 'default' unless sgbm matches.
-        matcher: what matches the two views: psmnet (that of the weights), sgbm (OpenCV's, which
-            needs none), or weights with a matcher, by name or file.
+        matcher: what matches the two views: sgbm (OpenCV's, which needs no weights), or weights
+            with a matcher, by name or file. Left out, or psmnet: that of the weights.
         cloud: write a coloured point cloud, NAME.cloud.ply.
         check: look at the first pair for swapped or unrectified images before any work.
     """
@@ -151,7 +153,7 @@ def match(
     if engine.is_ray:
         return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
     if right is None:
-        raise InputError(f"{left}: there is no right image beside it; give it as the second word")
+        raise InputError(f"{left}: there is no right image beside it; give it second")
     pairs = pairs_of.Pairs.find(left, right, camera)
     refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
     if check:
@@ -165,9 +167,11 @@ def match(
     return pairs_of.match_all(pairs, method, Path(out), with_cloud=cloud)
 
 
-def _weights_that_match(weights: str | None, matcher: str) -> str | None:
+def _weights_that_match(weights: str | None, matcher: str | None) -> str | None:
     """Name the weights whose matcher matches; None where sgbm does."""
-    if matcher == "psmnet":
+    from depthpose.depth.stereo import is_own_matcher
+
+    if is_own_matcher(matcher):
         return "default" if weights is None else weights
     if weights is not None:
         raise InputError(
@@ -203,15 +207,9 @@ def _match_on_ray(
 def evaluate(
     data: Path,
     out: Path,
-    weights: tuple[str, ...] = (),
-    matcher: Literal["sgbm"] | None = None,
-    predictions: str | None = None,
-    floor: tuple[FloorName, ...] = (),
-    train: tuple[Path, ...] = (),
-    train_without: tuple[str, ...] = (),
     split: str | None = None,
-    holes: Literal["fill", "leave"] = "fill",
-    comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
+    methods: Methods = MethodOptions(),  # noqa: B008  frozen
+    comparison: Protocol = ProtocolOptions(),  # noqa: B008
     matching: PairMatching = PairOptions(),  # noqa: B008
     engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
@@ -229,59 +227,32 @@ def evaluate(
     Args:
         data: KITTI raw, object, 2012/2015, Middlebury, or a plain folder of pairs.
         out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
-        weights: files or names. Weights with a generator see the left view alone; 'both:NAME' shows
-            their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the drawn one, and
-            'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the
-            generator, from the matcher on the drawn view, or from both.
-        matcher: sgbm measures OpenCV's StereoSGBM on both views, and no weights.
-        predictions: measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards
-            that 'depth predict|match --engine ray' left, path or URL.
-        floor: what every method must beat: rows (the best constant depth of each image row) or
-            nearest (the depth of the training image that looks most alike), or both.
-        train: folders with the frames that a floor is fitted to.
-        train_without: names of frames to keep out of them.
         split: eigen-test, eigen-val, eigen-train, eigen-train-val, eigen-benchmark, or a file of
             frames.
-        holes: sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out
-            (then the column 'coverage' says what share was measured).
     """
-    from depthpose.cli.depth import evaluating, methods
+    from depthpose.cli.depth import evaluating
     from depthpose.core.engine import is_job
     from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
     from depthpose.report.tables import table_files
 
-    if not weights and matcher is None and predictions is None and not floor:
-        raise InputError(
-            "measure --weights FILE, --matcher sgbm, --predictions DIR or --floor rows, or several."
-        )
+    predictions = methods.predictions
+    methods.refuse_none()
     rule = find_protocol(comparison.protocol)
     dataset = evaluating.open_frames(data, split)
-    chosen: list[methods.Method] = []
-    if matcher == "sgbm":
-        chosen.append(methods.sgbm_method(with_filled_holes=holes == "fill"))
-    chosen += [methods.named_method(word, matching.config) for word in weights]
-    if floor:
-        training = evaluating.open_training(train, train_without)
-        chosen += [methods.floor_method(name, training) for name in dict.fromkeys(floor)]
+    chosen = evaluating.choose_methods(methods, matching.config)
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate"}, files)
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
+    name, caps_m = comparison.protocol, comparison.cap
     if predictions is not None and is_job(predictions):
         from depthpose.cli.depth.engine import ShardTruth, measure_shards
 
-        truth = ShardTruth(
-            data=str(data.resolve()),
-            split=split,
-            protocol=comparison.protocol,
-            caps_m=comparison.cap,
-        )
+        truth = ShardTruth(data=str(data.resolve()), split=split, protocol=name, caps_m=caps_m)
         ready = measure_shards(dataset, predictions, truth, out, engine)
-        return evaluating.measure(
-            dataset, folders, comparison.protocol, comparison.cap, out, [ready]
-        )
+        return evaluating.measure(dataset, folders, name, caps_m, out, [ready])
     if engine.is_ray:
         raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
-    return evaluating.measure(dataset, folders, comparison.protocol, comparison.cap, out)
+    return evaluating.measure(dataset, folders, name, caps_m, out)

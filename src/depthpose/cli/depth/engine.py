@@ -63,7 +63,7 @@ class NetRecipe:
                 path,
                 self.config,
                 with_right=self.with_right,
-                matcher="sgbm" if self.with_sgbm else "psmnet",
+                matcher="sgbm" if self.with_sgbm else None,
                 with_unlike=self.with_unlike,
                 answer=self.answer,
             )

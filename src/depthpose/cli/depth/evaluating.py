@@ -2,26 +2,44 @@
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth.methods import Method, baseline_method, named_method, sgbm_method
+from depthpose.cli.depth.options import MethodOptions
 from depthpose.cli.depth.page import frame_sections
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_shard, read_settings, wait_for
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
-from depthpose.depth.evaluate import PROTOCOLS, Evaluation, Protocol, evaluate, has_truth
+from depthpose.depth.evaluate import (
+    PROTOCOLS,
+    Evaluation,
+    Protocol,
+    Row,
+    Source,
+    evaluate,
+    has_truth,
+)
+from depthpose.depth.metrics import METRICS
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import StereoInput
 from depthpose.report.tables import Section, plain_table, write_page, write_table
 
-_SHOWN = ("method", "weights", "speed", "cap_m", "frames", "coverage", "abs_rel", "sq_rel", "rmse",
-          "rmse_log", "d1", "epe_px", "d1_all", "ause")  # fmt: skip
-"""Columns that are printed; the files hold all."""
+
+def printed_columns() -> list[str]:
+    """Name the columns that are printed; files hold all."""
+    metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
+    return ["method", "weights", "speed", "cap_m", "frames", "coverage", *metrics, "ause"]
+
+
+def columns(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Give rows as files and pages take them."""
+    return [row.to_dict() for row in rows]
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
@@ -59,10 +77,24 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
     return home
 
 
+def choose_methods(options: MethodOptions, config: MatcherConfig) -> list[Method]:
+    """Build what was named: SGBM, weights and baselines, in this order."""
+    chosen: list[Method] = []
+    if options.matcher == "sgbm":
+        chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
+    chosen += [named_method(name, config) for name in options.weights]
+    if options.baseline:
+        training = open_training(options.train, options.train_without)
+        chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
+    return chosen
+
+
 def open_training(folders: Sequence[Path], without: Sequence[str]) -> Dataset:
-    """Open the frames that a floor is fitted to."""
+    """Open the frames that a baseline is fitted to."""
     if not folders:
-        raise InputError("a floor is fitted to training frames: give --train FOLDER, or several.")
+        raise InputError(
+            "a baseline is fitted to training frames: give --train FOLDER, or several."
+        )
     return join_datasets([open_dataset(folder) for folder in folders], without)
 
 
@@ -88,16 +120,17 @@ def measure(
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)
     measured = join([*each, *ready])
-    write_table(out, measured.rows)
+    rows = columns(measured.rows)
+    write_table(out, rows)
     write_details(measured, out)
     page = out / "report.html"
     sections = [
-        Section(title="Mean over frames", text=describe_protocol(protocol), rows=measured.rows),
+        Section(title="Mean over frames", text=describe_protocol(protocol), rows=rows),
         *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
         *detail_sections(measured),
     ]
     write_page(page, f"{protocol} on {dataset.name}", sections, environment())
-    print(plain_table(measured.rows, _SHOWN))
+    print(plain_table(rows, printed_columns()))
     say_skipped(measured)
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
     return 0
@@ -122,19 +155,19 @@ def measure_each(
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Let each row say whose predictions it is of.
+    """Write into each row whose predictions it is of.
 
     Args:
         result: of one set of predictions.
         name: of their folder.
         settings: that made them, where they are ours.
     """
-    who = _describe(name, settings)
-    short = {column: who[column] for column in ("method", "sees", "weights")}
+    source = describe_source(name, settings)
+    short = {"method": source.method, "sees": source.sees, "weights": source.weights}
     return Evaluation(
-        rows=[who | row for row in result.rows],
-        per_frame=[short | row for row in result.per_frame],
-        deciles=[short | row for row in result.deciles],
+        rows=[replace(row, **asdict(source)) for row in result.rows],
+        per_frame=[replace(row, **short) for row in result.per_frame],
+        deciles=[replace(row, **short) for row in result.deciles],
         skipped=result.skipped,
     )
 
@@ -151,9 +184,9 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
 
 def write_details(measured: Evaluation, out: Path) -> None:
     """Write each frame's numbers, and the error by confidence where there is any."""
-    write_table(out, measured.per_frame, name="frames")
+    write_table(out, columns(measured.per_frame), name="frames")
     if measured.deciles:
-        write_table(out, measured.deciles, name="confidence")
+        write_table(out, columns(measured.deciles), name="confidence")
 
 
 def detail_sections(measured: Evaluation) -> list[Section]:
@@ -163,9 +196,9 @@ def detail_sections(measured: Evaluation) -> list[Section]:
         Section(
             title="Error by confidence",
             text="Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)",
-            rows=measured.deciles,
+            rows=columns(measured.deciles),
         ),
-        Section(title="Each frame", rows=measured.per_frame),
+        Section(title="Each frame", rows=columns(measured.per_frame)),
         Section(title="Skipped frames", rows=without_truth),
     ]
     return [section for section in sections if section.rows]
@@ -187,16 +220,16 @@ def _show_progress(frames: Sequence[int]) -> Iterable[int]:
     return tqdm(frames, unit=" frames", disable=None)
 
 
-def _describe(name: str, settings: dict[str, Any] | None) -> dict[str, Any]:
-    """Columns that say whose predictions these are."""
+def describe_source(name: str, settings: dict[str, Any] | None) -> Source:
+    """Say whose predictions a folder holds, by its name and its settings (None: not ours)."""
     if settings is None:
-        return {"method": name, "sees": "", "speed": "", "weights": "", "weights_sha256": ""}
+        return Source(method=name)
     holes = {True: " (holes filled)", False: " (matched pixels)"}
     suffix = holes.get(settings.get("with_filled_holes", ""), "")
-    return {
-        "method": settings.get("matcher", "") + suffix,
-        "sees": settings.get("sees", "both views"),
-        "speed": settings.get("speed", "") if settings.get("sees") != "left view" else "",
-        "weights": settings.get("weights", ""),
-        "weights_sha256": settings.get("weights_sha256", "")[:12],
-    }
+    return Source(
+        method=settings.get("matcher", "") + suffix,
+        sees=settings.get("sees", "both views"),
+        speed=settings.get("speed", "") if settings.get("sees") != "left view" else "",
+        weights=settings.get("weights", ""),
+        weights_sha256=settings.get("weights_sha256", "")[:12],
+    )

@@ -22,7 +22,7 @@ from depthpose.depth.predictions import (
     write_estimate,
     write_estimate_cloud,
 )
-from depthpose.depth.stereo import PSMNetMatcher, tile_change_px
+from depthpose.depth.stereo import TiledMatcher, tile_change_px
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 
@@ -70,7 +70,7 @@ def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
 
 
 def refuse_unusable_first(pairs: Pairs) -> None:
-    """Look at the first pair before any work: swapped, unrectified or of the wrong size."""
+    """Check the first pair before any work: swapped, unrectified or of the wrong size."""
     refuse_unrectified_pair(pairs.read(0))
 
 
@@ -87,7 +87,8 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
     pair = pairs.read(0)
     assert pair.right is not None
     assert isinstance(method.net, FakestereoNet)
-    assert isinstance(method.net.matcher, PSMNetMatcher)
+    if not isinstance(method.net.matcher, TiledMatcher):
+        raise InputError(f"--tile: {method.name} matches no tiles; leave --tile away")
     change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
     print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
 

@@ -1,4 +1,4 @@
-"""Methods by their words on the command line, with what decides their results."""
+"""Methods by their names on the command line, with what decides their results."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -11,18 +11,18 @@ from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import own_device
-from depthpose.depth.baselines import NearestImageFloor, RowDepthFloor
-from depthpose.depth.config import Answer, FloorName, MatcherConfig, SGBMConfig, Speed
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConfig, Speed
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
-from depthpose.depth.stereo import with_usable_precision
+from depthpose.depth.stereo import MATCHERS, is_own_matcher, with_usable_precision
 
 
 class Method(NamedTuple):
     """An estimator, what to call it, and the JSON values that decide its results.
 
-    ``with_right`` says whether it is shown the real right view.
+    ``with_right`` says whether it is given the real right view.
     """
 
     name: str
@@ -36,7 +36,7 @@ def weights_method(
     config: MatcherConfig,
     *,
     with_right: bool | None = None,
-    matcher: str = "psmnet",
+    matcher: str | None = None,
     with_unlike: bool = True,
     answer: Answer | None = None,
 ) -> Method:
@@ -45,27 +45,28 @@ def weights_method(
     Args:
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
-        with_right: show it the real right view; by default only to a matcher, which needs it.
-        matcher: what matches the drawn view: psmnet (the weights' own), sgbm (OpenCV's), or that
-            of other weights, by name or file.
+        with_right: give it the real right view; by default only to a matcher, which needs it.
+        matcher: what matches the drawn view: None or a kind such as psmnet (the weights' own),
+            sgbm (OpenCV's), or that of other weights, by name or file.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
     Raises:
         InputError: a matcher alone is asked to do without the right view, or weights without a
-            matcher to look at it.
+            matcher for it.
     """
     config = with_usable_precision(config)  # what is computed in is what is recorded
     path = find_weights(weights)
     kind = read_checkpoint(path).kind
-    is_shown = kind == "psmnet" if with_right is None else with_right
-    if kind == "psmnet" and not is_shown:
+    is_matcher = kind in MATCHERS
+    is_shown = is_matcher if with_right is None else with_right
+    if is_matcher and not is_shown:
         raise InputError(
             f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
             "synthesise the right view."
         )
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
-    if kind != "psmnet":
+    if not is_matcher:
         facts["sees"] = "both views" if is_shown else "left view"
     if matcher == "sgbm":
         facts["matcher"] += " with sgbm"
@@ -75,8 +76,8 @@ def weights_method(
         )
         return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
     config = replace(config, device=own_device(config.device))
-    if matcher != "psmnet":
-        other = find_weights(matcher)
+    if not is_own_matcher(matcher):
+        other = find_weights(str(matcher))
         facts["matcher"] += f" with {other.stem}"
         facts["matcher_sha256"] = file_sha256(other)
         net = FakestereoNet.load(
@@ -90,7 +91,7 @@ def weights_method(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
             "weights with one, or sgbm."
         )
-    name = f"{path.stem}-both" if is_shown and kind != "psmnet" else path.stem
+    name = f"{path.stem}-both" if is_shown and not is_matcher else path.stem
     if answer is not None:
         facts["answer"] = answer
         name += f"-{answer}"
@@ -98,7 +99,7 @@ def weights_method(
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:
-    """Build the method of a word: weights by file or name, perhaps with ``both:`` and the like.
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like.
 
     ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
     ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.
@@ -124,12 +125,12 @@ def sgbm_method(*, with_filled_holes: bool) -> Method:
     return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
 
 
-def floor_method(name: FloorName, training: Dataset) -> Method:
-    """Fit a floor to the truth of training frames."""
-    kinds = {"rows": RowDepthFloor, "nearest": NearestImageFloor}
+def baseline_method(name: BaselineName, training: Dataset) -> Method:
+    """Fit a baseline to the truth of training frames."""
+    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
-        "matcher": f"floor: {name}",
+        "matcher": f"baseline: {name}",
         "sees": "left view" if name == "nearest" else "no image",
         "train": training.name,
         "train_frames": len(training),
@@ -139,4 +140,4 @@ def floor_method(name: FloorName, training: Dataset) -> Method:
     def show(frames: Sequence[int]) -> Iterable[int]:
         return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
 
-    return Method(f"floor-{name}", kinds[name].fit(training, show), settings, with_right=False)
+    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -9,7 +10,7 @@ import tyro
 from depthpose.cli.help import group
 from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, MatcherConfig, Speed
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
 _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
@@ -77,9 +78,9 @@ class ImageNetworks:
 
     weights: str = "default"
     """weights with a generator, by name or file ('depthpose weights list')."""
-    matcher: str = "psmnet"
-    """what matches the synthesised view: psmnet (that of the weights), sgbm (OpenCV's), or other
-    weights with a matcher, by name or file."""
+    matcher: str | None = None
+    """what matches the synthesised view: sgbm (OpenCV's), or other weights with a matcher, by name
+    or file. Left out, or psmnet: that of the weights."""
     answer: Answer | None = None
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
     joined: both. Left out: what the weights say; another matcher matches."""
@@ -93,14 +94,17 @@ class ImageNetworks:
         Raises:
             InputError: which, and what to leave away.
         """
-        if self.matcher != "psmnet" and self.answer is not None:
+        from depthpose.depth.stereo import is_own_matcher  # --help must not load torch
+
+        if not is_own_matcher(self.matcher) and self.answer is not None:
             raise InputError(
                 f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
                 "synthesised view; leave one away."
             )
         if self.matcher == "sgbm" and matching != MatcherOptions():
             raise InputError(
-                "--device, --precision and --max-memory are for psmnet; leave them away."
+                "--device, --precision and --max-memory are for matchers with weights; sgbm takes "
+                "none."
             )
 
 
@@ -136,6 +140,46 @@ class PredictOutput:
 
 @group
 @dataclass(frozen=True, kw_only=True)
+class MethodOptions:
+    """What is measured; several at once share the table."""
+
+    weights: tuple[str, ...] = ()
+    """files or names. Weights with a generator are given the left view alone; 'both:NAME' gives
+    their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the synthesised one,
+    'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the generator, from
+    the matcher on the synthesised view, or from both; 'quick:NAME' and 'fine:NAME' set the speed of
+    matching real pairs."""
+    matcher: Literal["sgbm"] | None = None
+    """sgbm measures OpenCV's StereoSGBM on both views, and no weights."""
+    holes: Literal["fill", "leave"] = "fill"
+    """sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out (then the
+    column 'coverage' is the share that was measured)."""
+    predictions: str | None = None
+    """measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards that 'depth
+    predict|match --engine ray' left, path or URL."""
+    baseline: Annotated[tuple[BaselineName, ...], tyro.conf.arg(aliases=("--floor",))] = ()
+    """what every method must beat: rows (the best constant depth of each image row) or nearest (the
+    depth of the training image that looks most alike), or both."""
+    train: tuple[Path, ...] = ()
+    """folders with the frames that a baseline is fitted to."""
+    train_without: tuple[str, ...] = ()
+    """names of frames to leave out of them."""
+
+    def refuse_none(self) -> None:
+        """Refuse to measure nothing.
+
+        Raises:
+            InputError: no method is named.
+        """
+        if not (self.weights or self.matcher or self.predictions or self.baseline):
+            raise InputError(
+                "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
+                "several."
+            )
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
     """How prediction and truth are compared."""
 
@@ -150,6 +194,7 @@ PairMatching = Annotated[PairOptions, tyro.conf.OmitArgPrefixes]
 MatchMatching = Annotated[MatchOptions, tyro.conf.OmitArgPrefixes]
 Networks = Annotated[ImageNetworks, tyro.conf.OmitArgPrefixes]
 Output = Annotated[PredictOutput, tyro.conf.OmitArgPrefixes]
+Methods = Annotated[MethodOptions, tyro.conf.OmitArgPrefixes]
 Protocol = Annotated[ProtocolOptions, tyro.conf.OmitArgPrefixes]
 
 

@@ -3,11 +3,10 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from depthpose.core.run import environment
 from depthpose.depth.datasets import Dataset
-from depthpose.depth.evaluate import PROTOCOLS, frame_result
+from depthpose.depth.evaluate import PROTOCOLS, FrameRow, frame_result, ranking_metric
 from depthpose.depth.predictions import COLOR_RANGE_M, read_estimate
 from depthpose.depth.types import StereoInput
 from depthpose.report.choose import MOST_VIEWS, choose_ranked, share_views, spread_evenly
@@ -52,7 +51,7 @@ def write_depth_page(
 def frame_sections(
     dataset: Dataset,
     folders: Sequence[Path],
-    rows: Sequence[Sequence[dict[str, Any]]],
+    rows: Sequence[Sequence[FrameRow]],
     protocol: str,
 ) -> list[Section]:
     """Show the worst, the median and the best frame of each set of predictions.
@@ -66,19 +65,22 @@ def frame_sections(
     places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
     for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
-        cap_m = of_folder[0].get("cap_m")
-        of_cap = [row for row in of_folder if row.get("cap_m") == cap_m]
-        column = "epe_px" if cap_m is None else "abs_rel"
-        for role, k in choose_ranked([row[column] for row in of_cap], most):
+        cap_m = of_folder[0].cap_m
+        of_cap = [row for row in of_folder if row.cap_m == cap_m]
+        metric = ranking_metric(cap_m)
+        sign = 1 if metric.better == "lower" else -1
+        for role, k in choose_ranked([sign * row.metrics[metric.name] for row in of_cap], most):
             row = of_cap[k]
+            cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
             text = (
-                f"The {role} of {_count(len(of_cap), 'frame')} by {column}: "
-                f"{row[column]:.4f}{'' if cap_m is None else f', truth up to {cap_m:g} m'}."
+                f"The {role} of {_count(len(of_cap), 'frame')} by {metric.name}: "
+                f"{row.metrics[metric.name]:.4f}{cap}."
             )
-            title = f"{folder.name}: {row['frame']}, {role}"
-            index = places[row["frame"]]
+            title = f"{folder.name}: {row.frame}, {role}"
+            index = places[row.frame]
             section = _frame_section(dataset, index, folder, (protocol, cap_m), title, text)
-            own = {name: value for name, value in row.items() if name not in _SAID_ABOVE}
+            columns = row.to_dict()
+            own = {name: value for name, value in columns.items() if name not in _SAID_ABOVE}
             sections.append(replace(section, rows=[own]))
     return sections
 

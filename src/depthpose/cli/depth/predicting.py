@@ -76,7 +76,7 @@ def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     read = None if camera is None else read_camera(camera, _size_of(first))
     if isinstance(read, StereoRig):
-        print("the camera's baseline is not looked at: one image has none", file=sys.stderr)
+        print("the camera's baseline is ignored: one image has none", file=sys.stderr)
     return Lens(camera=read, focal_px=focal_px)
 
 

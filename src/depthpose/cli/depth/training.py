@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
 _LOOKED_AT = 20
-"""Held-out pairs of a folder, where nothing else is said."""
+"""Held-out pairs of a folder, by default."""
 
 
 def train(
@@ -35,8 +35,8 @@ def train(
         stereo    the matcher; needs pairs with truth
         finetune  either generator through the frozen matcher; needs weights of both
 
-    A config holds every knob; the words below change what they name. The run folder keeps config,
-    metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
+    A config holds every setting; the options below change what they name. The run folder keeps
+    config, metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
     stopped the training, and ends with the weights of a run that nothing stopped. Several GPUs or
     machines: 'accelerate launch -m depthpose depth train ...'.
 
@@ -47,8 +47,8 @@ def train(
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
         data: folders of pairs; they replace the config's.
-        held_out: folders of pairs that validation looks at, and none of which is learnt from; of
-            each 20, evenly taken, where the config says no other number.
+        held_out: folders of pairs for validation, none of which is learnt from; of
+            each 20, evenly taken, unless the config sets another number.
         generator: finetune: weights of the generator to begin with.
         matcher: finetune: what matches the drawn view: weights with a matcher, by name or file,
             which are not changed.
@@ -73,10 +73,10 @@ def train(
             chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
         )
     words = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
-    knobs = {field.name: field.type for field in dataclasses.fields(kind)}
+    settings = {field.name: field.type for field in dataclasses.fields(kind)}
     for word, value in words.items():
         if value is not None and (
-            word not in knobs or (word in ("generator", "matcher") and stage != "finetune")
+            word not in settings or (word in ("generator", "matcher") and stage != "finetune")
         ):
             raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
     chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)

@@ -106,7 +106,8 @@ def reproduce_table(order: Order, methods: Sequence[tuple[str, Method]], out: Pa
     measured = evaluating.measure_all(order.dataset, folders, order.protocol, order.caps_m)
     of_each = len(order.caps_m)
     owns = [own for own, _ in methods for _ in range(of_each)]
-    rows = join_published(order.table, list(zip(owns, measured.rows, strict=True)))
+    joined = join_published(order.table, list(zip(owns, measured.rows, strict=True)))
+    rows = evaluating.columns(joined)
     write_table(out, rows)
     evaluating.write_details(measured, out)
     sections = [

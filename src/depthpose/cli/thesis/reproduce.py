@@ -69,7 +69,7 @@ def reproduce(
         chosen += [("", other) for other in others if other.name not in names]
     if train:
         training = evaluating.open_training(train, train_without)
-        baselines = [methods.floor_method(name, training) for name in ("rows", "nearest")]
+        baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
         # A baseline uses no right image, but is measured on the frames of the other rows.
         chosen += [("", one._replace(with_right=published.with_right)) for one in baselines]
     order = reproducing.Order(

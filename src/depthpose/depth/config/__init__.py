@@ -1,11 +1,11 @@
-"""Every knob of the depth room: frozen dataclasses that refuse a value where it is born."""
+"""Settings of depth: frozen dataclasses that refuse unusable values."""
 
 from depthpose.depth.config.data import AugmentConfig as AugmentConfig
 from depthpose.depth.config.data import DegradeConfig as DegradeConfig
 from depthpose.depth.config.data import PairsConfig as PairsConfig
 from depthpose.depth.config.data import StreetsConfig as StreetsConfig
 from depthpose.depth.config.data import TruthKind as TruthKind
-from depthpose.depth.config.matching import FloorName as FloorName
+from depthpose.depth.config.matching import BaselineName as BaselineName
 from depthpose.depth.config.matching import MatcherConfig as MatcherConfig
 from depthpose.depth.config.matching import PSMNetConfig as PSMNetConfig
 from depthpose.depth.config.matching import SGBMConfig as SGBMConfig

@@ -1,4 +1,4 @@
-"""Knobs of what a training sees: pairs on disk, their random changes, made streets."""
+"""Settings of training data: pairs on disk, their random changes, synthetic streets."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -101,13 +101,13 @@ class AugmentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class StreetsConfig:
-    """What made street scenes are like."""
+    """What synthetic street scenes are like."""
 
     seed: int = 0
     """Another seed, other streets."""
 
     frames: int = 100_000
-    """How many there are; each is made when it is asked for."""
+    """How many there are; each is rendered on demand."""
 
     rigs: Literal["kitti", "varied"] = "kitti"
     """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
@@ -165,7 +165,7 @@ class PairsConfig:
     """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
 
     streets: StreetsConfig | None = None
-    """Streets that are made while training, each on demand; beside the folders' pairs."""
+    """Streets that are rendered while training, each on demand; beside the folders' pairs."""
 
     split: str | None = None
     """Name or file of a split, for the first folder."""
@@ -175,8 +175,8 @@ class PairsConfig:
 
     truth: TruthKind | None = None
     """Which truth of the folders is learnt from, one kind alone; frames without it are left out.
-    None: the one kind that a folder has; a folder with several is refused. Streets that are made
-    while training have exact disparity, whatever this says."""
+    None: the one kind that a folder has; a folder with several is refused. Streets that are
+    rendered while training have exact disparity, whatever this says."""
 
     limit: int | None = None
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""

@@ -1,11 +1,11 @@
-"""Knobs of the stereo matchers, and the floors they must beat."""
+"""Settings of the stereo matchers, and the names of the baselines."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from depthpose.core.errors import InputError
 
-FloorName = Literal["rows", "nearest"]
+BaselineName = Literal["rows", "nearest"]
 """The best constant depth of each image row; the depth of the training image most alike."""
 
 
@@ -122,10 +122,10 @@ class SGBMConfig:
     """Side of the matched window [px], odd."""
 
     p1: int = 8 * 3 * 9
-    """Punishment of a disparity step of 1 between neighbours."""
+    """Penalty of a disparity step of 1 between neighbours."""
 
     p2: int = 32 * 3 * 9
-    """Punishment of a larger step; more than p1."""
+    """Penalty of a larger step; more than p1."""
 
     disp12_max_diff: int = 1
     """Largest difference allowed in the left-right check [px]."""

@@ -1,4 +1,4 @@
-"""Knobs of the two view synthesis networks: the one that paints, and the one that selects."""
+"""Settings of the two view synthesis networks: the one that paints, and the one that selects."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -78,7 +78,7 @@ class SelectionConfig:
     """Channels of the decoder at strides 16, 8, 4 and 2."""
 
     planes: int = 32
-    """Disparities that are told apart, evenly spaced in their logarithm."""
+    """Disparities that are distinguished, evenly spaced in their logarithm."""
 
     disparity_px: tuple[float, float] = (1.2, 88.0)
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
@@ -88,7 +88,7 @@ class SelectionConfig:
     right view; or both, weighed by their confidence."""
 
     least_confidence: float = 0.0
-    """Mean confidence below which an image is unlike what the weights know; 0: not looked at.
+    """Mean confidence below which an image is unlike what the weights know; 0: not checked.
     'depthpose depth calibrate' finds it."""
 
     virtual_focal_px: float = 372.0

@@ -24,12 +24,12 @@ def check_dataset(
     with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
-    """Look at every file of a dataset.
+    """Check every file of a dataset.
 
     Args:
         folder: the dataset's folder, in any layout that ``open_dataset`` knows.
         split: look only at these frames, and name those that are missing.
-        with_decoding: decode every image in full; else only headers and sizes are looked at.
+        with_decoding: decode every image in full; else only headers and sizes are read.
         progress: called with the number of frames done and of all frames.
 
     Raises:

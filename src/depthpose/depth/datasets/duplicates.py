@@ -4,7 +4,7 @@ Every street has sky above and asphalt below, so whole thumbnails of unrelated s
 0.9; what is left after each pixel's surroundings are subtracted does not. The comparison is made
 over small shifts and zooms, for a car turns and drives on between two frames.
 
-The threshold stands where frames of KITTI whose drives are known separate (95 pairs of KITTI 2015
+The threshold is where frames of KITTI whose drives are known separate (95 pairs of KITTI 2015
 from 20 drives): of some 4200 pairs from two drives none but those of one crossing, which two drives
 show, reaches 0.3; of frames of one drive a second apart 19 of 24 do, those in a turn do not. So
 the search finds the same view again, and not every frame of the same drive.
@@ -61,7 +61,7 @@ def find_duplicates(
     Args:
         first: usually the training set.
         second: usually the evaluation set.
-        at_least: smallest likeness that is listed; a lower one lists more pairs to look at by eye.
+        at_least: smallest likeness that is listed; a lower one lists more pairs to compare by eye.
         progress: wraps the sequence of frames, to show how far it is.
     """
     likeness = likeness_matrix(first, second, progress)

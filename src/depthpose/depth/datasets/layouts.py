@@ -1,6 +1,7 @@
 """Folders to frames: which layout this is, and where each frame's parts lie."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.errors import InputError
@@ -8,6 +9,19 @@ from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.packed import packed_frames
 
 _IMAGES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """How the files of a dataset lie in its folder.
+
+    Attributes:
+        find: gives the frames of a folder; none where it has another layout.
+        parts: the files and folders by which people recognise it.
+    """
+
+    find: Callable[[Path], Iterable[Frame]]
+    parts: str
 
 
 def find_frames(folder: Path) -> tuple[str, list[Frame]]:
@@ -25,20 +39,17 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     found = ", ".join(path.name for path in children[:8]) or "nothing"
     inside = [path.name for path in children[:50] if path.is_dir() and _recognise(path)]
     hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
+    known_layouts = ", ".join(f"{name} ({one.parts})" for name, one in LAYOUTS.items())
     raise InputError(
-        f"{folder}: no layout that is known here. It holds {found}. Known: "
-        "KITTI raw (DATE/DATE_drive_NNNN_sync/image_02/data), KITTI object (image_2, image_3, "
-        "calib), KITTI 2015 (image_2, image_3, disp_occ_0), KITTI 2012 (colored_0, colored_1), "
-        "Middlebury (SCENE/im0.png, calib.txt), pairs (left, right, calib.txt or camera.json, "
-        f".yaml), shards of 'depthpose data pack' (index.json).{hint}"
+        f"{folder}: no layout that is known here. It holds {found}. Known: {known_layouts}.{hint}"
     )
 
 
 def _recognise(folder: Path) -> tuple[str, list[Frame]] | None:
-    for layout, find in LAYOUTS.items():
-        frames = sorted(find(folder), key=lambda frame: frame.name)
+    for name, layout in LAYOUTS.items():
+        frames = sorted(layout.find(folder), key=lambda frame: frame.name)
         if frames:
-            return layout, frames
+            return name, frames
     return None
 
 
@@ -144,14 +155,17 @@ def _pairs(folder: Path) -> Iterable[Frame]:
         )
 
 
-LAYOUTS: dict[str, Callable[[Path], Iterable[Frame]]] = {
-    "packed shards": packed_frames,
-    "KITTI raw": _raw,
-    "KITTI object or 2015": _object_or_2015,
-    "KITTI 2012": _kitti_2012,
-    "Middlebury": _middlebury,
-    "pairs": _pairs,
+LAYOUTS = {
+    "packed shards": Layout(find=packed_frames, parts="index.json of 'depthpose data pack'"),
+    "KITTI raw": Layout(find=_raw, parts="DATE/DATE_drive_NNNN_sync/image_02/data"),
+    "KITTI object or 2015": Layout(
+        find=_object_or_2015, parts="image_2, image_3, calib or disp_occ_0"
+    ),
+    "KITTI 2012": Layout(find=_kitti_2012, parts="colored_0, colored_1"),
+    "Middlebury": Layout(find=_middlebury, parts="SCENE/im0.png, calib.txt"),
+    "pairs": Layout(find=_pairs, parts="left, right, calib.txt or camera.json, .yaml"),
 }
+"""Layouts of folders, tried in this order: a new one is a function and one entry here."""
 
 
 def _images(folder: Path) -> list[Path]:

@@ -38,7 +38,7 @@ def pack_frames(
         frames: what is packed, in order.
         out: a folder of its own.
         shard_bytes: a shard is closed when it has this many.
-        show: told the name of each frame.
+        show: called with the name of each frame.
 
     Raises:
         InputError: a file is missing or damaged, or the disk refuses.

@@ -24,7 +24,7 @@ from depthpose.depth.types import StereoInput
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
 """A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
 numbers of 8 bits or floats in [0, 1], (H, W, C), (C, H, W) or (H, W). The order of the channels
-cannot be told from the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
+cannot be seen in the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
 _CHANNELS = (1, 3, 4)
 _VALUES = (
     "give 8-bit numbers, or floats in [0, 1]: divide by the largest value that it can hold (65535 "

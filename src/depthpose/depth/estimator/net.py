@@ -37,7 +37,7 @@ from depthpose.depth.estimator.rig import (
     set_answer,
     square_camera,
 )
-from depthpose.depth.stereo import CameraMatcher, Matcher
+from depthpose.depth.stereo import CameraMatcher, Matcher, is_own_matcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser, openvino_generator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
@@ -89,7 +89,7 @@ class FakestereoNet:
         self.weights = weights
 
     def __repr__(self) -> str:
-        """Say it in one line: what draws and what matches, weights, device."""
+        """Give one line: what draws and what matches, weights, device."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
         said = [" + ".join(type(part).__name__ for part in parts)]
         said += [f"weights {self.weights!r}"] if self.weights else []
@@ -117,7 +117,7 @@ class FakestereoNet:
                 needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
                 ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
                 What names weights: :func:`depthpose.core.hub.find_weights`.
-            matcher: ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's, which needs none),
+            matcher: a kind such as ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
@@ -134,14 +134,15 @@ class FakestereoNet:
             MissingExtraError: OpenVINO is not installed.
         """
         refuse_unknown("engine", engine, ENGINES)
-        if weights is None and (matcher is None or matcher == "psmnet"):
+        if weights is None and is_own_matcher(matcher):
             weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
         if answer is not None:
             set_answer(found, answer)
         own = None
         # Paths first: a Path has a method 'match' too, and would pass for a matcher.
-        if isinstance(matcher, str | Path) and matcher not in ("psmnet", "sgbm"):
+        is_own = matcher == "sgbm" or is_own_matcher(matcher)
+        if isinstance(matcher, str | Path) and not is_own:
             own = read_depth_weights(find_weights(matcher))
         terms = join_terms(*(held.facts for held in (found, own) if held is not None))
         say_terms({"terms": terms})
@@ -179,7 +180,7 @@ class FakestereoNet:
                 ``image[..., ::-1]``).
             camera: camera or rig, its file of any format that is read, a dict of what such a file
                 holds, or the 3x3 matrix K. One image needs its focal length, for the image is
-                brought to the rig that the generator imitates; a baseline is not looked at. A pair
+                brought to the rig that the generator imitates; a baseline is ignored. A pair
                 without camera gives disparity only.
             focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
@@ -273,11 +274,11 @@ class FakestereoNet:
             return found
         known = [float(confidence.mean()) for confidence in drawn.confidence]
         return [
-            self._told_apart(image.name, replace(one, familiarity=familiarity))
+            self._checked_familiarity(image.name, replace(one, familiarity=familiarity))
             for image, one, familiarity in zip(images, found, known, strict=True)
         ]
 
-    def _told_apart(self, name: str, found: DepthEstimate) -> DepthEstimate:
+    def _checked_familiarity(self, name: str, found: DepthEstimate) -> DepthEstimate:
         """Refuse an image that is unlike what the weights know, or warn of it."""
         assert self.synthesiser is not None, "checked before"
         assert found.familiarity is not None

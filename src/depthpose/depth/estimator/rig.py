@@ -23,7 +23,7 @@ from depthpose.depth.disparity import (
     resized_map,
     resized_match,
 )
-from depthpose.depth.stereo import Matcher, PSMNetMatcher, SGBMMatcher
+from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
@@ -78,7 +78,7 @@ def from_virtual(
 def join_matches(one: Match, other: Match) -> Match:
     """Take the mean of two disparities in the logarithm, weighed by their confidence.
 
-    Where ``other`` has no answer, or no confidence, ``one`` stands.
+    Where ``other`` has no answer, or no confidence, ``one`` is taken.
     """
     assert one.confidence is not None
     weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
@@ -140,7 +140,7 @@ def choose_matcher(
         return matcher
     holder = found if own is None else own
     if holder is not None and holder.matcher is not None:
-        return PSMNetMatcher(holder.matcher, run)
+        return make_matcher(holder.matcher, run)
     generator = None if found is None else found.generator
     if matcher is None and generator is not None and generator.config.answer == "own":
         return None

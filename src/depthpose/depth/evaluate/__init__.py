@@ -8,6 +8,7 @@ from depthpose.depth.evaluate.evaluate import Evaluation as Evaluation
 from depthpose.depth.evaluate.evaluate import Measured as Measured
 from depthpose.depth.evaluate.evaluate import evaluate as evaluate
 from depthpose.depth.evaluate.evaluate import measure_frame as measure_frame
+from depthpose.depth.evaluate.evaluate import ranking_metric as ranking_metric
 from depthpose.depth.evaluate.evaluate import summarise as summarise
 from depthpose.depth.evaluate.frames import PROTOCOLS as PROTOCOLS
 from depthpose.depth.evaluate.frames import FrameResult as FrameResult
@@ -16,3 +17,8 @@ from depthpose.depth.evaluate.frames import clamped_depth as clamped_depth
 from depthpose.depth.evaluate.frames import find_protocol as find_protocol
 from depthpose.depth.evaluate.frames import frame_result as frame_result
 from depthpose.depth.evaluate.frames import has_truth as has_truth
+from depthpose.depth.evaluate.rows import DecileRow as DecileRow
+from depthpose.depth.evaluate.rows import FrameRow as FrameRow
+from depthpose.depth.evaluate.rows import MeanRow as MeanRow
+from depthpose.depth.evaluate.rows import Row as Row
+from depthpose.depth.evaluate.rows import Source as Source

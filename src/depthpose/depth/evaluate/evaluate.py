@@ -1,7 +1,7 @@
 """Each frame measured, and the means over frames."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,13 @@ from depthpose.depth.evaluate.frames import (
     find_protocol,
     prepare,
 )
+from depthpose.depth.evaluate.rows import DecileRow, FrameRow, MeanRow
 from depthpose.depth.metrics import (
-    depth_errors,
-    disparity_errors,
+    METRICS,
+    RANKING,
+    Metric,
     error_by_decile,
+    measure,
     score_confidence,
 )
 
@@ -34,37 +37,51 @@ class Evaluation:
     """What evaluating one set of predictions gave.
 
     Attributes:
-        rows: one a cap (or a set of pixels), names to values, ready for a report.
-        per_frame: the same for each frame.
+        rows: means over frames, one row for each cap.
+        per_frame: one row for each frame and cap.
         deciles: mean error of the least sure tenth of each frame's pixels (1) to the surest (10),
             for predictions with a confidence.
         skipped: frames that do not count, each with the reason.
     """
 
-    rows: list[dict[str, Any]]
-    per_frame: list[dict[str, Any]]
-    deciles: list[dict[str, Any]]
+    rows: list[MeanRow]
+    per_frame: list[FrameRow]
+    deciles: list[DecileRow]
     skipped: dict[str, str]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured:
-    """One frame's row of numbers by one cap, and its error by decile of confidence."""
+    """One frame's numbers by one cap (None for disparity), and its error by decile."""
 
-    row: dict[str, Any]
-    deciles: Float[Tensor, "10"] | None
+    frame: str
+    cap_m: float | None
+    pixels: int
+    coverage: float
+    metrics: Mapping[str, float]
+    deciles: Float[Tensor, "10"] | None = None
 
     def to_values(self) -> dict[str, Any]:
         """Give it as JSON values, exactly."""
-        deciles = None if self.deciles is None else self.deciles.tolist()
-        return {"row": self.row, "deciles": deciles}
+        cap = {} if self.cap_m is None else {"cap_m": self.cap_m}
+        counts = {"pixels": self.pixels, "coverage": self.coverage}
+        return {
+            "row": {"frame": self.frame, **cap, **counts, **self.metrics},
+            "deciles": None if self.deciles is None else self.deciles.tolist(),
+        }
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> "Measured":
         """Read what :meth:`to_values` gave."""
-        deciles = values["deciles"]
-        made = None if deciles is None else torch.tensor(deciles, dtype=torch.float64)
-        return cls(row=values["row"], deciles=made)
+        row, deciles = dict(values["row"]), values["deciles"]
+        return cls(
+            frame=row.pop("frame"),
+            cap_m=row.pop("cap_m", None),
+            pixels=row.pop("pixels"),
+            coverage=row.pop("coverage"),
+            metrics=row,
+            deciles=None if deciles is None else torch.tensor(deciles, dtype=torch.float64),
+        )
 
 
 def evaluate(
@@ -128,13 +145,10 @@ def summarise(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
             f"{protocol!r} needs ({rule.truth}). Choose another protocol or folder."
         )
-    stamp = {"protocol": protocol, "dataset": dataset.name}
-    per_frame = [item.row for item in measured]
-    error_name = "epe_px" if rule.truth == "disparity" else "abs_rel"
     return Evaluation(
-        rows=[stamp | row for row in _mean_rows(per_frame)],
-        per_frame=[stamp | row for row in per_frame],
-        deciles=[stamp | row for row in _decile_rows(measured, error_name)],
+        rows=_mean_rows(dataset.name, protocol, measured),
+        per_frame=[_frame_row(dataset.name, protocol, one) for one in measured],
+        deciles=_decile_rows(dataset.name, protocol, measured),
         skipped=skipped,
     )
 
@@ -147,77 +161,113 @@ def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> lis
 
 def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured:
     compared = compare_depth(prepared, rule, cap_m)
-    mask, row = _count(compared, {"frame": prepared.frame.name, "cap_m": cap_m})
+    mask, counted = _count(prepared, compared, cap_m)
     predicted_m, true_m = compared.predicted[mask], compared.truth[mask]
-    row |= asdict(depth_errors(predicted_m, true_m)) | prepared.view
+    metrics = measure("depth", predicted_m, true_m) | prepared.view
     relative = (predicted_m - true_m).abs() / true_m
-    return _score(row, relative, prepared.confidence, mask)
+    return _score(replace(counted, metrics=metrics), relative, prepared.confidence, mask)
 
 
 def _measure_disparity(prepared: Prepared) -> Measured:
     compared = compare_disparity(prepared)
-    mask, row = _count(compared, {"frame": prepared.frame.name})
+    mask, counted = _count(prepared, compared, None)
     predicted_px, true_px = compared.predicted[mask], compared.truth[mask]
-    row |= asdict(disparity_errors(predicted_px, true_px))
+    metrics = measure("disparity", predicted_px, true_px)
     if prepared.frame.disparity_noc is not None:
         seen_px = read_truth_disparity(prepared.frame.disparity_noc)
         seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
-        errors = disparity_errors(prepared.disparity_px[seen], seen_px[seen])
-        row |= {"epe_noc_px": errors.epe_px, "d1_noc": errors.d1_all}
-    row |= prepared.view
-    return _score(row, (predicted_px - true_px).abs(), prepared.confidence, mask)
+        metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
+    counted = replace(counted, metrics=metrics | prepared.view)
+    return _score(counted, (predicted_px - true_px).abs(), prepared.confidence, mask)
 
 
-def _count(compared: Compared, row: dict[str, Any]) -> tuple[Bool[Tensor, "h w"], dict[str, Any]]:
-    """Find the pixels that are measured, and say how many and what share they are."""
+def _count(
+    prepared: Prepared, compared: Compared, cap_m: float | None
+) -> tuple[Bool[Tensor, "h w"], Measured]:
+    """Find the pixels that are measured, how many they are, and their share of the truth."""
     counts = torch.isfinite(compared.truth)
     mask = counts & torch.isfinite(compared.predicted)
     share = float(mask.sum() / counts.sum())
-    return mask, row | {"pixels": int(mask.sum()), "coverage": share}
+    counted = Measured(
+        frame=prepared.frame.name,
+        cap_m=cap_m,
+        pixels=int(mask.sum()),
+        coverage=share,
+        metrics={},
+    )
+    return mask, counted
 
 
 def _score(
-    row: dict[str, Any],
+    measured: Measured,
     error: Float[Tensor, " n"],
     confidence: Float[Tensor, "h w"] | None,
     mask: Bool[Tensor, "h w"],
 ) -> Measured:
     """Add what the confidence is worth, where there is one."""
     if confidence is None:
-        return Measured(row=row, deciles=None)
+        return measured
     score = asdict(score_confidence(error, confidence[mask]))
-    return Measured(row=row | score, deciles=error_by_decile(error, confidence[mask]))
+    deciles = error_by_decile(error, confidence[mask])
+    return replace(measured, metrics={**measured.metrics, **score}, deciles=deciles)
 
 
-def _mean_rows(per_frame: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a cap; each frame counts the same."""
-    rows: list[dict[str, Any]] = []
-    for cap in _caps(per_frame):
-        of_cap = [row for row in per_frame if row.get("cap_m") == cap]
-        row: dict[str, Any] = {} if cap is None else {"cap_m": cap}
-        row |= {"frames": len(of_cap), "pixels": sum(item["pixels"] for item in of_cap)}
-        names = [n for n in of_cap[0] if n not in ("frame", "cap_m", "pixels")]
-        names = [n for n in names if all(n in item for item in of_cap)]
-        rows.append(row | {n: sum(item[n] for item in of_cap) / len(of_cap) for n in names})
+def _frame_row(dataset: str, protocol: str, one: Measured) -> FrameRow:
+    return FrameRow(
+        protocol=protocol,
+        dataset=dataset,
+        frame=one.frame,
+        cap_m=one.cap_m,
+        pixels=one.pixels,
+        coverage=one.coverage,
+        metrics=one.metrics,
+    )
+
+
+def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[MeanRow]:
+    """One row for each cap; each frame counts the same."""
+    rows: list[MeanRow] = []
+    for cap_m, of_cap in _by_cap(measured).items():
+        names = [n for n in of_cap[0].metrics if all(n in one.metrics for one in of_cap)]
+        rows.append(
+            MeanRow(
+                protocol=protocol,
+                dataset=dataset,
+                cap_m=cap_m,
+                frames=len(of_cap),
+                pixels=sum(one.pixels for one in of_cap),
+                coverage=sum(one.coverage for one in of_cap) / len(of_cap),
+                metrics={n: sum(one.metrics[n] for one in of_cap) / len(of_cap) for n in names},
+            )
+        )
     return rows
 
 
-def _decile_rows(measured: list[Measured], error_name: str) -> list[dict[str, Any]]:
-    """Ten rows a cap; each frame counts the same."""
-    rows: list[dict[str, Any]] = []
-    for cap in _caps([item.row for item in measured]):
-        of_cap = [item.deciles for item in measured
-                  if item.row.get("cap_m") == cap and item.deciles is not None]  # fmt: skip
-        if not of_cap:
-            continue
-        first = {} if cap is None else {"cap_m": cap}
-        errors = torch.stack(of_cap).nanmean(0).tolist()
+def _decile_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[DecileRow]:
+    """Ten rows for each cap; each frame counts the same."""
+    rows: list[DecileRow] = []
+    for cap_m, of_cap in _by_cap(measured).items():
+        deciles = [one.deciles for one in of_cap if one.deciles is not None]
+        errors = torch.stack(deciles).nanmean(0).tolist() if deciles else []
         rows += [
-            first | {"frames": len(of_cap), "confidence_decile": k, error_name: error}
-            for k, error in enumerate(errors, 1)
+            DecileRow(
+                protocol=protocol,
+                dataset=dataset,
+                cap_m=cap_m,
+                frames=len(deciles),
+                confidence_decile=n,
+                error={ranking_metric(cap_m).name: error},
+            )
+            for n, error in enumerate(errors, 1)
         ]
     return rows
 
 
-def _caps(rows: list[dict[str, Any]]) -> list[float | None]:
-    return list(dict.fromkeys(row.get("cap_m") for row in rows))
+def ranking_metric(cap_m: float | None) -> Metric:
+    """Give the metric by which frames are ranked: of depth up to a cap, or of disparity (None)."""
+    return METRICS[RANKING["disparity" if cap_m is None else "depth"]]
+
+
+def _by_cap(measured: Sequence[Measured]) -> dict[float | None, list[Measured]]:
+    caps = dict.fromkeys(one.cap_m for one in measured)
+    return {cap_m: [one for one in measured if one.cap_m == cap_m] for cap_m in caps}

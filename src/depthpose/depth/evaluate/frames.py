@@ -31,7 +31,7 @@ from depthpose.depth.types import DepthEstimate
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """How a prediction is held against the truth.
+    """How a prediction is compared with the truth.
 
     In all protocols of depth truth counts between 0.001 m and the cap, and predictions are clamped
     to that range.
@@ -79,7 +79,7 @@ def find_protocol(name: str) -> Protocol:
     """Give a protocol by name.
 
     Raises:
-        InputError: there is none; the nearest name is said.
+        InputError: there is none; the error names the nearest.
     """
     if name not in PROTOCOLS:
         raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
@@ -87,7 +87,7 @@ def find_protocol(name: str) -> Protocol:
 
 
 def has_truth(frame: Frame, rule: Protocol) -> bool:
-    """Whether a frame has the truth that a protocol needs, told by its files alone."""
+    """Whether a frame has the truth that a protocol needs, by its files alone."""
     match rule.truth:
         case "disparity":
             return frame.disparity is not None
@@ -124,7 +124,7 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameResult:
-    """What a person looks at to see where the error of a frame is.
+    """The maps of a frame that show where its error is.
 
     Attributes:
         estimate: at the size of the image.

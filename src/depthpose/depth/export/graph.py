@@ -1,7 +1,7 @@
-"""The networks of this room as one ONNX graph, with all that the estimator does around them.
+"""The depth networks as one ONNX graph, with all that the estimator does around them.
 
 Sizes stay free: the graph computes them from the images that it is given. Networks come from
-``torch.export``; what stands around them (the virtual rig, padding, and the way back) is written
+``torch.export``; what is around them (the virtual rig, padding, and the way back) is written
 in operators, because sizes there depend on a focal length, which no exporter follows.
 """
 
@@ -27,7 +27,7 @@ from depthpose.depth.export.steps import (
 )
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import IMAGENET_MEAN, IMAGENET_STD
-from depthpose.depth.weights import DepthWeights
+from depthpose.depth.weights import DepthWeights, as_psmnet
 
 _IMAGES = ("batch", 3, "height", "width")
 _MAPS = ("batch", "height", "width")
@@ -53,6 +53,7 @@ def image_graph(weights: DepthWeights) -> Graph:
             f"{'generator' if generator is None else 'matcher'}; 'depthpose weights pack' makes "
             "one file of both."
         )
+    matcher = None if weights.matcher is None else as_psmnet(weights.matcher, "these weights")
     rig = generator.config
     graph = Graph()
     image = graph.input("image", np.float32, _IMAGES)
@@ -61,7 +62,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     small = focal_size(full, focal_yx(K), rig.virtual_focal_px)
     left = resized_image(image, small)
     seen = drawn(left, generator)
-    found = _answered(left, seen, weights.matcher, rig)
+    found = _answered(left, seen, matcher, rig)
     disparity_px, confidence = (resized_map(values, full) for values in found)
     disparity_px = disparity_px * ratio(full, small)
     focal_m_px = _focal_m_px(K, rig)
@@ -86,9 +87,9 @@ def pair_graph(weights: DepthWeights) -> Graph:
     Raises:
         InputError: there is no matcher in the weights.
     """
-    matcher = weights.matcher
-    if matcher is None:
+    if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
+    matcher = as_psmnet(weights.matcher, "these weights")
     graph = Graph()
     left = graph.input("left", np.float32, _IMAGES)
     right = graph.input("right", np.float32, _IMAGES)

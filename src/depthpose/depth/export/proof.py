@@ -1,8 +1,8 @@
-"""What is exported of depth weights, and the estimates that it is held to."""
+"""Export targets of depth weights, and the estimates that their graphs are compared with."""
 
 import dataclasses
-from collections.abc import Iterator
-from typing import Any, Literal
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,17 +10,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import refuse_unknown
 from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
-from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.depth.weights import DepthWeights
-
-What = Literal["image", "pair"]
-"""One image to depth, or a rectified pair to disparity."""
+from depthpose.depth.weights import DepthWeights, as_psmnet
 
 _LIMITS = {
     "depth_m": Limit(value=0.01, is_relative=True),
@@ -51,24 +49,47 @@ _LEAST_PX = 1.0
 """Disparity from which depths are compared."""
 
 
-def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]) -> Export:
-    """Say what becomes of weights in a file.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Target:
+    """What a graph computes.
+
+    Attributes:
+        fits: whether it is what weights are exported as by default.
+        export: makes the graph and its test cases of weights and further facts for its user.
+    """
+
+    fits: Callable[[DepthWeights], bool]
+    export: Callable[[DepthWeights, dict[str, Any]], Export]
+
+
+def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
+    """Describe the file that weights are exported to.
 
     Args:
         weights: of a generator and a matcher, of a generator with an answer of its own, or of a
             matcher alone.
-        what: one image to depth, or a pair to disparity; None: the first that the weights can.
+        what: a key of ``TARGETS``; None: the first that fits the weights.
         facts: what else a user of the file must know.
+
+    Raises:
+        InputError: an unknown target.
     """
     if what is None:
-        what = "pair" if weights.generator is None else "image"
-    if what == "pair":
-        return Export(
-            graph=lambda: pair_graph(weights),
-            cases=lambda: _pair_cases(weights),
-            limits=_LIMITS,
-            facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
-        )
+        what = next(name for name, target in TARGETS.items() if target.fits(weights))
+    refuse_unknown("what", what, TARGETS)
+    return TARGETS[what].export(weights, facts)
+
+
+def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    return Export(
+        graph=lambda: pair_graph(weights),
+        cases=lambda: _pair_cases(weights),
+        limits=_LIMITS,
+        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
+    )
+
+
+def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     rig = {} if weights.generator is None else _rig_facts(weights)
     selects = isinstance(weights.generator, SelectionGenerator)
     return Export(
@@ -77,6 +98,13 @@ def depth_export(weights: DepthWeights, what: What | None, facts: dict[str, Any]
         limits=_SELECTION_LIMITS if selects else _LIMITS,
         facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
+
+
+TARGETS = {
+    "image": Target(fits=lambda weights: weights.generator is not None, export=_image_export),
+    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
+}
+"""One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 
 
 def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
@@ -88,7 +116,7 @@ def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
 
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None
-    matcher = None if weights.matcher is None else PSMNetMatcher(weights.matcher, _QUICK)
+    matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
     net = FakestereoNet(matcher, make_synthesiser(weights.generator))
     sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
     for size in _SIZES:
@@ -107,8 +135,9 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
 
 def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.matcher is not None
-    net = FakestereoNet(PSMNetMatcher(weights.matcher, _QUICK))
-    work_px = weights.matcher.config.work_focal_px
+    network = as_psmnet(weights.matcher, "these weights")
+    net = FakestereoNet(make_matcher(network, _QUICK))
+    work_px = network.config.work_focal_px
     for size in _SIZES:
         left, right = _scenes(*size)
         inputs = {"left": left.numpy(), "right": right.numpy()}

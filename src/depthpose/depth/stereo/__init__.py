@@ -1,7 +1,13 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
 from depthpose.depth.stereo.inference import PSMNetInference
-from depthpose.depth.stereo.matcher import CallableMatcher, CameraMatcher, Matcher, check_pair
+from depthpose.depth.stereo.matcher import (
+    CallableMatcher,
+    CameraMatcher,
+    Matcher,
+    TiledMatcher,
+    check_pair,
+)
 from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import (
@@ -11,21 +17,27 @@ from depthpose.depth.stereo.psmnet_matcher import (
     with_usable_precision,
 )
 from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
+from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, is_own_matcher, make_matcher
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
 
 __all__ = [
+    "MATCHERS",
     "CallableMatcher",
     "CameraMatcher",
     "Footprint",
     "Matcher",
+    "MatcherKind",
     "PSMNet",
     "PSMNetInference",
     "PSMNetMatcher",
     "SGBMMatcher",
     "Steps",
+    "TiledMatcher",
     "check_pair",
     "fill_holes",
     "import_psmnet",
+    "is_own_matcher",
+    "make_matcher",
     "normalise",
     "psmnet_from_published",
     "tile_change_px",

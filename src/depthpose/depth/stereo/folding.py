@@ -1,5 +1,6 @@
 """Batch norm folded into the convolution before it: the same function, one pass less."""
 
+from functools import cache
 from itertools import product
 from typing import cast
 
@@ -69,20 +70,11 @@ class RowsConv:
     def __call__(self, rows: Rows) -> Rows:
         """Convolve rows that carry their own halo; the answer has none."""
         if self.is_transposed:
-            # Row 2i+1 looks at rows i and i+1, so the last pair of rows lacks its halo.
-            return self._transposed(rows)[:, :, :-2]
-        if _has_onednn(rows):
-            strides = (self.stride,) * 3
-            args = (rows, self.weight, self.bias, (0, 1, 1), strides, (1, 1, 1), 1)
-            return torch.mkldnn_convolution(*args)
-        return nn.functional.conv3d(rows, self.weight, self.bias, self.stride, (0, 1, 1))
-
-    def _transposed(self, rows: Rows) -> Rows:
-        if _has_onednn(rows):
-            sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
-            args = (rows, self.weight, self.bias, *sizes, "none", [], "")
-            return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
-        return nn.functional.conv_transpose3d(rows, self.weight, self.bias, 2, 1, 1)
+            # Row 2i+1 uses rows i and i+1, so the last pair of rows lacks its halo.
+            transposed = _onednn_transposed if _has_onednn(rows) else _transposed
+            return transposed(rows, self.weight, self.bias)[:, :, :-2]
+        convolved = _onednn_convolved if _has_onednn(rows) else _convolved
+        return convolved(rows, self.weight, self.bias, self.stride)
 
 
 class CostConv:
@@ -109,7 +101,48 @@ class CostConv:
         return out[:, 1:-1, 1:-1]
 
 
+def _convolved(rows: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    return nn.functional.conv3d(rows, weight, bias, stride, (0, 1, 1))
+
+
+def _onednn_convolved(rows: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    strides = (stride,) * 3
+    return torch.mkldnn_convolution(rows, weight, bias, (0, 1, 1), strides, (1, 1, 1), 1)
+
+
+def _transposed(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return nn.functional.conv_transpose3d(rows, weight, bias, 2, 1, 1)
+
+
+def _onednn_transposed(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
+    args = (rows, weight, bias, *sizes, "none", [], "")
+    return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
+
+
 def _has_onednn(x: Tensor) -> bool:
     """Whether to call oneDNN by name: PyTorch's own choice takes a slow path for few rows."""
     is_usable = x.device.type == "cpu" and x.dtype in (torch.float32, torch.bfloat16)
-    return is_usable and torch.backends.mkldnn.is_available()
+    return is_usable and has_onednn_operators()
+
+
+@cache
+def has_onednn_operators() -> bool:
+    """Whether this PyTorch has both oneDNN operators, which it does not document, as used here.
+
+    Without them, or where they answer otherwise than the documented ones, these are called.
+    """
+    if not torch.backends.mkldnn.is_available():
+        return False
+    rows, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
+    try:
+        with torch.no_grad():
+            found = (
+                _onednn_convolved(rows, weight, bias, 1),
+                _onednn_transposed(rows, weight, bias),
+            )
+    except (AttributeError, RuntimeError, TypeError):
+        return False
+    wanted = (_convolved(rows, weight, bias, 1), _transposed(rows, weight, bias))
+    both = zip(found, wanted, strict=True)
+    return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)

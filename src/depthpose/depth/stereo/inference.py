@@ -153,13 +153,13 @@ class _Pass:
         self.up: Slab | None = None
 
     def run(self, index: int) -> None:
-        """Walk through hourglass ``index``; what it adds is made where it is next looked at."""
+        """Walk through hourglass ``index``; what it adds is made where it is next used."""
         hourglass = self.net.hourglasses[index]
         down = self._same1(hourglass, self._down1(hourglass, index))
         deep = relu(convolve(hourglass.down2, down, 0, down.height // 2))
         deep = relu(convolve(hourglass.same2, deep, 0, deep.height))
         self.first_down = self.first_down or down
-        # Nobody looks at these again; the plan of memory counts on it.
+        # These are not used again; the plan of memory relies on it.
         self.up = down = None
         self.up = self._up2(hourglass, deep, self.first_down)
 
@@ -196,7 +196,7 @@ class _Pass:
 
     def _same1(self, hourglass: _FoldedHourglass, x: Slab) -> Slab:
         """Second layer on the way down, plus what came up from the hourglass before."""
-        # What came up is looked at row by row, so the answer may take its place.
+        # What came up is read row by row, so the answer may take its place.
         out = torch.empty_like(x.values) if self.up is None else self.up.values
         for first, stop in spans(x.height, self.steps.rows):
             y = convolve(hourglass.same1, x, first, stop).values

@@ -1,4 +1,4 @@
-"""What a stereo matcher is, what it takes, and the tenant that wraps a function of the user's."""
+"""Protocols of stereo matchers, and the adapter of a function of the user's."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
@@ -10,6 +10,7 @@ from torch import Tensor
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.types import Match
 
 
@@ -36,7 +37,7 @@ class Matcher(Protocol):
 
 @runtime_checkable
 class CameraMatcher(Matcher, Protocol):
-    """A matcher that chooses at which size it looks at pairs, and takes several at once."""
+    """A matcher that chooses the size at which pairs are matched, and takes several at once."""
 
     def match_many(
         self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
@@ -53,7 +54,22 @@ class CameraMatcher(Matcher, Protocol):
         ...
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns at which it looks at the images of a camera [px]."""
+        """Rows and columns at which the images of a camera are matched [px]."""
+        ...
+
+
+@runtime_checkable
+class TiledMatcher(Matcher, Protocol):
+    """A matcher that can match in tiles, and the whole image all the same."""
+
+    config: MatcherConfig
+
+    def match_whole(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair without tiles, whatever the config says.
+
+        Raises:
+            InputError: as for ``match``.
+        """
         ...
 
 
@@ -79,7 +95,7 @@ class CallableMatcher:
         self.with_numpy_images = with_numpy_images
 
     def match(self, left: Tensor, right: Tensor) -> Match:
-        """Ask the function, and refuse an answer that is no disparity map.
+        """Call the function, and refuse a result that is no disparity map.
 
         Raises:
             InputError: unusable images, or an answer of another type or size, infinite, negative,

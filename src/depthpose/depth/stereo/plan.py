@@ -101,7 +101,7 @@ class Footprint:
         return self._map_bytes * max(5 * 4, 2 * levels + 12)
 
     def _first_layers_bytes(self, steps: Steps) -> int:
-        """``cost0``, both views looked at in 21 ways, and three layers of a slab."""
+        """``cost0``, both views convolved in 21 ways, and three layers of a slab."""
         return self._volume_bytes + 21 * self._map_bytes + (3 * steps.rows + 16) * self._row_bytes
 
     def _hourglass_bytes(self, steps: Steps) -> int:

@@ -22,7 +22,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.stereo.inference import PSMNetInference
-from depthpose.depth.stereo.matcher import check_pair
+from depthpose.depth.stereo.matcher import TiledMatcher, check_pair
 from depthpose.depth.stereo.plan import Footprint, Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.types import Match
@@ -113,7 +113,7 @@ class PSMNetMatcher:
         return max(trained_px, float(camera.K[0, 0]) * min(share, 1.0))
 
     def _reaching(self, focal_px: float) -> PSMNetConfig:
-        """Give the network with the disparities that a larger size asks for."""
+        """Give the network with the disparities that a larger size needs."""
         trained = self.network_config
         assert trained.work_focal_px is not None
         larger = min(focal_px / trained.work_focal_px, _MOST_REACH)
@@ -234,7 +234,7 @@ def pad_top_right(
 def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
-    Halved at least where the point left looks at lies outside the right view: nothing there can
+    Halved at least where the matching point lies outside the right view: nothing there can
     agree, and nothing contradicts.
     """
     difference_px = left_right_difference_px(found.disparity_px, right_px)
@@ -243,7 +243,7 @@ def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Mat
     return Match(disparity_px=found.disparity_px, confidence=confidence)
 
 
-def tile_change_px(matcher: PSMNetMatcher, left: Tensor, right: Tensor) -> float:
+def tile_change_px(matcher: TiledMatcher, left: Tensor, right: Tensor) -> float:
     """Mean difference that tiles make to the disparity of a pair [px].
 
     Raises:

@@ -20,7 +20,7 @@ _MODES = {
 
 
 class SGBMMatcher:
-    """A matcher that needs no weights; holes are NaN unless it is told to fill them.
+    """A matcher that needs no weights; holes are NaN unless it fills them.
 
     OpenCV has no answer in the leftmost ``num_disparities`` columns.
 

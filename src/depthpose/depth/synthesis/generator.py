@@ -107,7 +107,7 @@ Logits = Float[Tensor, "b 1 rows columns"]
 
 
 class PatchDiscriminator(nn.Module):
-    """Judge each 70x70 patch: C64-C128-C256-C512-1; 2,768,705 parameters at width 64."""
+    """Score each 70x70 patch: C64-C128-C256-C512-1; 2,768,705 parameters at width 64."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class PatchDiscriminator(nn.Module):
 
 
 class PixelDiscriminator(nn.Module):
-    """Judge each pixel alone: 1x1 convolutions 64-128-1; 9,024 parameters at width 64."""
+    """Score each pixel alone: 1x1 convolutions 64-128-1; 9,024 parameters at width 64."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()

@@ -19,7 +19,7 @@ Precision = Literal["fp32", "bf16"]
 class OpenvinoGenerator(SelectionGenerator):
     """Answers what :class:`SelectionGenerator` answers, sizes free, on the processor.
 
-    Converting the network takes some seconds. Gradients do not flow, and a training of the network
+    Converting the network takes some seconds. There are no gradients, and a training of the network
     that it was made from does not change it.
 
     Args:

@@ -72,7 +72,7 @@ class SelectionGenerator(nn.Module):
 
 
 def make_planes(config: SelectionConfig) -> Planes:
-    """Give the disparities that are told apart [px], evenly spaced in their logarithm."""
+    """Give the disparities that are distinguished [px], evenly spaced in their logarithm."""
     low, high = config.disparity_px
     return torch.linspace(math.log(low), math.log(high), config.planes).exp()
 
@@ -164,17 +164,3 @@ def mix_shifts(left: Images, logits: Logits, planes: Planes) -> Images:
         near, far = padded[..., whole : whole + width], padded[..., whole + 1 : whole + 1 + width]
         drawn = drawn + shares[:, number : number + 1] * torch.lerp(near, far, part)
     return drawn
-
-
-def find_filled(
-    left_px: Float[Tensor, "b h w"], right_px: Float[Tensor, "b h w"], tolerance: float = 0.15
-) -> Bool[Tensor, "b h w"]:
-    """Mark pixels of the right view that the left image does not show, so that they are made up.
-
-    Such a pixel looks up a left pixel that is nearer than the pixel itself (by ``tolerance``), or
-    lies beyond the border.
-    """
-    width = right_px.shape[-1]
-    columns = torch.arange(width, device=right_px.device) + right_px
-    looked_up = shift_left(left_px[:, None].expand(-1, 3, -1, -1), right_px)[:, 0]
-    return (looked_up > right_px * (1 + tolerance) + 0.5) | (columns > width - 0.5)

@@ -15,7 +15,6 @@ from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import (
     Selected,
     SelectionGenerator,
-    find_filled,
     select,
     shift_left,
 )
@@ -40,14 +39,12 @@ class Drawn:
             where it has none.
         confidence: 0 (guess) to 1 (sure) of that.
         is_sky: where the left view shows the sky.
-        is_filled: pixels of the right view that the left image does not show.
     """
 
     right: Float[Tensor, "b 3 h w"]
     disparity_px: Float[Tensor, "b h w"] | None = None
     confidence: Float[Tensor, "b h w"] | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None
-    is_filled: Bool[Tensor, "b h w"] | None = None
 
 
 @runtime_checkable
@@ -56,7 +53,7 @@ class Synthesiser(Protocol):
 
     @property
     def config(self) -> GeneratorConfig | SelectionConfig:
-        """The network's knobs, and its rig."""
+        """The network's settings, and its rig."""
         ...
 
     def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
@@ -93,7 +90,6 @@ class SelectionSynthesiser:
             "disparity_px": seen.disparity_px,
             "confidence": seen.confidence,
             "is_sky": seen.is_sky,
-            "is_filled": find_filled(seen.shift_px, other.shift_px),
         }
         return Drawn(**{name: part.to(left.device) for name, part in parts.items()})
 
@@ -136,7 +132,7 @@ def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tens
 def select_views(
     generator: SelectionGenerator, left: Float[Tensor, "b 3 h w"]
 ) -> tuple[Selected, Selected]:
-    """Answer disparity, sky and confidence of the left and of the right view; gradients flow.
+    """Answer disparity, sky and confidence of the left and of the right view, with gradients.
 
     Args:
         generator: the network.
@@ -155,7 +151,7 @@ def select_views(
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Draw right views of any size, RGB in [0, 1]; gradients flow.
+    """Draw right views of any size, RGB in [0, 1], with gradients.
 
     Sides close to a multiple of what the network takes are resized to it, others padded by
     reflection. Mirrored rows move the horizon's place in the image, which tells the ground's depth:

@@ -1,4 +1,4 @@
-"""Made street scenes with exact disparity: the data that costs nothing and knows everything."""
+"""Synthetic street scenes with exact disparity: training data that costs nothing."""
 
 from depthpose.depth.synthetic.clutter import make_clutter as make_clutter
 from depthpose.depth.synthetic.dataset import StreetFrame as StreetFrame

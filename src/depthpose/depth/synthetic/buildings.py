@@ -40,7 +40,7 @@ class Style(NamedTuple):
 
 
 class Plot(NamedTuple):
-    """Where a house stands, along a straight street.
+    """Place of a house along a straight street.
 
     Attributes:
         x_m: its front, which looks to the street.

@@ -1,4 +1,4 @@
-"""Made street scenes as a dataset."""
+"""Synthetic street scenes as a dataset."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ _OCCLUSION_SHARE = 1e-4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetFrame:
-    """A made pair and everything that is known about it.
+    """A synthetic pair and everything that is known about it.
 
     Attributes:
         left: left image.
@@ -151,7 +151,7 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:
 
 @dataclass(frozen=True)
 class Streets:
-    """Made pairs, each a function of the seed and its index alone: no order, no state, no files.
+    """Synthetic pairs, each a function of the seed and its index alone.
 
     Attributes:
         config: what the frames are like.

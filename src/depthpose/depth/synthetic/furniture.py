@@ -1,4 +1,4 @@
-"""What stands along a street: lamps, signs, lights, posts, fences, walls, bins, wires."""
+"""Furniture of a street: lamps, signs, lights, posts, fences, walls, bins, wires."""
 
 from functools import cache
 from itertools import pairwise

@@ -68,7 +68,7 @@ def place(
     scale: Values = 1.0,
     tints: Mapping[str, Color] | None = None,
 ) -> Mesh:
-    """Copy a model to where it stands.
+    """Copy a model to its place.
 
     Args:
         mesh: a model, on the ground at the origin.
@@ -88,7 +88,7 @@ def place(
 
 
 NEAREST_M = 2.5
-"""A car drives where nothing stands nearer to its camera: with a baseline of 0.53 m and half of
+"""A car drives where nothing is nearer to its camera: with a baseline of 0.53 m and half of
 KITTI's resolution that is a disparity of 77 px."""
 
 

@@ -1,4 +1,4 @@
-"""What stands beside the road: houses, gardens, trees, lamps and signs."""
+"""What is beside the road: houses, gardens, trees, lamps and signs."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""One made street: its mesh, its light and where the camera is mounted."""
+"""One synthetic street: its mesh, its light and where the camera is mounted."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,7 +24,7 @@ class Weather:
 
     Attributes:
         sun: unit vector towards the sun, in the world's frame (y down).
-        sun_color: linear light of the sun; small where clouds hide it.
+        sun_color: linear light of the sun; small where clouds cover it.
         zenith: light of the sky overhead.
         horizon: light of the sky low down.
         is_overcast: no shadows are cast.
@@ -92,7 +92,7 @@ class Markings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetScene:
-    """A made street, in the frame of its left camera (x right, y down, z forward) [m].
+    """A synthetic street, in the frame of its left camera (x right, y down, z forward) [m].
 
     Attributes:
         mesh: everything that is seen, but the sky.
@@ -139,7 +139,7 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
 def _mount(
     rng: np.random.Generator, height_m: float
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
-    """How the camera stands: near level, now and then turned off the road's direction."""
+    """Attitude of the camera: near level, now and then turned off the road's direction."""
     pitch, roll = rng.normal(0, 0.012), rng.normal(0, 0.009)
     yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
     c, s = np.cos([pitch, yaw, roll]), np.sin([pitch, yaw, roll])
@@ -245,7 +245,7 @@ def street_rig(config: StreetsConfig, index: int) -> tuple[StereoRig, float]:
 def rig_number(config: StreetsConfig, index: int) -> int:
     """Say which of KITTI's rigs a frame has, where ``config.rigs`` knows no others.
 
-    Rigs cannot be told apart by their size: small pictures of two of them are of one.
+    Rigs cannot be distinguished by their size: small pictures of two of them are of one.
     """
     full = replace(config, scale=1.0, crop=None)
     width = street_rig(full, index)[0].width

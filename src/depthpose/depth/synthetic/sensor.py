@@ -123,7 +123,7 @@ _TURN_RAD = np.deg2rad(np.arange(-44.5, 44.5, 0.1728))
 """Elevations of the beams, and the turns that lie in the cameras' sight."""
 
 _ORIGIN_M = (0.056, -0.076, -0.272)
-"""Where it stands in the left camera's frame: a little above and behind."""
+"""Its place in the left camera's frame: a little above and behind."""
 
 _SIZE_PX = (440, 1200)
 _FOCAL_PX = 600.0
@@ -142,8 +142,8 @@ def camera_from_velodyne() -> Float64[np.ndarray, "4 4"]:
 def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
     """Scan a stage: x forward, y left, z up [m] and reflectance, a row a return.
 
-    The beams are met exactly: a wide picture from the LiDAR's place tells which triangles are near
-    each beam, and these are intersected.
+    Hits of the beams are exact: a wide picture from the LiDAR's place shows which triangles are
+    near each beam, and these are intersected.
     """
     tilt, turn = (
         torch.from_numpy(a.ravel()) for a in np.meshgrid(_BEAMS_RAD, _TURN_RAD, indexing="ij")

@@ -20,14 +20,14 @@ _CHUNK = 1 << 17
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hits:
-    """Where rays meet triangles.
+    """Where rays hit triangles.
 
     Attributes:
         primitive: number of the triangle.
         barycentric: shares of its corners.
         points: in the left camera's frame [m].
         towards: unit vectors along the rays.
-        distance_m: from the eye.
+        distance_m: from the camera.
     """
 
     primitive: Int[Tensor, " n"]
@@ -46,7 +46,7 @@ class Hits:
 class _Surfaces:
     """What is known of the surface at each hit.
 
-    ``normal`` is smooth, ``plane`` the triangle's own; both look to the eye. ``uv`` is in tiles.
+    ``normal`` is smooth, ``plane`` the triangle's own; both look to the camera. ``uv`` is in tiles.
     """
 
     material: Int[Tensor, " n"]
@@ -56,7 +56,7 @@ class _Surfaces:
 
 
 def shade(stage: Stage, hits: Hits, focal_px: float) -> Float[Tensor, "n 3"]:
-    """Give the light from each hit towards the eye."""
+    """Give the light from each hit towards the camera."""
     count = len(hits.primitive)
     parts = [
         _shade(stage, hits.part(start, start + _CHUNK), focal_px)

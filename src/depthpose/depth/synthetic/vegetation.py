@@ -192,7 +192,7 @@ def _clump(
     where: tuple,
     leaves: tuple[int, Number],
 ) -> None:
-    """A dark core that hides what is behind, and leaves about it."""
+    """A dark core that occludes what is behind, and leaves about it."""
     centre, radii = where
     light = rng.uniform(0.8, 1.15)
     core = Surface("leaf", (0.3 * light, 0.3 * light, 0.3 * light), 0.9, int(rng.integers(3)))

@@ -1,4 +1,4 @@
-"""The light that one eye of a stage receives, pixel by pixel."""
+"""The light that one camera of a stage receives, pixel by pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -18,12 +18,12 @@ Seen = tuple[Int[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, " n"]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sight:
-    """Visibility from one eye.
+    """Visibility from one camera.
 
     Attributes:
         raster: visibility at the pixel centres.
         K: intrinsic matrix.
-        eye: where the camera stands, in the left camera's frame [m]; it looks along z.
+        eye: position of the camera in the left camera's frame [m]; it looks along z.
         edges: edge functions of all triangles; see ``core.raster``.
         volume: what they are divided by.
     """
@@ -47,10 +47,10 @@ def look(
     """Find what each pixel sees.
 
     Args:
-        stage: what to look at.
+        stage: the scene.
         K: intrinsic matrix.
         size: height and width of the picture [px].
-        eye: where the camera stands, in the left camera's frame [m].
+        eye: position of the camera in the left camera's frame [m].
     """
     corners = stage.corners - eye
     raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)

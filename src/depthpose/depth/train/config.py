@@ -1,9 +1,9 @@
-"""Knobs of the three stages; the defaults are the thesis's schedules (2.4.2, 2.5.3)."""
+"""Settings of the three stages; the defaults are the thesis's schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
     DegradeConfig,
@@ -12,6 +12,7 @@ from depthpose.depth.config import (
     PSMNetConfig,
     SelectionConfig,
 )
+from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,13 +23,13 @@ class ViewTraining:
     """The network that is trained."""
 
     discriminator: Literal["patch", "pixel", "none"] = "patch"
-    """Who judges it; none: L1 alone."""
+    """Scores patches or single pixels; none: L1 alone."""
 
     discriminator_width: int = 64
     """Channels of the discriminator's first layer."""
 
-    gan_mode: Literal["vanilla", "lsgan"] = "vanilla"
-    """Cross entropy on logits, or least squares."""
+    gan_mode: str = "vanilla"
+    """vanilla: cross entropy on logits; lsgan: least squares; see ``losses.ADVERSARIAL_LOSSES``."""
 
     l1_weight: float = 100.0
     """Weight of L1 against the adversarial loss."""
@@ -47,13 +48,17 @@ class ViewTraining:
     """The discriminator's optimiser."""
 
     pairs: PairsConfig = field(default_factory=PairsConfig)
-    """Training pairs; their truth is not looked at."""
+    """Training pairs; their truth is not used."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=200.0))
     """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown loss."""
+        refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +81,9 @@ class SelectTraining:
     encoder_rate: float = 0.3
     """Learning rate of the encoder as a share of the decoder's."""
 
-    disparity_loss: Literal["log", "pixel"] = "log"
-    """Error of disparity's logarithm, or of disparity in shares of the largest."""
+    disparity_loss: str = "log"
+    """log: error of disparity's logarithm; pixel: of disparity as a share of the largest; see
+    ``losses.DISPARITY_LOSSES``."""
 
     plane_weight: float = 0.2
     """Weight of the cross entropy over sky and disparities."""
@@ -108,7 +114,7 @@ class SelectTraining:
     """Changes of the input image alone."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(steps=20_000, batch_size=8, clip_norm=5.0)
@@ -116,7 +122,8 @@ class SelectTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and shares that are none."""
+        """Refuse weights and shares that are none, and an unknown loss."""
+        refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
         shares = {"more_share": self.more_share, "encoder_rate": self.encoder_rate}
         for name, value in shares.items():
             if not 0 <= value <= 1:
@@ -151,7 +158,7 @@ class StereoTraining:
     """Training pairs, with disparity or depth."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=20.0))
     """How long."""
@@ -177,7 +184,7 @@ class FinetuneTraining:
     """Training pairs, with disparity or depth."""
 
     held_out: PairsConfig | None = None
-    """Pairs that validation looks at."""
+    """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""

@@ -1,4 +1,4 @@
-"""Pairs, on disk or made, as training samples by ticket."""
+"""Pairs, on disk or rendered, as training samples by index."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +30,7 @@ class _Place(NamedTuple):
 
 
 class TrainingPairs:
-    """Frames of several folders, each ticket a random one, randomly changed.
+    """Frames of several folders, each sample a random one, randomly changed.
 
     Args:
         config: which pairs, and how.
@@ -70,7 +70,7 @@ class TrainingPairs:
         return len(self._places)
 
     def __getitem__(self, ticket: int) -> TrainingPair:
-        """Make the sample of a ticket."""
+        """Make the n-th sample."""
         index = shuffled_index(ticket, len(self), self.seed)
         return augment(self.read(index), self.config.augment, ticket_generator(ticket, self.seed))
 
@@ -102,7 +102,7 @@ class TrainingPairs:
         return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
 
     def _check_baselines(self, wanted_m: float) -> None:
-        """Look at every rig before any work: a pair of another one would teach other metres."""
+        """Check every rig before any work: a pair of another one would teach other metres."""
         for name, rig in self._rigs():
             if rig is None:
                 raise InputError(
@@ -235,8 +235,12 @@ def _choose_truth(
     return wanted or next(iter(counts), None)
 
 
+_STREETS = "made streets"
+"""Synthetic streets, as the states of trainings name them: a resumed one compares the names."""
+
+
 def _name(source: Dataset | Streets) -> str:
-    return source.name if isinstance(source, Dataset) else "made streets"
+    return source.name if isinstance(source, Dataset) else _STREETS
 
 
 def _spread(items: Sequence[_Place], count: int | None) -> list[_Place]:

@@ -33,12 +33,12 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
+from depthpose.depth.weights import read_generator, read_psmnet, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
-"""Knobs of the loop that change no weight: a resumed run may have others."""
+"""Settings of the loop that change no weight: a resumed run may have others."""
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
-"""Knobs that may name weights."""
+"""Settings that may name weights."""
 _MEASURED = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
@@ -61,7 +61,7 @@ class Run:
             ``matcher.safetensors`` or ``fakestereo.safetensors`` in it, and their card beside them.
         resume: go on from its last state.
         finish: make weights of its last state, without another step.
-        on_step: told after each step.
+        on_step: called after each optimiser step.
     """
 
     folder: Path
@@ -71,7 +71,7 @@ class Run:
 
     @property
     def words(self) -> dict[str, Any]:
-        """What the loop is told of it."""
+        """The settings of the loop."""
         return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
@@ -132,7 +132,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=True)
     matcher = PSMNet(config.matcher)
     if config.start is not None:
-        _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
+        _start_from(matcher, read_psmnet(find_weights(config.start)), config.start)
     facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
 
@@ -140,14 +140,14 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)
-    for knob in ("generator", "matcher"):
-        if not getattr(config, knob):
+    for setting in ("generator", "matcher"):
+        if not getattr(config, setting):
             raise InputError(
-                f"fine-tuning needs weights of a {knob} to begin with: --{knob} FILE (what 'depth "
-                "train view' and 'depth train stereo' wrote)."
+                f"fine-tuning needs weights of a {setting} to begin with: --{setting} FILE (what "
+                "'depth train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
-    matcher = read_matcher(find_weights(config.matcher))
+    matcher = read_psmnet(find_weights(config.matcher))
     config = replace(config, pairs=_at_virtual_focal(config.pairs, generator.config))
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
@@ -163,7 +163,7 @@ STAGES = {
     "stereo": (StereoTraining, train_stereo),
     "finetune": (FinetuneTraining, train_finetune),
 }
-"""Config and function of each stage, by its word on the command line."""
+"""Config and function of each stage, by its name on the command line."""
 
 
 def _walk(
@@ -176,9 +176,11 @@ def _walk(
     settings = {"stage": type(config).__name__, **config_to_dict(config)}
     decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
     settings["loop"] = decisive | {"processes": find_shard().world}
-    named = {knob: name for knob in _BEGINS_WITH if isinstance(name := settings.get(knob), str)}
-    for knob, name in named.items():
-        settings[f"{knob}_sha256"] = file_sha256(find_weights(name))
+    named = {
+        setting: name for setting in _BEGINS_WITH if isinstance(name := settings.get(setting), str)
+    }
+    for setting, name in named.items():
+        settings[f"{setting}_sha256"] = file_sha256(find_weights(name))
     if pairs.truths:
         settings["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
@@ -203,11 +205,11 @@ def _facts(
     truths: Sequence[str],
     began_with: Sequence[str],
 ) -> dict[str, str]:
-    """Say what the card says before anything is measured; terms of what it begins with bind it."""
+    """Make the card before anything is measured, with the terms of the weights of the start."""
     sources = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
     data = [Path(folder).name for pairs in sources for folder in pairs.folders]
     if any(pairs.streets for pairs in sources):
-        data.append("made streets")
+        data.append("synthetic streets")
     facts = {
         "trained_on": ", ".join(data),
         "stage": type(config).__name__,
@@ -278,20 +280,20 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
 
 
 _FREE = ("max_disparity_px",)
-"""Knobs that no weight depends on: a matcher looks through any disparities in the same way."""
+"""Settings that no weight depends on: a matcher searches any disparities in the same way."""
 
 
 def _start_from(network: Generator | PSMNet, found: Generator | PSMNet, source: str) -> None:
     """Copy weights whose config is the network's own, but for the range of disparities.
 
     Raises:
-        InputError: a knob differs, so the weights would mean something else.
+        InputError: a setting differs, so the weights would mean something else.
     """
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
-    for knob, value in wanted.items():
-        if given[knob] != value and knob not in _FREE:
+    for setting, value in wanted.items():
+        if given[setting] != value and setting not in _FREE:
             raise InputError(
-                f"{source}: was trained with {knob} = {given[knob]!r}, but the config says "
+                f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
     network.load_state_dict(found.state_dict())

@@ -13,7 +13,7 @@ from depthpose.core.loop import Evidence, Turn, make_adam, ticket_generator
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
-from depthpose.depth.losses import log_disparity_loss, plane_loss, view_loss
+from depthpose.depth.losses import DISPARITY_LOSSES, plane_loss, view_loss
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.synthesis.selection import log_expectation, mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
@@ -44,12 +44,12 @@ class SelectionSample(NamedTuple):
 
 
 class SelectionSamples:
-    """Samples by ticket: a share of the tickets draws from the second source, evenly spread.
+    """Samples by index: a share of the indices draws from the second source, evenly spread.
 
     Args:
         sources: the pairs that set the length of an epoch; and perhaps others, e.g. real ones
             beside synthetic ones.
-        more_share: share of the tickets that draws from the others.
+        more_share: share of the samples that draws from the others.
         config: changes of the input alone.
         seed: decides the changes.
 
@@ -68,7 +68,7 @@ class SelectionSamples:
         return len(self.sources[0])
 
     def __getitem__(self, ticket: int) -> SelectionSample:
-        """Make the sample of a ticket."""
+        """Make the n-th sample."""
         before, now = int(ticket * self.more_share), int((ticket + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][ticket - before]
         seen = degrade(pair.left, self.config, ticket_generator(ticket, self.seed + 1))
@@ -133,14 +133,11 @@ class SelectTask:
     def _truth_loss(
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Float[Tensor, "b h w"]
     ) -> Float[Tensor, ""]:
-        """Punish wrong disparity of one view."""
+        """Losses of the disparity of one view."""
         planes, range_px = self.generator.planes, self.generator.config.disparity_px
         log_px = log_expectation(logits, planes)[:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
-        if self.config.disparity_loss == "log":
-            loss = log_disparity_loss(log_px[:, 0], truth_px, range_px)
-        else:
-            loss = _pixel_loss(log_px[:, 0].exp(), truth_px, range_px[1])
+        loss = DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
         # The nearest point of the four pixels that a logit stands for; unknown is -1.
@@ -158,15 +155,6 @@ class SelectTask:
         evidence = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
         self._train()
         return evidence
-
-
-def _pixel_loss(
-    found_px: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"], most_px: float
-) -> Float[Tensor, ""]:
-    """Mean absolute disparity error over the pixels with truth, relative to the largest."""
-    is_known = truth_px > 0
-    error = torch.where(is_known, (found_px - truth_px.nan_to_num(0.0)).abs(), 0.0)
-    return error.sum() / is_known.sum().clamp(min=1) / most_px
 
 
 def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> Evidence:

@@ -116,25 +116,27 @@ class ViewTask:
             )
         }
         if config.discriminator != "none":
-            judge = make_discriminator(config.discriminator, config.discriminator_width)
-            self.modules["discriminator"] = judge.train()
+            discriminator = make_discriminator(config.discriminator, config.discriminator_width)
+            self.modules["discriminator"] = discriminator.train()
             self.optimizers["discriminator"] = (
-                make_adam(judge.parameters(), config.discriminator_adam),
+                make_adam(discriminator.parameters(), config.discriminator_adam),
                 config.discriminator_adam,
             )
 
     def step(self, batch: TrainingPair) -> Iterator[Turn]:
-        """Draw once; the discriminator learns from it, then judges it anew."""
+        """Draw once; the discriminator learns from it, then scores it anew."""
         left, right = 2 * batch.left - 1, 2 * batch.right - 1
         drawn = self.generator(left)
         l1 = l1_loss(drawn, right)
         if self.config.discriminator == "none":
             yield Turn("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
-        judge, mode = self.modules["discriminator"], self.config.gan_mode
-        judged = discriminator_loss(judge(left, right), judge(left, drawn.detach()), mode)
-        yield Turn("discriminator", judged, {})
-        fooled = adversarial_loss(judge(left, drawn), mode, is_real=True)
+        discriminator, mode = self.modules["discriminator"], self.config.gan_mode
+        d_loss = discriminator_loss(
+            discriminator(left, right), discriminator(left, drawn.detach()), mode
+        )
+        yield Turn("discriminator", d_loss, {})
+        fooled = adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = fooled + self.config.l1_weight * l1
         yield Turn("generator", loss, {"l1": l1.detach(), "adversarial": fooled.detach()})
 

@@ -7,7 +7,7 @@ import torch
 from depthpose.core.camera import StereoRig, resize_camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image
-from depthpose.depth.baselines import NearestImageFloor, RowDepthFloor, fill_by_pyramid
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline, fill_by_pyramid
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, read_known_depth
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.types import StereoInput
@@ -41,7 +41,7 @@ def pair_of(image: torch.Tensor, camera: StereoRig | None = None) -> StereoInput
 
 def test_rows_learn_a_road(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
-    estimate = RowDepthFloor.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
+    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
     assert estimate.depth_m is not None
     inside = (road_m() > 1.0) & (road_m() < 80)
     known_m = road_m()[inside]
@@ -53,7 +53,9 @@ def test_rows_learn_a_road(tmp_path: Path) -> None:
 def test_rows_follow_the_camera_and_not_the_size(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
     larger = resize_camera(rig(), 2 * W, 2 * H)
-    estimate = RowDepthFloor.fit(data).estimate_pair(pair_of(torch.rand(3, 2 * H, 2 * W), larger))
+    estimate = RowDepthBaseline.fit(data).estimate_pair(
+        pair_of(torch.rand(3, 2 * H, 2 * W), larger)
+    )
     assert estimate.depth_m is not None
     truth_m = road_m(2 * H, larger)
     inside = (truth_m > 2.0) & (truth_m < 20)
@@ -65,7 +67,7 @@ def test_a_row_takes_the_constant_of_least_relative_error(tmp_path: Path) -> Non
     sparse_m = torch.full((H, W), torch.nan)
     sparse_m[20, :8] = depths_m
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), sparse_m)})
-    estimate = RowDepthFloor.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
+    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
     assert estimate.depth_m is not None
     candidates_m = torch.linspace(1, 80, 7901)
     loss = ((candidates_m[:, None] - depths_m).abs() / depths_m).mean(1)
@@ -78,7 +80,7 @@ def test_a_frame_with_more_points_has_no_louder_voice(tmp_path: Path) -> None:
     few[20, :2], many[20, :40] = 5.0, 20.0
     images = torch.rand(2, 3, H, W)
     data = write_frames(tmp_path, {"a": (images[0], few), "b": (images[1], many)})
-    estimate = RowDepthFloor.fit(data).estimate_pair(pair_of(images[0]))
+    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(images[0]))
     assert estimate.depth_m is not None
     assert float(estimate.depth_m[20, 0]) == pytest.approx(5.0, 2e-3)
 
@@ -86,13 +88,13 @@ def test_a_frame_with_more_points_has_no_louder_voice(tmp_path: Path) -> None:
 def test_the_nearest_image_gives_its_own_depth(tmp_path: Path) -> None:
     images = torch.rand(3, 3, H, W)
     frames = {n: (images[k], torch.full((H, W), 4.0 + k)) for k, n in enumerate("abc")}
-    floor = NearestImageFloor.fit(write_frames(tmp_path, frames))
+    baseline = NearestImageBaseline.fit(write_frames(tmp_path, frames))
     darker = (0.6 * images[1] + 0.02 * torch.rand(3, H, W)).clamp(0, 1)
-    estimate = floor.estimate_pair(pair_of(darker))
+    estimate = baseline.estimate_pair(pair_of(darker))
     assert estimate.depth_m is not None
     assert torch.allclose(estimate.depth_m, torch.full((H, W), 5.0), rtol=1e-3)
     twice_as_long = replace(rig(), K=rig().K * torch.tensor([[2.0], [2.0], [1.0]]))
-    farther = floor.estimate_pair(pair_of(darker, twice_as_long)).depth_m
+    farther = baseline.estimate_pair(pair_of(darker, twice_as_long)).depth_m
     assert farther is not None
     assert torch.allclose(farther, torch.full((H, W), 10.0), rtol=1e-3)
 
@@ -124,17 +126,17 @@ def test_disparity_serves_where_no_depth_is_known(tmp_path: Path) -> None:
 def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
     write_image(tmp_path / "left/a.png", torch.rand(3, H, W))
     data = open_dataset(tmp_path)
-    for floor in (RowDepthFloor, NearestImageFloor):
+    for baseline in (RowDepthBaseline, NearestImageBaseline):
         with pytest.raises(InputError, match="none of its 1 frames has both truth and calibration"):
-            floor.fit(data)
+            baseline.fit(data)
 
 
-def test_a_floor_needs_a_rig(tmp_path: Path) -> None:
+def test_a_baseline_needs_a_rig(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
-    for floor in (RowDepthFloor.fit(data), NearestImageFloor.fit(data)):
+    for baseline in (RowDepthBaseline.fit(data), NearestImageBaseline.fit(data)):
         with pytest.raises(InputError, match="x: has no rig"):
-            floor.estimate_pair(pair)
+            baseline.estimate_pair(pair)
 
 
 def test_frames_are_kept_out_by_name(tmp_path: Path) -> None:

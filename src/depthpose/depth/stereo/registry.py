@@ -1,0 +1,51 @@
+"""Matchers with weights, by the kind that their weights files name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig, PSMNetConfig
+from depthpose.depth.stereo.matcher import Matcher
+from depthpose.depth.stereo.psmnet import PSMNet
+from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherKind:
+    """What it takes to read, write and run one kind of matcher.
+
+    Attributes:
+        config: dataclass of the network's sizes and conventions, which its weights file holds.
+        network: makes the module of a config, and keeps it as the attribute ``config``.
+        matcher: makes a matcher of a module in eval mode.
+    """
+
+    config: type
+    network: type[nn.Module]
+    matcher: Callable[[Any, MatcherConfig], Matcher]
+
+
+MATCHERS = {"psmnet": MatcherKind(config=PSMNetConfig, network=PSMNet, matcher=PSMNetMatcher)}
+"""Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
+
+
+def make_matcher(network: nn.Module, config: MatcherConfig) -> Matcher:
+    """Make the matcher of a network of any kind.
+
+    Raises:
+        InputError: no kind has such a network.
+    """
+    for kind in MATCHERS.values():
+        if isinstance(network, kind.network):
+            return kind.matcher(network, config)
+    raise InputError(
+        f"{type(network).__name__} is no network of a matcher; known are {', '.join(MATCHERS)}"
+    )
+
+
+def is_own_matcher(matcher: object) -> bool:
+    """Whether a matcher's name means the one that the weights hold: none, or that of a kind."""
+    return matcher is None or (isinstance(matcher, str) and matcher in MATCHERS)
