@@ -148,7 +148,7 @@ def match(
     if weights is None and config != MatcherConfig():
         raise InputError(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
-            "psmnet; sgbm takes none of them."
+            "matchers with weights; sgbm takes none."
         )
     if engine.is_ray:
         return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
