@@ -1,7 +1,6 @@
 """Names that modules had before: importing one says where it is now."""
 
 import sys
-from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from types import ModuleType
 
@@ -31,9 +30,7 @@ MOVED = {
 class MovedFinder(MetaPathFinder):
     """Asked last, for modules that no other finder has found."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> None:
+    def find_spec(self, fullname: str, path: object, target: ModuleType | None = None) -> None:
         """Say the new name of a module of ours that moved.
 
         Raises:

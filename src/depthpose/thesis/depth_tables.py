@@ -58,8 +58,10 @@ class JoinedRow(Row):
 
     Attributes:
         source: which of the three.
-        method, weights, cap_m, protocol: as in :class:`~depthpose.depth.evaluate.MeanRow`; of a
-            difference across two protocols both are named.
+        method: its name.
+        weights: name of the file.
+        cap_m: truth beyond it does not count.
+        protocol: by which frames were measured; of a difference across two, both.
         metrics: the seven numbers.
         others: further columns: the note of a printed row, all others of ours.
     """

@@ -50,7 +50,11 @@ class MeanRow(Row):
     """Means over frames, each of the same weight.
 
     Attributes:
-        method, sees, speed, weights, weights_sha256: as in :class:`Source`; None: not known.
+        method: as in :class:`Source`, like the next four; None: not known.
+        sees: which images it was given.
+        speed: of a matcher of real pairs.
+        weights: name of the file.
+        weights_sha256: the first 12 digits.
         protocol: by which the frames were measured.
         dataset: its name.
         cap_m: truth beyond it does not count; None for disparity.
