@@ -234,7 +234,7 @@ def test_clouds_have_the_poses_of_the_plain_command(
     [
         (["--workers", "2"], "are for --engine ray; add it"),
         ([*RAY, "--block", "0"], "--block 0"),
-        ([*RAY, "--worker-cpus", "0"], "no core and no GPU"),
+        ([*RAY, "--worker-cpus", "0"], "needs a core or a GPU"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(
