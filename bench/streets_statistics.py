@@ -1,10 +1,10 @@
-"""Are made streets like real ones? Layout, disparity and brightness of both, side by side.
+"""Statistics of synthetic and real streets: layout, disparity and brightness.
 
     python bench/streets_statistics.py --number 40
 
-reads the real pairs that ``$DEPTHPOSE_DATA`` names and draws made ones of the same rig; it prints a
-table and writes ``out/streets_statistics/`` (a figure for each measure). What is made of KITTI is
-of its licence and is never committed.
+reads the real pairs of ``$DEPTHPOSE_DATA`` and renders synthetic ones of the same rig; it prints a
+table and writes ``out/streets_statistics/`` (a figure for each measure). Figures of KITTI's data
+fall under its licence and are never committed.
 """
 
 import argparse
