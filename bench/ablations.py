@@ -1,12 +1,12 @@
-"""What each choice of the training is worth, by one small configuration and one number of steps.
+"""Effect of each choice of the training, by one small configuration and one number of steps.
 
     python bench/ablations.py --made streets --real PAIRS/kitti2015_train_drives \
         --evaluate PAIRS/kitti2015_eval_drives --out out/ablations
 
 L1 alone against cGAN + L1, patch against pixel discriminator, batch norm's mode at test; and how
-accuracy grows with the number of made and of real pairs. Every arm is trained apart, measured, then
-fine-tuned and measured again: on real pairs, and on made streets of a seed that none has seen.
-What stands in ``--out`` is not done again: a second call goes on where the first was stopped.
+accuracy grows with the number of synthetic and real pairs. Every arm is trained apart, measured,
+fine-tuned and measured again: on real pairs, and on synthetic streets of a seed of their own.
+Results in ``--out`` are reused: a second call continues where the first was stopped.
 """
 
 import argparse
@@ -55,9 +55,9 @@ class Arm:
     """One training.
 
     Attributes:
-        made: number of made pairs that both stages see, where ``real`` is None.
-        real: number of real pairs that both stages see, after the made ones have been learnt.
-        discriminator: who judges the generator; none: L1 alone.
+        made: number of synthetic pairs of both stages, where ``real`` is None.
+        real: number of real pairs of both stages, after training on the synthetic ones.
+        discriminator: kind of discriminator of the generator; none: L1 alone.
         seed: of weights, order and augmentation.
     """
 
@@ -74,7 +74,7 @@ class Arm:
 
 
 def arms(real_pairs: tuple[int, ...], seeds: int) -> list[Arm]:
-    """Every arm, what others begin with first."""
+    """Every arm; those from which others start come first."""
     found: list[Arm] = []
     for seed in range(seeds):
         found += [Arm(seed=seed), Arm(seed=seed, discriminator="none")]
@@ -85,13 +85,13 @@ def arms(real_pairs: tuple[int, ...], seeds: int) -> list[Arm]:
 
 
 class Bench:
-    """Where the data lie and the runs go."""
+    """Folders of data and runs."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options, self.out = options, options.out
 
     def pairs(self, arm: Arm) -> PairsConfig:
-        """Give what an arm is trained on."""
+        """Give the training data of an arm."""
         folder = self.options.made if arm.real is None else self.options.real
         return PairsConfig(
             folders=(str(folder),), limit=arm.made if arm.real is None else arm.real,
@@ -99,7 +99,7 @@ class Bench:
         )  # fmt: skip
 
     def matcher(self) -> Path:
-        """Train the one matcher of all arms, on made streets."""
+        """Train the matcher that all arms share, on synthetic streets."""
         pairs = self.pairs(Arm())
         pairs = replace(pairs, augment=AugmentConfig(crop_px=(64, 160), scale=(0.9, 1.4)))
         config = StereoTraining(
@@ -140,7 +140,7 @@ class Bench:
         )  # fmt: skip
 
     def train(self, stage: str, config: Any, folder: Path) -> Path:  # noqa: ANN401 - any stage
-        """Train once; a finished run is left alone."""
+        """Train once; a finished run is reused."""
         if not (folder / "done.json").exists():
 
             def show(progress: Any) -> None:  # noqa: ANN401
@@ -153,7 +153,7 @@ class Bench:
         return folder
 
     def measure(self, arm: Arm, stage: str, weights: Path) -> dict[str, Any]:
-        """Measure weights on real pairs and on made streets, once."""
+        """Measure weights on real pairs and on synthetic streets, once."""
         folder = self.out / arm.name / f"measured-{stage}"
         if not (folder / "row.json").exists():
             real = ("depth", "evaluate", "--data", str(self.options.evaluate), "--cap", "80")
@@ -186,7 +186,7 @@ class Bench:
 
 
 def made_quality(weights: Path) -> dict[str, float]:
-    """What is drawn and measured where the left view shows it and where it hides it."""
+    """Errors of the generated view and of depth, in visible and in occluded regions."""
     net = FakestereoNet.load(weights, with_unlike=True)
     config = StreetsConfig(seed=9, scale=0.25)
     rows = [measure(net, draw_street(config, index)) for index in range(HELD_OUT_STREETS)]
@@ -202,7 +202,9 @@ def draw_growth(path: Path, rows: list[dict[str, Any]]) -> None:
             made[row["stage"]].append((row["made"], row["abs_rel"]))
         if row["made"] == Arm.made:  # without real pairs: the made ones alone
             real[row["stage"]].append((row["real"] or 0, row["abs_rel"]))
-    draw_curves(path, {"made pairs": made, "real pairs": real}, "AbsRel, 25 real pairs", log=True)
+    draw_curves(
+        path, {"synthetic pairs": made, "real pairs": real}, "AbsRel, 25 real pairs", log=True
+    )
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 mpl.use("Agg")
 
 _MOST_INSIDE = 5
-"""So many names fit into a plot; more stand beside it."""
+"""Largest number of names inside a plot; a longer legend is placed beside it."""
 
 Curves = Mapping[str, Sequence[tuple[float, float]]]
 

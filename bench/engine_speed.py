@@ -1,8 +1,8 @@
-"""Images a second by the plain command and by ``--engine ray`` with 1 and 2 workers.
+"""Images a second without ``--engine`` and by ``--engine ray`` with 1 and 2 workers.
 
 Run: ``.venv/bin/python bench/engine_speed.py --images 500`` (needs the extra ``ray``). Each command
-is a process of its own, timed from its start to its end; what Ray takes to start is in it, and is
-measured apart by a run of one image. The peak memory is that of the command's own process.
+is a separate process, timed from its start to its end. This includes Ray's start, which is also
+measured by a run of one image. The peak memory is that of the command's own process.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""One image and one pair by torch, ONNX Runtime and OpenVINO: seconds, and how far answers differ.
+"""One image and one pair by torch, ONNX Runtime and OpenVINO: seconds, and difference of results.
 
     python bench/engines.py [--weights default] [--frames 4] [--runs 8] [--what network image pair]
 
-Needs the extras ``export`` and ``openvino``. One thread and one process; engines take turns, since
-other work on a machine slows them all alike: processor time, least of the runs, and its ratio to
-torch's. Answers are compared on synthetic streets that nothing was trained on. int8: convolutions
-alone, in QDQ form, their ranges from other synthetic streets by onnxruntime.
+Needs the extras ``export`` and ``openvino``. One thread and one process; runs of the engines
+alternate, so that a busy machine slows all alike: processor time, least of the runs, and ratio to
+torch's. Results are compared on synthetic streets that were not trained on. int8: convolutions
+alone, in QDQ form, with ranges from other synthetic streets by onnxruntime.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def feed_of(given: StereoInput) -> Feed:
 
 
 def export_graph(folder: Path, weights: str, what: str) -> Path:
-    """Write the graph, unless an earlier run has."""
+    """Write the graph, unless it exists."""
     path = folder / f"{Path(weights).name}-{what}.onnx"
     if not path.exists():
         found = read_depth_weights(find_weights(weights))
@@ -75,7 +75,7 @@ class Calibration:
 
 
 def quantised(path: Path) -> Path:
-    """Write the int8 graph, unless an earlier run has."""
+    """Write the int8 graph, unless it exists."""
     target = path.with_suffix(".int8.onnx")
     if not target.exists():
         quantization = import_module("onnxruntime.quantization")
@@ -157,7 +157,7 @@ def runs_of(folder: Path, weights: str, what: str) -> dict[str, Run]:
 
 
 def seconds_of(runs: Mapping[str, Run], given: StereoInput, count: int) -> dict[str, list[float]]:
-    """Take turns; the first turn is to warm up."""
+    """Run the engines alternately; the first round is a warm-up."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(count + 1):
         for name, run in runs.items():
@@ -189,7 +189,7 @@ def differences_of(
 
 
 def input_of(frame: StereoSample, what: str) -> StereoInput:
-    """Give a frame as a pair, or as one image, whose disparity is then of the imitated rig."""
+    """Give a frame as a pair, or as one image, whose disparity is then of the virtual rig."""
     given = frame.input
     if what == "pair":
         return given
@@ -259,7 +259,7 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--frames", type=int, default=4, help="streets to compare answers on")
+    parser.add_argument("--frames", type=int, default=4, help="streets to compare results on")
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--what", nargs="+", default=["network", "image", "pair"])
     parser.add_argument("--out", type=Path, default=Path("out/bench"))

@@ -1,12 +1,12 @@
-"""Known objects found in depth alone, without masks: made tables, and the real frames.
+"""Known objects found in depth alone, without masks: synthetic tables, and the real frames.
 
     python bench/find_tables.py --weights parts --tables 20
     python bench/find_tables.py --weights linemod.safetensors ycb --real $DEPTHPOSE_DATA/pose
 
-A made table shows two to all of the objects, each once at most, between unknown things, with a
-sensor's errors. An instance counts that shows half of its silhouette and 200 pixels. Right is an
+A synthetic table has two to all of the objects, each at most once, between other things, with a
+sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. Right is an
 answer of that object with ADD (ADD-S where symmetries are declared or were found) below 10 % of the
-diameter; an answer that is right of no instance, however hidden, is wrong.
+diameter; an answer that fits no instance, however occluded, is wrong.
 """
 
 import argparse
@@ -35,7 +35,7 @@ Row = dict[str, Any]
 
 
 class Shown(NamedTuple):
-    """An instance of a frame: of which object, where, and whether it must be found."""
+    """An instance of a frame: its object, its pose, and whether it must be found."""
 
     model: ObjectModel
     pose: Rigid
@@ -43,7 +43,7 @@ class Shown(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Depth, camera and what there is."""
+    """Depth, camera and the true instances."""
 
     name: str
     depth_m: torch.Tensor
@@ -52,7 +52,7 @@ class Frame(NamedTuple):
 
 
 def made_tables(models: Sequence[ObjectModel], number: int) -> Iterator[Frame]:
-    """Make tables of another seed than any training."""
+    """Generate tables of another seed than any training."""
     config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0))
     by_number = {model.number: model for model in models}
     for frame in make_frames(models, config, number):
@@ -80,7 +80,7 @@ def real_frames(folder: Path, models: Sequence[ObjectModel]) -> Iterator[Frame]:
 
 
 def judge(frame: Frame, found: Sequence[PoseEstimate]) -> Row:
-    """Count instances found and answers that are of none."""
+    """Count found instances and answers that fit none."""
     right: set[int] = set()
     wrong = []
     for estimate in found:

@@ -1,9 +1,9 @@
-"""What it costs to draw the right view of a frame that is no multiple of what the generator takes.
+"""Accuracy for frames whose sides are no multiples of those that the generator takes.
 
     python bench/frame_sizes.py --data PAIRS/kitti_object_more --weights painted.safetensors
 
-Each way to bring a frame to sides that the U-Net takes is held against the same truth: AbsRel and
-d1 of the depth that comes of it (eigen-raw-camera, cap 80 m), and L1 of the drawn view.
+Each way to bring a frame to sides that the U-Net takes is compared with the same truth: AbsRel and
+d1 of the resulting depth (eigen-raw-camera, cap 80 m), and L1 of the generated right view.
 """
 
 import argparse
@@ -34,7 +34,7 @@ Draw = Callable[[UNetGenerator, Tensor], Tensor]
 
 
 def run(generator: UNetGenerator, left: Tensor) -> Tensor:
-    """Draw views whose sides are multiples."""
+    """Generate views whose sides are multiples."""
     return (generator(2 * left - 1) + 1) / 2
 
 
@@ -57,7 +57,7 @@ def of_rows(count: int) -> Draw:
 
 
 def of_crops(rows: int, columns: int) -> Draw:
-    """Draw overlapping crops of the size of training; each counts less towards its borders."""
+    """Generate overlapping crops of the training's size, weighted less towards their borders."""
 
     def draw(generator: UNetGenerator, left: Tensor) -> Tensor:
         height, width = left.shape[-2:]
@@ -91,7 +91,7 @@ class Drawer:
 
     @torch.no_grad()
     def draw(self, left: Tensor) -> Drawn:
-        """Draw right views one by one."""
+        """Generate right views one by one."""
         right = [self.way(self.generator, image[None]).clamp(0, 1) for image in left]
         return Drawn(right=torch.cat(right))
 
@@ -115,7 +115,7 @@ def measure(dataset: Dataset, net: FakestereoNet) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print a row a way."""
+    """Print a row for each way."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="pairs with LiDAR")
     parser.add_argument("--weights", required=True, help="with a U-Net generator")

@@ -1,4 +1,4 @@
-"""What a newcomer types, typed on a fresh machine: seconds, and what each command leaves on disk.
+"""The README's commands on a fresh machine: seconds, and disk space of each command.
 
     python bench/fresh_machine.py [--data $DEPTHPOSE_DATA] [--with-tests]
 
@@ -33,7 +33,7 @@ def disk_mb(folder: Path) -> float:
 
 
 class Machine:
-    """A home, a clone in it, and rows of what was run there."""
+    """A home, a clone in it, and a row for each command that was run there."""
 
     def __init__(self, folder: Path, data: Path | None) -> None:
         self.folder, self.clone = folder, folder / "depthpose"
@@ -62,7 +62,7 @@ class Machine:
 
 
 def readme_commands() -> list[str]:
-    """What the README's shell blocks say, cut short where it would take hours."""
+    """Commands of the README's shell blocks, shortened where they would take hours."""
     text = (PROJECT / "README.md").read_text()
     blocks = re.findall(r"^```bash\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
@@ -72,7 +72,7 @@ def readme_commands() -> list[str]:
 
 
 def main() -> None:
-    """Print a Markdown table, a row a command."""
+    """Print a Markdown table with a row for each command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--data", type=Path, help="folder of the real samples")
     parser.add_argument("--with-tests", action="store_true", help="make check and make test too")
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 def prepare(machine: Machine, work: Path, data: Path | None) -> None:
-    """What the README's commands take from elsewhere: configs, a CAD file, the real samples."""
+    """Inputs of the README's commands: configs, a CAD file, the real samples."""
     (work / "configs").symlink_to(machine.clone / "configs")
     machine.run(f"python {machine.clone}/bench/own_part.py part.stl", work)
     if data:

@@ -20,7 +20,7 @@ CONSTRAINTS = str(PROJECT / "constraints.txt")
 
 
 def pip(python: Path, *words: str) -> str:
-    """What ``python -m pip WORDS`` prints."""
+    """The output of ``python -m pip WORDS``."""
     command = [str(python), "-m", "pip", *words]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 

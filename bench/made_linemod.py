@@ -1,15 +1,15 @@
-"""Held-out made views of known objects: success over occlusion, sensor noise and resolution.
+"""Held-out synthetic views of known objects: success over occlusion, noise and resolution.
 
     python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
         --ours pose.safetensors --pointnet pointnet.safetensors \
         --depth-image depth-image.safetensors --open3d 100
 
-Every view is a rendering of its own, by a seed that no training has. A method is given one view at
-a time, on one thread; of several weights each answers for the objects that it knows. Success is ADD
+Every view is rendered separately, by a seed that no training has. A method is given one view at
+a time, on one thread; of several weights each is used for its own objects. Success is ADD
 (ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
-is every answer that votes can give, whatever its risk; of ours risks.png says how many are wrong if
-only the surest are given. Writes rows.csv, rows.json, table.md, views.csv with each
-view, and success.png with all curves. What another run measured stands beside it by ``--also``.
+is every answer that votes can give, whatever its risk; for ours risks.png has the share of wrong
+answers over the share that is answered. Writes rows.csv, rows.json, table.md, views.csv with each
+view, and success.png with all curves. ``--also`` adds the results of other runs.
 """
 
 import argparse
@@ -46,7 +46,7 @@ Row = dict[str, Any]
 
 
 class Condition(NamedTuple):
-    """How the views of one point of a curve look."""
+    """Conditions of the views of one point of a curve."""
 
     occlusion: float = 0.0
     noise: float = 1.0
@@ -54,7 +54,7 @@ class Condition(NamedTuple):
 
 
 class Method(NamedTuple):
-    """One way to pose a view, and how many views of each object it is given."""
+    """A method of pose estimation, and its number of views of each object."""
 
     name: str
     pose: Callable[[ViewInput], PoseEstimate]
@@ -63,7 +63,7 @@ class Method(NamedTuple):
 
 
 def made_views(models: Sequence[ObjectModel], at: Condition, number: int) -> Objects:
-    """Make ``number`` views of each object under a condition."""
+    """Render ``number`` views of each object under a condition."""
     config = ObjectsConfig(
         number=number * len(models), seed=SEED, views=None,
         resolution=(at.resolution, at.resolution),
@@ -168,14 +168,14 @@ def shares(rows: Sequence[Row]) -> Row:
         "success": right / len(rows),
         "refused": refused / len(rows),
         "wrong": (len(rows) - right - refused) / len(rows),
-        # Where more than half is refused, the median is no number.
+        # Where more than half is refused, the median is infinite.
         "median error [diameters]": round(middle, 4) if middle < torch.inf else None,
         "median ms": round(1000 * float(torch.tensor([row["s"] for row in rows]).median()), 1),
     }
 
 
 def conditions(words: argparse.Namespace) -> Iterator[tuple[Condition, int]]:
-    """List what is measured, each once."""
+    """List the conditions, each once."""
     for occlusion in OCCLUSIONS:
         yield Condition(occlusion=occlusion), words.number
     if words.sweep:
@@ -190,7 +190,7 @@ def earlier(folders: Sequence[Path], name: str) -> Iterator[Row]:
 
 
 def draw(rows: Sequence[Row], out: Path) -> None:
-    """Draw success of all objects over each knob, the others at their usual value."""
+    """Plot success of all objects over each condition, the others at their usual value."""
     usual = Condition()._asdict()
     plots: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for knob, what in (("occlusion", "share of the silhouette that is hidden"),
@@ -208,7 +208,7 @@ def draw(rows: Sequence[Row], out: Path) -> None:
 
 
 def draw_risks(views: Sequence[Row], out: Path) -> None:
-    """Draw the share of wrong answers over the share that is answered, for each occlusion."""
+    """Plot the share of wrong answers over the share that is answered, for each occlusion."""
     curves: dict[str, list[tuple[float, float]]] = {}
     for occlusion in OCCLUSIONS:
         at = Condition(occlusion=occlusion)._asdict()
@@ -224,7 +224,7 @@ def draw_risks(views: Sequence[Row], out: Path) -> None:
 def main() -> None:
     """Run every method under every condition."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bop", type=Path, required=True, help="data set whose models are shown")
+    parser.add_argument("--bop", type=Path, required=True, help="data set of the models")
     parser.add_argument("--objects", type=int, nargs="*", help="their numbers; all by default")
     parser.add_argument("--ours", nargs="*", default=[])
     parser.add_argument("--pointnet", nargs="*", default=[])

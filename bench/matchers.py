@@ -2,9 +2,9 @@
 
     python bench/matchers.py [--data PAIRS] [--weights default kitti-nc] [--number 25] [--threads 2]
 
-Without --data the one pair is Middlebury's Motorcycle, from scikit-image's package. SGBM is told
-the largest true disparity of each pair; ours are told nothing. Methods take turns pair by pair in
-one process, so their ratios hold where the machine is busy.
+Without --data the only pair is Middlebury's Motorcycle, from scikit-image's package. SGBM is given
+the largest true disparity of each pair, ours are not. Methods alternate, pair by pair, in
+one process, so their ratios are valid on a busy machine too.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python bench/mono_speed.py [--weights default] [--precision fp32 bf16] [--device cpu]
 
-Beside the shipped set stands the full-width one (random weights: time does not depend on them).
-Each set runs in a process of its own, so that its peak memory is its own.
+The shipped weights and those of full width (random weights: time does not depend on them).
+Each runs in a separate process, so that peak memory is measured separately.
 """
 
 import argparse
@@ -82,7 +82,7 @@ def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
 
 
 def uses_matcher(net: FakestereoNet) -> bool:
-    """Whether depth from one image asks the matcher at all."""
+    """Whether depth from one image uses the matcher."""
     assert net.synthesiser is not None
     config = net.synthesiser.config
     return isinstance(config, GeneratorConfig) or config.answer != "own"
@@ -129,7 +129,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
 
 
 def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
-    """Take turns in one process, one thread: processor time bears a machine with other work."""
+    """Alternate in one process, one thread; processor time is valid on a busy machine too."""
     torch.set_num_threads(1)
     image = street()
     nets = {name: make_net(name, MatcherConfig()) for name in names}
@@ -143,13 +143,13 @@ def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
 
 
 def main() -> None:
-    """Run every set in a process of its own and print a table."""
+    """Run each set of weights in a separate process and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--weights", nargs="+", default=["default", "full"])
     parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--device", default="cpu")
     parser.add_argument(
-        "--compare", nargs="+", metavar="W", help="processor time of one thread, taking turns"
+        "--compare", nargs="+", metavar="W", help="processor time of one thread, alternating runs"
     )
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()

@@ -1,9 +1,9 @@
-"""A CAD part that no shipped network has seen: a valve body, written as STL in millimetres.
+"""A CAD part that no shipped network was trained on: a valve body, as STL in millimetres.
 
     python bench/own_part.py valve.stl
     depthpose pose train --cad valve.stl --unit mm --out my_part
 
-Overlapping solids, as many CAD files hold; 125 mm across, with no symmetry.
+Overlapping solids, as in many CAD files; 125 mm across, without symmetry.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""How likely each of several poses is that fit: slopes by made views, and how honest they are.
+"""Probabilities of several poses that fit: slopes from synthetic views, and their calibration.
 
     python bench/pose_candidates.py --weights linemod.safetensors bunny.safetensors parts ycb
 
-Made views of all objects, three in ten unoccluded, the others hidden by up to a half. Every
-candidate is compared with the truth by ADD; copies count as right where a declared symmetry, or
-one that was found and is exact to 1 % of the diameter, says so. Cases are views with several
+Synthetic views of all objects, three in ten unoccluded, the others occluded by up to a half. Every
+candidate is compared with the truth by ADD; copies count as right if a declared symmetry, or
+a detected one that is exact to 1 % of the diameter, allows it. Cases are views with several
 candidates one of which is right below 10 % of the diameter. Slopes are fitted on four fifths and
-judged on the other, five times; those of all are printed last.
+evaluated on the other, five times; those of all cases are printed last.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def add_of(pose: Rigid, truth: Rigid, copies: Copies) -> float:
 
 
 def case_of(found: PoseEstimate, truth: Rigid, copies: Copies) -> Case | None:
-    """Give the signals of all candidates and which is right, where one of several is."""
+    """Give the signals of all candidates and the index of the right one, if there is one."""
     if found.camera_from_model is None or not found.alternatives:
         return None
     poses = [found.camera_from_model, *(a.camera_from_model for a in found.alternatives)]
@@ -50,7 +50,7 @@ def case_of(found: PoseEstimate, truth: Rigid, copies: Copies) -> Case | None:
 
 
 def cases_of(name: str, number: int) -> tuple[list[Case], int]:
-    """Pose made views of the objects of weights, all candidates alike, nothing refused."""
+    """Pose synthetic views of the objects of weights, with all candidates, nothing refused."""
     weights = read_pose_weights(find_weights(name))
     even = dict.fromkeys(RefusalConfig().candidate_slopes, 0.0)
     opened = RefusalConfig(max_risk=1.0, candidate_slopes=even)
@@ -71,7 +71,7 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
 
 
 def judge(cases: Sequence[Case]) -> list[tuple[float, bool]]:
-    """Give the largest share of each case and whether it is the right one's, cross-validated."""
+    """Give each case's largest share and whether its candidate is right, cross-validated."""
     pairs: list[tuple[float, bool]] = []
     for fold in range(5):
         slopes = fit_candidate_slopes([c for k, c in enumerate(cases) if k % 5 != fold])
@@ -82,7 +82,7 @@ def judge(cases: Sequence[Case]) -> list[tuple[float, bool]]:
 
 
 def main() -> None:
-    """Print how honest the shares are, and the slopes."""
+    """Print the calibration of the shares, and the slopes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--weights", nargs="+", default=["parts", "ycb"])
     parser.add_argument("--number", type=int, default=12, help="views of each object")

@@ -1,13 +1,13 @@
-"""What voxels, points, features, width and network are worth to one part, at equal steps.
+"""Effect of voxels, points, features, width and network for one part, at equal steps.
 
     python bench/own_part.py valve.stl
     python bench/pose_choices.py valve.stl --out out/pose_choices
 
-Each arm is a training of ``configs/pose/own-part.yaml`` from nothing, with one thing changed, and
-is looked at by the same 200 held-out made views at each occlusion: ADD below a tenth of the
-diameter, by votes alone, nothing refused. Seconds are those of the training on one thread, views
-and all.
-What stands in ``--out`` is not done again: a second call goes on where the first was stopped.
+Each arm is a training of ``configs/pose/own-part.yaml`` from random weights, with one change, and
+is evaluated on the same 200 held-out synthetic views at each occlusion: ADD below a tenth of the
+diameter, by votes alone, nothing refused. Seconds are of the training on one thread, including the
+rendering of views.
+Results in ``--out`` are reused: a second call continues where the first was stopped.
 """
 
 import argparse
@@ -39,7 +39,7 @@ ARMS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "twice as wide": ("network", WIDE),
     "PointNet": ("network", PointNetConfig()),  # pyright: ignore[reportAssignmentType]
 }
-"""What each changes of the first: a part of the config, and its knobs (or a network)."""
+"""Changes of each arm: a part of the config, and its options (or a network)."""
 
 
 def config_of(arm: str, cad: Path, steps: int, seed: int) -> tuple[str, PoseTraining]:
@@ -60,7 +60,7 @@ def config_of(arm: str, cad: Path, steps: int, seed: int) -> tuple[str, PoseTrai
 
 
 def run_arm(arm: str, cad: Path, steps: int, seed: int, out: Path) -> dict[str, Any]:
-    """Train, or read what an earlier call found."""
+    """Train, or read the result of an earlier call."""
     home = out / f"{arm}, seed {seed}".replace(" ", "_").replace(",", "")
     if (home / "row.json").exists():
         return json.loads((home / "row.json").read_text())

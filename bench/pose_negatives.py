@@ -1,13 +1,13 @@
-"""What is not the named object, and is posed all the same: shares answered ``ok``.
+"""Clouds that do not show the requested object: shares answered ``ok``.
 
     python bench/pose_negatives.py --weights parts ycb linemod.safetensors --number 40
 
-Eight kinds of negatives, of each so many: another object of the weights (or a part of ours, where
-they know one alone), copies scaled by 0.8, 0.9, 1.1 and 1.2 (so many of each), mirrored ones,
-blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. Each is seen as
-held-out views are, half of them with up to a half hidden. Beside them the objects themselves, four
+Eight kinds of negatives, ``--number`` of each: another object of the weights (or one of our parts,
+if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.2 (``--number`` each), mirrored ones,
+blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. Views are rendered
+like held-out ones, half of them with up to a half occluded. Also the objects themselves, four
 times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of the diameter.
-``--save`` writes every signal as JSON; nothing is refused for its risk then.
+``--save`` writes all signals as JSON; then nothing is refused for its risk.
 """
 
 import argparse
@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 
 def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
-    """Show each of some models once."""
+    """Render each of some models once."""
     config = ObjectsConfig(
         number=len(models), seed=seed, views=None, resolution=(1.0, 1.0), occluded_share=0.5,
         occlusion=(0.0, 0.5),
@@ -47,7 +47,7 @@ def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
 
 
 def things(weights: PoseWeights, kind: str, number: int) -> tuple[list[ObjectModel], list[int]]:
-    """Give what is shown, and which object it is asked for."""
+    """Give the model in view, and the name of the requested object."""
     generator = ticket_generator(sum(map(ord, kind)), SEED)
     asked = [k % len(weights.models) for k in range(number)]
     models = [weights.models[k] for k in asked]
@@ -60,7 +60,7 @@ def things(weights: PoseWeights, kind: str, number: int) -> tuple[list[ObjectMod
 
 
 def kinds() -> Iterator[str]:
-    """Name what is shown."""
+    """Give the name of the model in view."""
     for kind in get_args(NegativeKind):
         if kind == "scaled":
             yield from (f"scaled by {times}" for times in SCALES)
@@ -69,7 +69,7 @@ def kinds() -> Iterator[str]:
 
 
 def measure(net: GeoPoseNet, kind: str, number: int) -> list[Row]:
-    """Ask for every negative of a kind, or for the objects themselves."""
+    """Estimate every negative of a kind, or the objects themselves."""
     models, asked = things(net.weights, kind, number)
     rows = []
     for sample, which in zip(seen(models, SEED), asked, strict=True):

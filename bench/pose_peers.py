@@ -2,11 +2,11 @@
 
     python bench/pose_peers.py $DEPTHPOSE_DATA/pose --seeds 5 [--weights W.safetensors ...]
 
-``pip install -e '.[open3d]'`` first. Ours runs on the objects that the weights know. Seconds
-are of the wall, one thread each (``OMP_NUM_THREADS=1``); a model's preparation is not among them.
-Success is ADD (ADD-S where the table says so) below 10 % of the diameter; what is answered beyond
-is wrong, what is not answered refused. A second table judges by ADD alone, to the nearest of the
-copies that the data set declares: right, right among the named alternatives, refused, wrong, and
+``pip install -e '.[open3d]'`` first. Ours runs on the objects of the weights. Seconds
+are wall time, one thread each (``OMP_NUM_THREADS=1``), without the preparation of models.
+Success is ADD (ADD-S where the table has it) below 10 % of the diameter; other answers are
+wrong, no answer is refused. A second table uses ADD alone, to the nearest of the
+copies that the data set declares: right, right among the alternatives, refused, wrong, and
 wrong with a certainty of 0.9 and more. ``--no-peer`` leaves Open3D out.
 """
 
@@ -39,7 +39,7 @@ Method = Callable[[CloudInput], PoseEstimate]
 
 
 def judge(case: RealCase, estimate: PoseEstimate) -> Row:
-    """Errors of one estimate in diameters, and what they mean."""
+    """Errors of one estimate in diameters, and the verdict."""
     row: Row = {
         "metric": "ADD-S" if case.is_symmetric else "ADD",
         "add": None, "adds": None, "error_m": None,
@@ -69,13 +69,13 @@ def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
 
 
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
-    """The classical peer for one model."""
+    """Open3D's registration for one model."""
     config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
     return FpfhRegistration(case.model, config).estimate
 
 
 def our_method(weights: Sequence[str], case: RealCase, seed: int, with_icp: bool) -> Method:
-    """Trained weights that know the object; the seed chooses points and pairs of votes."""
+    """Trained weights with the object; the seed draws points and pairs of votes."""
     config = EstimateConfig(with_icp=with_icp, voting=VotingConfig(seed=seed))
     net = next(n for n in map(read_weights, weights) if case.sample.input.object in names_in(n))
     estimator = GeoPoseNet(net, config)
@@ -90,7 +90,7 @@ def read_weights(name: str) -> PoseWeights:
 
 
 def names_in(weights: PoseWeights) -> set[str]:
-    """Name the objects that weights know."""
+    """List the objects of weights."""
     return {model.name for model in weights.models}
 
 

@@ -2,14 +2,14 @@
 
 python bench/pose_speed.py [--voxels 500 2000 10000] [--threads 1] [--rounds 7] [--width full|half]
 
-The network is one that nobody trained, which takes as long as any; its directions are then
+The network is untrained, which takes as long as a trained one; its directions are then
 replaced by true ones with noise (15 degrees for a tenth of the points, 3 for the rest), so that
-the later stages do what they do in use. Stages are those of ``PoseEstimate.seconds``: cloud
-(thinning, flying pixels, voxels), network (kernel maps among it), voting, svd (outvoting and fit),
+the later stages run as in use. Stages are those of ``PoseEstimate.seconds``: cloud
+(thinning, flying pixels, voxels), network (with kernel maps), voting, svd (outliers and fit),
 icp, check (signals, observability, refusal). The least of the rounds is shown, of wall time.
 Memory is the growth of the resident set's peak over a first estimate of that size after one of a
-small cloud, in its own process, Linux only. The network alone, forward and training step, beside
-other engines: bench/sparse_speed.py.
+small cloud, in its own process, Linux only. For the network alone, compared with
+other engines, see bench/sparse_speed.py.
 """
 
 import argparse
@@ -44,7 +44,7 @@ NO_RISK = RefusalConfig(max_risk=1.0, slopes=dict.fromkeys(SIGNALS, 0.0), min_ho
 
 
 class Told(GeoPoseNet):
-    """Calls the network, and then votes with true directions and noise."""
+    """Calls the network, and replaces its directions by true ones with noise."""
 
     truth: Rigid
 
@@ -63,7 +63,7 @@ class Told(GeoPoseNet):
 
 
 def cloud_of(voxels: int) -> tuple[Tensor, ObjectModel]:
-    """A bumpy closed surface of about so many voxels, seen whole, and its model of points."""
+    """A bumpy closed surface of about ``voxels`` voxels, fully visible, and its model of points."""
     points_m = VOXEL_M * (surface(voxels)[:, 1:].float() + 0.5)
     return points_m, make_model(points_m, torch.zeros(0, 3, dtype=torch.long), name="bumpy")
 

@@ -1,6 +1,6 @@
 """Real partial clouds of known pose: two of LineMOD, five scans of the bunny, YCB's two frames.
 
-What ``$DEPTHPOSE_DATA/pose`` holds; its data are of non-commercial licence and never committed.
+From ``$DEPTHPOSE_DATA/pose``; the data have a non-commercial licence and are never committed.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from depthpose.pose.mesh import read_model
 from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth
 
 _SCANNER_M = 0.7
-"""The bunny's scanner looks along -z; our camera along +z, from about so far away."""
+"""The bunny's scanner looks along -z, our camera along +z, from about this distance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,7 +28,7 @@ class RealCase:
     Attributes:
         sample: the cloud and its pose.
         model: of its object.
-        is_symmetric: judged by ADD-S. All of YCB are: geometry alone cannot tell the sides of its
+        is_symmetric: evaluated by ADD-S. All of YCB are: geometry alone does not show the sides of
             boxes, nor how a can is turned.
     """
 
@@ -79,7 +79,7 @@ def ycb_cases(folder: Path) -> Iterator[RealCase]:
 
 
 def real_cases(folder: Path) -> list[RealCase]:
-    """Everything that there is."""
+    """All instances."""
     return [*lm_cases(folder), *bunny_cases(folder), *ycb_cases(folder)]
 
 

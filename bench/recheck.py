@@ -1,12 +1,12 @@
-"""Run the quick tables of docs/results.md again, and name every number that has moved.
+"""Run the quick tables of docs/results.md again, and list every number that has changed.
 
     DEPTHPOSE_DATA=SAMPLES python bench/recheck.py [--only NAME ...] [--out out/bench/recheck]
 
-A quick table takes minutes on one core and needs no weights but those that ship, and the published
-PSMNet of the samples. Numbers of time, of memory and of rounding errors are those of one machine
-and are left out; so are rows whose weights do not ship. A number has moved where it differs from
-the print by more than half of the last digit and a five-hundredth of itself, which is what another
-processor may do. The exit code is 1 where one has moved.
+A quick table takes minutes on one core and needs only the shipped weights and the published
+PSMNet of the samples. Times, memory and rounding errors depend on the machine
+and are left out; so are rows whose weights are not shipped. A number has changed if it differs from
+the printed one by more than half of the last digit and a five-hundredth of itself, which another
+processor may cause. The exit code is 1 if one has changed.
 """
 
 import argparse
@@ -45,16 +45,16 @@ _STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of results.md, and what makes it again.
+    """A table of results.md, and the commands that reproduce it.
 
     Attributes:
         name: for ``--only``.
-        after: a part of results.md; the first table below it is meant.
-        commands: run in order; SAMPLES and OUT stand for folders.
-        files: JSON rows that they leave, under OUT.
+        after: text of results.md; the table is the first one below it.
+        commands: run in order; SAMPLES and OUT are replaced by folders.
+        files: JSON rows that they write, under OUT.
         numbers: columns that are compared, by name in results.md and in the rows.
-        key: columns that say which row it is, beside the first.
-        rows: what the first column means in the rows; rows that it does not name are not compared.
+        key: columns that identify a row, besides the first.
+        rows: values in the rows for each name in the first column; other names are not compared.
             None: it is a column of the rows itself, named in ``key``.
         tolerance: share of a number by which another processor may change it.
     """
@@ -185,7 +185,7 @@ TABLES = (
 
 
 def main() -> int:
-    """Run, compare, and print what has moved."""
+    """Run, compare, and print what has changed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=[table.name for table in TABLES], default=())
     parser.add_argument("--out", type=Path, default=Path("out/bench/recheck"))
@@ -209,7 +209,7 @@ def main() -> int:
 
 
 def run(table: Table, out: Path, samples: str) -> list[dict[str, Any]]:
-    """Run the commands of a table in OUT, and give the rows that they leave."""
+    """Run the commands of a table in OUT, and give the rows that they write."""
     out.mkdir(parents=True, exist_ok=True)
     for command in table.commands:
         _execute(command.replace("SAMPLES", samples).replace("OUT", str(out)), out)
@@ -239,7 +239,7 @@ def printed_rows(text: str, after: str) -> list[dict[str, str]]:
 def compare(
     table: Table, printed: Sequence[Mapping[str, str]], rows: Sequence[Mapping[str, Any]]
 ) -> tuple[list[str], int, list[str]]:
-    """Give what has moved in words, how many numbers were compared, and rows that were not."""
+    """Give a line for each change, the count of compared numbers, and rows not compared."""
     moved: list[str] = []
     left_out: list[str] = []
     compared = 0
@@ -262,7 +262,7 @@ def compare(
 
 
 def has_moved(printed: str, now: float | None, tolerance: float) -> bool:
-    """Whether a number is not what is printed, ``0.472`` or ``68.8 %``.
+    """Whether a number differs from the printed one, ``0.472`` or ``68.8 %``.
 
     Beyond half of the last printed digit it may be off by ``tolerance`` of itself.
     """
@@ -276,7 +276,7 @@ def has_moved(printed: str, now: float | None, tolerance: float) -> bool:
 
 
 def _wanted(table: Table, line: Mapping[str, str]) -> dict[str, str]:
-    """Say which row a printed line is; nothing where it is none of ours."""
+    """Give the values that identify the row of a printed line; empty if it is not compared."""
     by_column = {place: line[column] for column, place in table.key.items()}
     if table.rows is None:
         return by_column

@@ -1,11 +1,11 @@
-"""From how wrong a start does our ICP still find the pose? On the real instances.
+"""Success of our ICP over the error of its start, on the real instances.
 
-python bench/refine_starts.py [--tries 10]   ($DEPTHPOSE_DATA/pose holds them)
+python bench/refine_starts.py [--tries 10]   (instances of $DEPTHPOSE_DATA/pose)
 
 A start is the true pose turned about the middle of the object by an angle, about an axis drawn by
 chance, and shifted by a share of the diameter in a direction drawn by chance. Right is ADD (ADD-S
-where the data are judged by it) below 5 % of the diameter: the truth of some instances was fitted
-to the same depth, and is no better than 1 % or 2 %. Beside it, the same with six starts more,
+for symmetric instances) below 5 % of the diameter: the truth of some instances was fitted
+to the same depth, and is no better than 1 % or 2 %. Then the same with six more starts,
 each the given one turned by 15 degrees one way or the other about an axis of the camera: of the
 seven, the one that explains the cloud best (``pose.refine.refine_best``).
 """
@@ -46,7 +46,7 @@ def unit(generator: torch.Generator) -> Tensor:
 
 
 def is_right(case: RealCase, found: Rigid, truth: Rigid) -> bool:
-    """Judge by ADD, or ADD-S."""
+    """Evaluate by ADD, or ADD-S."""
     measure = adds_m if case.is_symmetric else add_m
     points_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // 1000)]
     return float(measure(found, truth, points_m)) < RIGHT * case.model.diameter_m

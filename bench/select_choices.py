@@ -1,4 +1,4 @@
-"""What each choice of the selecting generator is worth, at one small size and one number of steps.
+"""Effect of each choice of the selecting generator, at one small size and one number of steps.
 
     python bench/select_choices.py --encoder lite0.safetensors --streets streets \
         --real FOLDER ... --labelled FOLDER ... --unlabelled FOLDER ... --without NAME ... \
@@ -6,8 +6,8 @@
 
 ``--real`` are pairs with truth, ``--unlabelled`` pairs without, ``--labelled`` the same with the
 labels of a matcher ('depthpose data label'). Choose by ``--held-out``, pairs of other training
-drives; ``--evaluate`` is for the table alone. What stands in ``--out`` is not done again: a second
-call goes on where the first was stopped.
+drives; ``--evaluate`` is for the table alone. Results in ``--out`` are reused: a second
+call continues where the first was stopped.
 """
 
 import argparse
@@ -96,10 +96,10 @@ ARMS = (
 
 
 class MixingSynthesiser(SelectionSynthesiser):
-    """Draws the right view as a mixture of shifts instead of by one shift a pixel."""
+    """Renders the right view as a mixture of shifts instead of by one shift per pixel."""
 
     def draw(self, left: torch.Tensor) -> Drawn:
-        """Draw right views; images are RGB in [0, 1]."""
+        """Synthesise right views; images are RGB in [0, 1]."""
         height, width = left.shape[-2:]
         size = (round(height / 32) * 32, round(width / 32) * 32)
         given = torch.nn.functional.interpolate(left, size, mode="bilinear", antialias=True)
@@ -113,7 +113,7 @@ class MixingSynthesiser(SelectionSynthesiser):
 
 
 class Bench:
-    """Where the data lie and the runs go."""
+    """Folders of data and runs."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options, self.out = options, options.out
@@ -126,7 +126,7 @@ class Bench:
         )  # fmt: skip
 
     def sources(self, arm: Arm) -> dict[str, Any]:
-        """Give what an arm sees."""
+        """Give the training data of an arm."""
         streets = replace(self.pairs([self.options.streets]), exclude=(), truth="disparity")
         if arm.sees == "streets":
             return {"pairs": streets}
@@ -145,7 +145,7 @@ class Bench:
         )  # fmt: skip
 
     def train(self, stage: str, config: Any, folder: Path) -> Path:  # noqa: ANN401 - any stage
-        """Train once; a finished run is left alone."""
+        """Train once; a finished run is reused."""
         if not (folder / "done.json").exists():
             run = Run(folder=folder, resume=folder.exists())
             STAGES[stage][1](config, run)
@@ -168,7 +168,7 @@ class Bench:
         return {"arm": arm.name, "seed": arm.seed} | held | self.measure(folder, "own", weights)
 
     def painting(self) -> dict[str, Any]:
-        """Train the generator that paints on the same pairs, and match what it draws."""
+        """Train the U-Net generator on the same pairs, and match its views."""
         folder = self.out / "painted"
         generator = GeneratorConfig(width=24, levels=5, virtual_focal_px=FOCAL_PX)
         adam = AdamConfig(learning_rate=5e-4, beta1=0.5, schedule="cosine")
@@ -207,7 +207,7 @@ class Bench:
         return {f"eval {name}": row[name] for name in ("abs_rel", "rmse", "d1")}
 
     def answers(self) -> list[dict[str, Any]]:
-        """Measure what else the first arm's distributions can be used for."""
+        """Measure other uses of the first arm's distributions."""
         folder = self.out / "as_shipped-0"
         weights = folder / "generator.safetensors"
         rows = []
@@ -250,7 +250,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=Path, required=True)
     for name in ("real", "labelled", "unlabelled", "without"):
         parser.add_argument(f"--{name}", nargs="+", default=[])
-    parser.add_argument("--matcher", type=Path, help="weights of the matcher of drawn views")
+    parser.add_argument("--matcher", type=Path, help="weights of the matcher of synthesised views")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--out", type=Path, default=Path("out/select_choices"))
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Where networks put the sky of synthetic streets, which know it exactly.
+"""The sky that networks find in synthetic streets, compared with the exact labels.
 
 python bench/sky.py --weights default kitti-nc --number 24
 """
@@ -22,7 +22,7 @@ CAP_M = 80.0
 
 
 def measure(name: str, sees: str, streets: list[StereoSample]) -> dict[str, object]:
-    """One row: what a network says of the sky and of the rest; no depth counts as far."""
+    """One row: a network's depth in the sky and elsewhere; no depth counts as far."""
     net = FakestereoNet.load(name, with_unlike=True)
     depths: dict[bool, list[Tensor]] = {True: [], False: []}
     sure: dict[bool, list[Tensor]] = {True: [], False: []}

@@ -4,9 +4,9 @@ python bench/sparse_speed.py [--voxels 500 2000 10000] [--threads 1] [--rounds 7
 
 Peers: MinkowskiEngine where it is installed (0.5.4 is built from source: pip install
 --no-build-isolation, after mending four 'from collections import Sequence'), and the same maps
-with torch's own autograd, offset by offset. A forward begins with coordinates, so hashing and
-kernel maps count; a step is a forward, a loss and its way back, without the optimiser, which is
-the same for all. Rounds go through all engines in turn; the least of each is shown. Memory is the
+with torch's own autograd, offset by offset. A forward pass starts from coordinates, so hashing and
+kernel maps count; a step is forward pass, loss and backward pass, without the optimiser, which is
+the same for all. Engines alternate in each round; the least of each is shown. Memory is the
 growth of the resident set's peak over a step, each in its own process, Linux only.
 """
 
@@ -55,7 +55,7 @@ def plain_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tenso
 
 
 class MinkowskiVoxels:
-    """A tensor of MinkowskiEngine that our network takes for voxels."""
+    """A tensor of MinkowskiEngine with the interface of our voxels."""
 
     def __init__(self, tensor: Any) -> None:  # noqa: ANN401
         self.tensor, self.features = tensor, tensor.F
@@ -69,7 +69,7 @@ class MinkowskiVoxels:
         )
 
     def at_points(self) -> Tensor:
-        """Rows stand as they were given."""
+        """Rows keep the order in which they were given."""
         return self.features
 
 
@@ -123,7 +123,7 @@ def engines(network: ResUNet, coordinates: Tensor) -> dict[str, Run]:
 
 
 def step(run: Run) -> None:
-    """Forward, loss, way back; gradients add up in place, as after ``zero_grad`` in place."""
+    """Forward, loss, backward; gradients add up in place, as after ``zero_grad`` in place."""
     run().square().mean().backward()
 
 

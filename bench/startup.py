@@ -1,4 +1,4 @@
-"""How long ``--help`` of each command takes, beside an empty Python and ``import torch``.
+"""Time of ``--help`` of each command, of an empty Python and of ``import torch``.
 
 python bench/startup.py
 """

@@ -18,7 +18,7 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import Footprint, PSMNetMatcher, Steps
 
 PLAIN = 0
-"""Stands, as a bound, for the plain network."""
+"""Marks the plain network, in place of a bound."""
 
 
 def resident_bytes(field: str) -> int:
@@ -46,7 +46,7 @@ def run_once(size: tuple[int, int], weights: Path | None, bound: int | None, out
 def measure(
     size: tuple[int, int], weights: Path | None, bound: int | None
 ) -> tuple[np.ndarray, int]:
-    """Run in a fresh process: memory that one run leaves behind would hide the next one's."""
+    """Run in a fresh process: memory kept from one run would mask that of the next."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run.npz"
         command = [sys.executable, __file__, "--size", f"{size[0]}x{size[1]}", "--child", str(out)]

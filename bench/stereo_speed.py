@@ -1,9 +1,9 @@
-"""Time of PSMNet as it is run here, beside the plain network: same weights, threads and process.
+"""Time of our PSMNet compared with the plain network: same weights, threads and process.
 
 python bench/stereo_speed.py [--size 256x512 375x1242] [--weights published_kitti2015.tar]
 
-Without weights they are random, and differences say less. With a left and right image
-(--pair LEFT RIGHT) their bottom is matched instead of noise.
+Without weights they are random, and differences mean less. With a left and right image
+(--pair LEFT RIGHT) their lower part is matched instead of noise.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Are made streets like real ones? Layout, disparity and brightness of both, side by side.
+"""Statistics of synthetic and real streets: layout, disparity and brightness.
 
     python bench/streets_statistics.py --number 40
 
-reads the real pairs that ``$DEPTHPOSE_DATA`` names and draws made ones of the same rig; it prints a
-table and writes ``out/streets_statistics/`` (a figure for each measure). What is made of KITTI is
-of its licence and is never committed.
+reads the real pairs of ``$DEPTHPOSE_DATA`` and renders synthetic ones of the same rig; it prints a
+table and writes ``out/streets_statistics/`` (a figure for each measure). Figures of KITTI's data
+fall under its licence and are never committed.
 """
 
 import argparse
@@ -68,11 +68,11 @@ def read_real(number: int, scale: float) -> tuple[list, list]:
 
 
 def draw_curves(path: Path, name: str, curves: dict[str, np.ndarray]) -> None:
-    """Draw a curve of each kind, real black and made red."""
+    """Draw a curve of each kind, real black and synthetic red."""
     picture = Image.new("RGB", SIZE, "white")
     pen = ImageDraw.Draw(picture)
     top = max(float(np.nanmax(curve)) for curve in curves.values()) * 1.05
-    pen.text((10, 5), f"{name}   (black real, red made; top {top:.3g})", fill="black")
+    pen.text((10, 5), f"{name}   (black real, red synthetic; top {top:.3g})", fill="black")
     for color, curve in zip(("black", "red"), curves.values(), strict=True):
         x = np.linspace(20, SIZE[0] - 20, len(curve))
         y = SIZE[1] - 15 - curve / top * (SIZE[1] - 45)
@@ -104,10 +104,10 @@ def main() -> None:
     sky = np.mean([float(f.is_sky.float().mean()) for f in frames])
     road = np.mean([float(f.is_road.float().mean()) for f in frames])
     occluded = np.mean([float(f.occluded.float().mean()) for f in frames])
-    print(f"made: sky {sky:.3f}, road {road:.3f}, occluded {occluded:.3f} of the pixels")
+    print(f"synthetic: sky {sky:.3f}, road {road:.3f}, occluded {occluded:.3f} of the pixels")
     bright = [float(one["brightness by row"].mean()) for one in (real, made)]
-    print(f"mean brightness: real {bright[0]:.3f}, made {bright[1]:.3f}")
-    # JSON knows no NaN: rows where nothing is known.
+    print(f"mean brightness: real {bright[0]:.3f}, synthetic {bright[1]:.3f}")
+    # JSON has no NaN: these are rows without data.
     listed = {
         kind: {
             name: [x if np.isfinite(x) else None for x in map(float, v)] for name, v in one.items()

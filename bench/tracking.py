@@ -1,16 +1,16 @@
-"""Objects followed through made sequences of known motion, beside each frame estimated anew.
+"""Tracking in synthetic sequences of known motion, compared with estimating each frame anew.
 
     python bench/tracking.py --weights parts --frames 60
     python bench/tracking.py --weights parts --speed 2 --anew 0
 
-Each object of the weights moves on a smooth path before a wall, over a table, between unknown
+Each object of the weights moves on a smooth path before a wall, over a table, between other
 boxes, and turns as it goes, at 30 frames a second (``--speed 1``: 0.2 m/s and 40 degrees a second
-in the mean). A plate covers it whole in one stretch of frames, it is taken away in another, and two
-fifths of it are hidden in a third. A depth sensor measures all. Right is an answer with ADD (ADD-S
+on average). A plate covers it fully in some frames, it is removed in others, and two
+fifths of it are occluded in others. Depth has a sensor's errors. Right is an answer with ADD (ADD-S
 where symmetries are declared or were found) below 10 % of the diameter in a frame that shows the
-object; lost is none in such a frame. "says so" are the frames from the begin of a drop-out to the
+object; lost is no answer in such a frame. "says so" are frames from the start of a drop-out to the
 first that is refused, "back" those from its end to the next right answer. Seconds are of the
-processor, one thread. ``--anew N``: every N-th frame is searched without what was before.
+processor, one thread. ``--anew N``: every N-th frame is searched without earlier frames.
 """
 
 import argparse
@@ -46,7 +46,7 @@ Row = dict[str, Any]
 
 
 class Frame(NamedTuple):
-    """A view, the true pose, and whether the object is to be seen."""
+    """A view, the true pose, and whether the object is visible."""
 
     view: ViewInput
     truth: Rigid
@@ -71,7 +71,7 @@ def path(number: int, speed: float, generator: torch.Generator) -> Iterator[Rigi
 
 
 def background(generator: torch.Generator) -> Tensor:
-    """Draw a wall, a table and boxes of no known object."""
+    """Render a wall, a table and boxes that are no known object."""
     row = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH).double()
     table_m = 0.35 / ((row - 239.5) / FOCAL_PX).clamp(min=1e-6)
     depth_m = table_m.clamp(max=1.4)
@@ -91,7 +91,7 @@ def background(generator: torch.Generator) -> Tensor:
 
 
 def sequence(model: ObjectModel, number: int, speed: float, seed: int) -> Iterator[Frame]:
-    """Make the frames of one object."""
+    """Render the frames of one object."""
     generator = ticket_generator(seed, SEED)
     behind_m = background(generator)
     triangles = drawn_triangles(model).double()
@@ -120,7 +120,7 @@ def sequence(model: ObjectModel, number: int, speed: float, seed: int) -> Iterat
 
 
 def verdict(model: ObjectModel, points_m: Tensor, frame: Frame, found: PoseEstimate) -> str:
-    """Say whether an estimate is right, wrong, lost, or rightly none."""
+    """Classify an estimate as right, wrong, lost, or rightly none."""
     if found.camera_from_model is None:
         return "lost" if frame.is_seen else "none"
     is_adds = not model.symmetries.is_none
@@ -169,7 +169,7 @@ def counts(said: Sequence[str]) -> Row:
 
 
 def anew(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
-    """Search every frame without what was before."""
+    """Search every frame without earlier frames."""
     points_m = sample_surface(model, 1000)[0]
     said = []
     began = time.process_time()

@@ -1,9 +1,9 @@
-"""Does the data keep up with the step? Samples a second of each source and number of workers.
+"""Samples a second of each data source and number of workers, and of the training steps.
 
     python bench/training_speed.py --data FOLDER [--workers 0 1 2]
 
 The source is a folder of pairs (read, decoded, augmented), the same held in memory, and streets
-made on the fly; beside them the samples a second that the compact steps take.
+rendered on the fly; then the samples a second that the compact training steps take.
 """
 
 import argparse
@@ -30,7 +30,7 @@ CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 
 
 def sources(data: str, view: ViewTraining) -> dict[str, PairsConfig]:
-    """Three ways to get the compact generator's samples."""
+    """Three data sources for the compact generator."""
     pairs = replace(view.pairs, folders=(data,), with_cache=False)
     made = StreetsConfig(scale=0.52)
     return {

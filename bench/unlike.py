@@ -1,10 +1,10 @@
-"""Which images weights refuse as unlike what they know: real streets, and what is no street.
+"""Images that weights refuse as unlike those of their training: real streets, and other images.
 
     python bench/unlike.py --samples $DEPTHPOSE_DATA [--weights default kitti-nc]
 
 Streets: KITTI's, KITTI-360's and those of six cameras of another car (DGP), with their own focal
 lengths. Unlike: scikit-image's pictures, indoor pictures, noise, one colour; streets turned,
-cut to what is above the horizon, or enlarged four times, all with the focal length that is told.
+cut to the part above the horizon, or enlarged four times, all with an unchanged focal length.
 """
 
 import argparse
@@ -36,7 +36,7 @@ PICTURES = ("astronaut", "brick", "camera", "cat", "cell", "checkerboard", "cloc
             "coins", "grass", "gravel", "horse", "hubble_deep_field", "immunohistochemistry",
             "logo", "moon", "page", "retina", "rocket", "text")  # fmt: skip
 PHONE = 0.8
-"""Focal length of what has none, in widths."""
+"""Focal length of images without one, in widths."""
 KITTI360_PX = 552.55
 
 
@@ -61,7 +61,7 @@ def dgp(folder: Path) -> Iterator[StereoInput]:
 
 
 def streets(samples: Path) -> Iterator[tuple[str, StereoInput]]:
-    """Give real streets, by where they are from."""
+    """Give real streets, with their source."""
     for folder in PAIRS:
         dataset = open_dataset(samples / "depth" / folder)
         for index in range(len(dataset)):
@@ -81,7 +81,7 @@ def picture(name: str) -> Tensor:
 
 
 def unlike(samples: Path) -> Iterator[tuple[str, StereoInput]]:
-    """Give what is no street, or a street that is told wrongly."""
+    """Give images that are no street, or streets with a wrong focal length."""
     generator = torch.Generator().manual_seed(0)
     for name in PICTURES:
         yield "scikit-image's pictures", given(name, picture(name))
@@ -125,7 +125,7 @@ def measure(weights: str, samples: Path) -> list[dict[str, Any]]:
 
 
 def indoors(weights: str) -> dict[str, Any]:
-    """Give the error on Middlebury's Motorcycle, which is refused unless one insists."""
+    """Give the error on Middlebury's Motorcycle, which is refused by default."""
     sample = read_motorcycle()
     assert sample is not None
     truth_m = sample.truth.depth_m

@@ -1,10 +1,10 @@
-"""What a generator draws, where the left view shows it and where it does not, on made streets.
+"""Errors of generated right views, where the left view shows the scene and where it does not.
 
     python bench/view_quality.py --weights default runs/l1/fakestereo.safetensors --number 20
 
-Streets of a seed that no weights were trained on, so every pixel's truth is known: which points of
-the right view the left one hides, and which points of the left view the right one does. The first
-streets become pictures: the real right view, and below it what each generator draws.
+Synthetic streets of a seed that no weights were trained on, so occlusion is known: which points of
+the right view are occluded in the left one, and the other way round. The first
+streets become pictures: the real right view, and below it that of each generator.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def estimate_street(net: FakestereoNet, frame: StreetFrame) -> DepthEstimate:
 
 
 def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
-    """L1 of the drawn view and relative depth error, in seen and in hidden regions."""
+    """L1 of the generated view and relative depth error, in visible and in occluded regions."""
     estimate = estimate_street(net, frame)
     assert estimate.right is not None
     assert estimate.depth_m is not None
@@ -62,7 +62,7 @@ def measure(net: FakestereoNet, frame: StreetFrame) -> dict[str, float]:
 
 
 def draw_views(path: Path, nets: dict[str, FakestereoNet], frames: list[StreetFrame]) -> None:
-    """Write real right views, a column a street, and below them what each generator draws."""
+    """Write real right views, a column for each street, and those of each generator below."""
     height, width = (min(frame.right.shape[k] for frame in frames) for k in (1, 2))
     columns = []
     for frame in frames:

@@ -2,9 +2,9 @@
 
 python bench/voting_speed.py [--points 500 1000 2000 5000] [--hypotheses 50 128 1024] [--noise 0.05]
 
-The peer takes one hypothesis at a time in NumPy, vectorised over the points, as published loops do;
+The peer tests one hypothesis at a time in NumPy, vectorised over the points, like published code;
 it draws its pairs, tests and refits as ours does without refinement. Votes err by ``noise``
-[rad, each way] and a fifth of them points anywhere. Each time is the least of many runs, in
+[rad, each way] and a fifth of them are random. Each time is the least of many runs, in
 processor time of the one thread used, so that other work on the machine counts little; all rows
 come from one process.
 """
@@ -27,7 +27,7 @@ WRONG_SHARE = 0.2
 
 
 def made_votes(points: int, noise: float, seed: int) -> tuple[torch.Tensor, ...]:
-    """A seen half of a ball of 5 cm, eight keypoints in and about it, noisy directions."""
+    """The visible half of a ball of 5 cm, eight keypoints in and about it, noisy directions."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.nn.functional.normalize(torch.randn(points, 3, generator=generator), dim=-1) * 0.05
     x[:, 2] = -x[:, 2].abs() + 0.8
@@ -54,7 +54,7 @@ def least_seconds(run: Callable[[], object], budget_s: float = 1.5, most: int = 
 
 
 def measure(points: int, hypotheses: list[int], noise: float) -> list[dict[str, object]]:
-    """Measure all ways for one number of points; errors are means over ten made clouds."""
+    """Measure all ways for one number of points; errors are means over ten clouds."""
     clouds = [made_votes(points, noise, seed) for seed in range(10)]
     x, n, _ = clouds[0]
     x_numpy, n_numpy = x.double().numpy(), n.double().numpy()

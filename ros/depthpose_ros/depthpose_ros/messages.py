@@ -1,4 +1,4 @@
-"""Messages as plain dataclasses, and what is in them as arrays: nothing here needs ROS.
+"""Messages as plain dataclasses, and their contents as arrays: nothing here needs ROS.
 
 The fields are those of ``std_msgs``, ``sensor_msgs`` and ``geometry_msgs``, so that a message of
 rclpy is read as it is, and :mod:`depthpose_ros.nodes` copies an answer field by field.

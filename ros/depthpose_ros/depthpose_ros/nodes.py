@@ -22,7 +22,7 @@ _QUEUE = 4
 
 
 class WorkNode(Node):
-    """Waits for messages of one time, works on the newest, says what it could not use."""
+    """Waits for messages of one time, processes the newest, and warns of input it cannot use."""
 
     def __init__(self, name: str, **parameters: object) -> None:
         super().__init__(name)
@@ -52,7 +52,7 @@ class WorkNode(Node):
         self._heard = both
 
     def destroy_node(self) -> None:
-        """End the thread before the node goes."""
+        """End the thread before the node is destroyed."""
         if self._latest is not None:
             self._latest.close()
         super().destroy_node()

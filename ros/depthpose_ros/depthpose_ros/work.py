@@ -1,4 +1,4 @@
-"""What the nodes do: messages in, messages out, the latest first. Nothing here needs ROS."""
+"""The work of the nodes: messages in, messages out, the latest first. Nothing here needs ROS."""
 
 import threading
 from collections.abc import Callable
@@ -63,8 +63,8 @@ class Poses:
     """A depth image, with a mask or without, to poses of known objects.
 
     Attributes:
-        net: knows the objects.
-        object: which one; None: the only one that the weights know, or all where no mask says.
+        net: the pose estimator.
+        object: its name; None: the only one of the weights, or all objects without a mask.
     """
 
     net: GeoPoseNet
@@ -94,7 +94,7 @@ class Poses:
 
 
 class Latest:
-    """Works on what came last; what comes while it works takes the place of what waits.
+    """Processes the newest input; input that arrives meanwhile replaces what is waiting.
 
     A node that is slower than its camera then answers with the newest frame, not with an old one.
 
@@ -119,7 +119,7 @@ class Latest:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Finish what is being worked on, and end."""
+        """Finish the present input, and end."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
