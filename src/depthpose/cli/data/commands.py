@@ -4,6 +4,7 @@ import math
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,14 +15,18 @@ from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
+    from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import LabelConfig
 
 
 @group
 @dataclass(frozen=True, kw_only=True)
 class LabelOptions:
-    """What counts as known."""
+    """What matches the pairs, and what counts as known."""
 
+    weights: str = "default"
+    """with a matcher, by name or file; their terms hold for the labels too."""
+    device: Device = "cpu"
     max_difference_px: float = 1.0
     """largest difference of the two views' disparities."""
     max_difference_share: float = 0.03
@@ -39,6 +44,13 @@ class LabelOptions:
             largest_share=self.max_difference_share,
             least_confidence=self.min_confidence,
         )
+
+    def load(self) -> "FakestereoNet":
+        """Build the matcher of the weights."""
+        from depthpose.depth.config import MatcherConfig
+        from depthpose.depth.estimator import FakestereoNet  # --help must not load torch
+
+        return FakestereoNet.load(self.weights, config=MatcherConfig(device=self.device))
 
 
 @group
@@ -67,7 +79,7 @@ class ExportOptions:
             raise InputError(f"--images {self.images} is for --format colmap; remove it")
 
 
-Limits = Annotated[LabelOptions, tyro.conf.OmitArgPrefixes]
+Labels = Annotated[LabelOptions, tyro.conf.OmitArgPrefixes]
 Exports = Annotated[ExportOptions, tyro.conf.OmitArgPrefixes]
 
 
@@ -92,11 +104,7 @@ def check(
 
     check_folder = check_bop if is_bop(path) else check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+        show = partial(_show_done, bar)
         report = check_folder(path, split, with_decoding=with_decoding, progress=show)
     for problem in (*report.notices, *report.problems):
         print(f"{problem.kind}: {problem.path}: {problem.message}")
@@ -104,14 +112,19 @@ def check(
     return 0 if report.is_ok else 1
 
 
+def _show_done(bar: Any, done: int, total: int) -> None:  # noqa: ANN401  tqdm's
+    bar.total = total
+    bar.update(done - bar.n)
+
+
 def pack(
     path: tyro.conf.Positional[Path], out: Path, split: str | None = None, shard_mb: int = 256
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
 
-    OUT, or a URL to which it was copied (s3://, gs://), can be used wherever a data set can; a
-    remote shard is cached in ~/.cache/depthpose or $DEPTHPOSE_CACHE when it is first read. Files
-    are copied unchanged. index.json is written last; after an interruption packing begins again.
+    OUT, or a URL of a copy (s3://, gs://), can be used wherever a data set can; shards of a URL are
+    cached in ~/.cache/depthpose or $DEPTHPOSE_CACHE. Files are copied unchanged; index.json is
+    written last; after an interruption packing begins again.
 
         depthpose data pack KITTI --split eigen-train-val --out shards
 
@@ -165,9 +178,8 @@ def duplicates(
     if not -1 <= threshold <= 1:
         raise InputError(f"--at-least {threshold:g}: a likeness is -1 .. 1; take 0.3")
     first, second = open_dataset(train), open_dataset(evaluation)
-    ranked = find_duplicates(
-        first, second, threshold, lambda frames: tqdm(frames, unit=" frames", disable=None)
-    )
+    show = partial(tqdm, unit=" frames", disable=None)
+    ranked = find_duplicates(first, second, threshold, show)
     rows = [asdict(pair) for pair in ranked if pair.likeness >= threshold]
     _list_duplicates(rows, out)
     likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
@@ -190,9 +202,7 @@ def _list_duplicates(rows: list[dict[str, Any]], out: Path | None) -> None:
 def label(
     path: tyro.conf.Positional[Path],
     out: Path,
-    weights: str = "default",
-    device: Device = "cpu",
-    limits: Limits = LabelOptions(),
+    options: Labels = LabelOptions(),
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
@@ -204,20 +214,16 @@ def label(
     Args:
         path: a dataset with right views and calibration.
         out: folder to write to.
-        weights: with a matcher, by name or file; their terms hold for the labels too.
     """
     from depthpose.core.checkpoint import file_sha256, find_weights
-    from depthpose.depth.config import MatcherConfig
     from depthpose.depth.datasets import open_dataset
-    from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import label_pairs
 
-    config = limits.config
+    config = options.config
     dataset = open_dataset(path)
-    sha256 = file_sha256(find_weights(weights))
+    sha256 = file_sha256(find_weights(options.weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
-    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
-    labelled = label_pairs(net, dataset, config, out, settings)
+    labelled = label_pairs(options.load(), dataset, config, out, settings)
     shares = [share for _, share in _shown(labelled, None, "pairs")]
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")

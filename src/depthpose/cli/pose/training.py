@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -12,6 +12,9 @@ from depthpose.cli.help import group
 from depthpose.cli.options import Training, TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:
+    from depthpose.pose.train import PoseTraining
 
 _START = "parts"
 """The weights that ship and may go with any licence."""
@@ -112,12 +115,36 @@ def train(
     return 0
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class CalibrationOptions:
+    """How the refusal is chosen."""
+
+    config: Path | None = None
+    """YAML of the training: its sensor and distances, and what is not said here."""
+    max_wrong_share: float | None = None
+    """of the answers that are given."""
+    number: int | None = None
+    """views of each object to choose by."""
+
+    @property
+    def chosen(self) -> "PoseTraining":
+        """Settings of the training with these."""
+        from depthpose.core.config import read_config
+        from depthpose.pose.train import PoseTraining
+
+        chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
+        limits = changed(
+            chosen.calibration, max_wrong_share=self.max_wrong_share, number=self.number
+        )
+        return dataclasses.replace(chosen, calibration=limits)
+
+
+Calibration = Annotated[CalibrationOptions, tyro.conf.OmitArgPrefixes]
+
+
 def calibrate(
-    weights: tyro.conf.Positional[str],
-    out: Path,
-    config: Path | None = None,
-    max_wrong_share: float | None = None,
-    number: int | None = None,
+    weights: tyro.conf.Positional[str], out: Path, options: Calibration = CalibrationOptions()
 ) -> int:
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
@@ -129,20 +156,13 @@ def calibrate(
     Args:
         weights: a file, a name or hf://OWNER/NAME.
         out: the .safetensors file to write.
-        config: YAML of the training: its sensor and distances, and what is not said here.
-        max_wrong_share: of the answers that are given.
-        number: views of each object to choose by.
     """
     from depthpose.core.checkpoint import find_weights
-    from depthpose.core.config import read_config
     from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.train import PoseTraining, recalibrate
+    from depthpose.pose.train import recalibrate
 
     refuse_to_replace(out)
-    chosen = PoseTraining() if config is None else read_config(config, PoseTraining)
-    knobs = changed(chosen.calibration, max_wrong_share=max_wrong_share, number=number)
-    chosen = dataclasses.replace(chosen, calibration=knobs)
-    print(recalibrate(find_weights(weights), out, chosen))
+    print(recalibrate(find_weights(weights), out, options.chosen))
     print(f"calibrated weights: {out}")
     return 0
 
