@@ -122,9 +122,8 @@ def pack(
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
 
-    OUT, or a URL of a copy (s3://, gs://), can be used wherever a data set can; shards of a URL are
-    cached in ~/.cache/depthpose or $DEPTHPOSE_CACHE. Files are copied unchanged; index.json is
-    written last; after an interruption packing begins again.
+    OUT, or a URL of its copy (s3://, gs://), is used as any data set; a URL's shards are cached in
+    ~/.cache/depthpose or $DEPTHPOSE_CACHE. Files are unchanged. Interrupted, packing begins again.
 
         depthpose data pack KITTI --split eigen-train-val --out shards
 

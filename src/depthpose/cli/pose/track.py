@@ -33,6 +33,7 @@ class SequenceOptions:
     """which of the objects that the weights know."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
+    device: Device = "cpu"
 
     def refuse_unusable(self) -> None:
         """Refuse none of the three kinds of input, or several, and several processes.
@@ -53,12 +54,7 @@ class SequenceOptions:
 Frames = Annotated[SequenceOptions, tyro.conf.OmitArgPrefixes]
 
 
-def track(
-    out: Path,
-    weights: str = "parts",
-    frames: Frames = SequenceOptions(),
-    device: Device = "cpu",
-) -> int:
+def track(out: Path, weights: str = "parts", frames: Frames = SequenceOptions()) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
     Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
@@ -78,7 +74,7 @@ def track(
     from depthpose.cli.pose.tracking import track_bop, track_folder
 
     frames.refuse_unusable()
-    (method,) = pose_methods([weights], EstimateConfig(device=device))
+    (method,) = pose_methods([weights], EstimateConfig(device=frames.device))
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     if frames.bop is not None:
