@@ -201,7 +201,7 @@ def _list_duplicates(rows: list[dict[str, Any]], out: Path | None) -> None:
 def label(
     path: tyro.conf.Positional[Path],
     out: Path,
-    options: Labels = LabelOptions(),
+    labels: Labels = LabelOptions(),
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
@@ -218,11 +218,11 @@ def label(
     from depthpose.depth.datasets import open_dataset
     from depthpose.depth.labels import label_pairs
 
-    config = options.config
+    config = labels.config
     dataset = open_dataset(path)
-    sha256 = file_sha256(find_weights(options.weights))
+    sha256 = file_sha256(find_weights(labels.weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
-    labelled = label_pairs(options.load(), dataset, config, out, settings)
+    labelled = label_pairs(labels.load(), dataset, config, out, settings)
     shares = [share for _, share in _shown(labelled, None, "pairs")]
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
@@ -233,7 +233,7 @@ def export_depth(
     results: tyro.conf.Positional[Path],
     format: Literal["colmap", "nerfstudio"],
     out: Path,
-    options: Exports = ExportOptions(),
+    export: Exports = ExportOptions(),
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 
@@ -253,10 +253,10 @@ def export_depth(
         format: whose files.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
     """
-    options.refuse_unusable(format)
+    export.refuse_unusable(format)
     if format == "colmap":
-        return _export_colmap(results, out, options)
-    return _export_nerfstudio(results, out, options)
+        return _export_colmap(results, out, export)
+    return _export_nerfstudio(results, out, export)
 
 
 def _export_colmap(results: Path, out: Path, options: ExportOptions) -> int:

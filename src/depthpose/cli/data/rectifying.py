@@ -52,7 +52,7 @@ def rectify(
     right: tyro.conf.Positional[str],
     camera: Path,
     out: Path,
-    options: Rectifying = RectifyOptions(),
+    rectifying: Rectifying = RectifyOptions(),
 ) -> int:
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
@@ -78,13 +78,13 @@ def rectify(
     from depthpose.core.files import image_size
     from depthpose.core.run import claim_folder, claim_names
 
-    calibration = options.read(camera)
+    calibration = rectifying.read(camera)
     lefts, rights = list_pairs(left, right)
     _refuse_own_results(out, [*lefts, *rights])
-    rectifier = make_rectifier(calibration, image_size(lefts[0]), options.keep)
+    rectifier = make_rectifier(calibration, image_size(lefts[0]), rectifying.keep)
     pairs = list(zip(lefts, rights, strict=True))
-    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=options.check)
-    claim_folder(out, _settings(calibration, options.keep), [*_SIDES, "camera.json"])
+    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=rectifying.check)
+    claim_folder(out, _settings(calibration, rectifying.keep), [*_SIDES, "camera.json"])
     claim_names(out, {path.stem: path for path in lefts})
     _write_rectified(rectifier, pairs, out)
     print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")

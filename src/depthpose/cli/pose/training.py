@@ -144,7 +144,7 @@ Calibration = Annotated[CalibrationOptions, tyro.conf.OmitArgPrefixes]
 
 
 def calibrate(
-    weights: tyro.conf.Positional[str], out: Path, options: Calibration = CalibrationOptions()
+    weights: tyro.conf.Positional[str], out: Path, calibration: Calibration = CalibrationOptions()
 ) -> int:
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
@@ -162,7 +162,7 @@ def calibrate(
     from depthpose.pose.train import recalibrate
 
     refuse_to_replace(out)
-    print(recalibrate(find_weights(weights), out, options.chosen))
+    print(recalibrate(find_weights(weights), out, calibration.chosen))
     print(f"calibrated weights: {out}")
     return 0
 
