@@ -154,20 +154,21 @@ def main(words: Sequence[str] | None = None) -> int:
         with _notices_in_a_line():
             return _run(name, rest)
     except (InputError, MissingExtraError) as error:
-        print(f"depthpose: error: {error}", file=sys.stderr)
-        return 2
+        return _fail(f"error: {error}")
     except OSError as error:
         if error.errno not in _OF_THE_DISK:
             raise
-        print(f"depthpose: error: {_said_of(error)}", file=sys.stderr)
-        return 2
+        return _fail(f"error: {_said_of(error)}")
     except KeyboardInterrupt as stop:
-        said = str(stop) or "interrupted"
-        print(f"depthpose: {said}; what was finished is kept", file=sys.stderr)
-        return 130
+        return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
         if "depthpose.core.hold" in sys.modules:
             sys.modules["depthpose.core.hold"].release_folders()
+
+
+def _fail(reason: str, code: int = 2) -> int:
+    print(f"depthpose: {reason}", file=sys.stderr)
+    return code
 
 
 def _said_of(error: OSError) -> str:
@@ -257,10 +258,7 @@ def _explain(given: list[str]) -> int:
     group = given[0] if given and not given[0].startswith("-") else ""
     known = {name.partition(" ")[0] for name in COMMANDS}
     if group and group not in known:
-        print(
-            f"depthpose: error: no command {group!r}; {nearest_name(group, known)}", file=sys.stderr
-        )
-        return 2
+        return _fail(f"error: no command {group!r}; {nearest_name(group, known)}")
     inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
     verb = next((word for word in given[1:] if not word.startswith("-")), "")
     if group and verb:

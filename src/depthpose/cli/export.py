@@ -4,11 +4,7 @@ from pathlib import Path
 from typing import Any
 
 
-def export_depth(
-    out: Path,
-    weights: str = "default",
-    what: str | None = None,
-) -> int:
+def export_depth(out: Path, weights: str = "default", what: str | None = None) -> int:
     """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
 
     The graph does all that the estimator does, at any size: one image and its K to metres, sky and

@@ -1,15 +1,36 @@
 """``depthpose serve``."""
 
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from depthpose.cli.help import group
 from depthpose.core.errors import InputError, MissingExtraError
 
 
-def serve(
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    weights: str = "default",
-    pose_weights: str = "parts",
-    max_upload_mb: int = 64,
-) -> int:
+@group
+@dataclass(frozen=True, kw_only=True)
+class ServeOptions:
+    """Where the page is, and what answers."""
+
+    host: str = "127.0.0.1"
+    """127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can use the
+    page: there is no password and no encryption."""
+    port: int = 8000
+    """of the page; 0 takes a free one."""
+    weights: str = "default"
+    """of the depth networks, by name or file ('depthpose weights list')."""
+    pose_weights: str = "parts"
+    """of a pose network, by name or file."""
+    max_upload_mb: int = 64
+    """all files of one request together [1e6 bytes]."""
+
+
+Page = Annotated[ServeOptions, tyro.conf.OmitArgPrefixes]
+
+
+def serve(page: Page = ServeOptions()) -> int:
     """Serve a page for your browser: drop an image, a pair, a depth image or a cloud onto it.
 
     Tab Depth: depth, the synthesised right view, confidence and a cloud. Tab Pose: votes, the posed
@@ -19,31 +40,29 @@ def serve(
 
         depthpose serve
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
-
-    Args:
-        host: 127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can
-            use the page: there is no password and no encryption.
-        port: of the page; 0 takes a free one.
-        weights: of the depth networks, by name or file ('depthpose weights list').
-        pose_weights: of a pose network, by name or file.
-        max_upload_mb: all files of one request together [1e6 bytes].
     """
     try:
-        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
+        from depthpose.web import Limits, known_names, make_app, open_socket, taken_address
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.pose.estimator import GeoPoseNet
 
-    if max_upload_mb < 1:
-        raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
-    taken = open_socket(host, port)
+    if page.max_upload_mb < 1:
+        raise InputError(f"--max-upload-mb {page.max_upload_mb}: take 1 at least; 64 is usual")
+    taken = open_socket(page.host, page.port)
+    names = known_names(page.host, taken_address(taken))
+    limits = Limits(upload_bytes=page.max_upload_mb * 10**6, hosts=names)
+    depth = FakestereoNet.load(page.weights, with_unlike=True)
+    return _answer(make_app(depth, GeoPoseNet.load(page.pose_weights), limits), taken)
+
+
+def _answer(app: Any, taken: Any) -> int:  # noqa: ANN401  types of the extra
+    """Print the address, and answer until Ctrl+C."""
+    from depthpose.web import run, taken_address
+
     address = taken_address(taken)
-    limits = Limits(upload_bytes=max_upload_mb * 10**6, hosts=known_names(host, address))
-    app = make_app(
-        FakestereoNet.load(weights, with_unlike=True), GeoPoseNet.load(pose_weights), limits
-    )
     shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:

@@ -1,9 +1,12 @@
 """``depthpose weights ...``."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 import tyro
+
+from depthpose.core.errors import InputError
 
 
 def list_weights(folder: Path | None = None) -> int:
@@ -95,7 +98,9 @@ def import_weights(
     from depthpose.core.run import refuse_to_replace
 
     refuse_to_replace(out)
-    if kind == "fcgf":
+    if kind == "psmnet":
+        _import_psmnet(file, out, align_corners)
+    elif kind == "fcgf":
         from depthpose.pose.network import import_fcgf
 
         import_fcgf(file, out, classes=classes)
@@ -103,21 +108,22 @@ def import_weights(
         from depthpose.pose.resnet import import_resnet18
 
         import_resnet18(file, out)
-    elif kind == "efficientnet-lite0":
+    else:
         from depthpose.depth.synthesis.lite0 import import_lite0
 
         import_lite0(file, out)
-    else:
-        from depthpose.core.errors import InputError
-        from depthpose.depth.stereo import import_psmnet
-
-        if align_corners is None:
-            raise InputError(
-                "weights import psmnet needs --align-corners true (weights of 2018) or false "
-                "(of 2021): the file does not say, and a wrong choice costs about a pixel."
-            )
-        import_psmnet(file, out, align_corners=align_corners == "true")
     return show_weights(str(out))
+
+
+def _import_psmnet(file: Path, out: Path, align_corners: str | None) -> None:
+    from depthpose.depth.stereo import import_psmnet
+
+    if align_corners is None:
+        raise InputError(
+            "weights import psmnet needs --align-corners true (weights of 2018) or false "
+            "(of 2021): the file does not say, and a wrong choice costs about a pixel."
+        )
+    import_psmnet(file, out, align_corners=align_corners == "true")
 
 
 def pack_weights(
@@ -188,11 +194,9 @@ def complete_weights(
     refuse_to_replace(out)
     path = find_weights(weights)
     numbers = known_numbers(path)
-    if models.is_file() and len(numbers) == 1:
-        meshes = {numbers[0]: read_model(models, unit, number=numbers[0])}
-    else:
-        meshes = read_bop_models(models, numbers)
-    complete(path, meshes, out)
+    is_one = models.is_file() and len(numbers) == 1
+    one = {number: read_model(models, unit, number=number) for number in numbers if is_one}
+    complete(path, one or read_bop_models(models, numbers), out)
     return show_weights(str(out))
 
 
@@ -216,22 +220,32 @@ def push_weights(
     """
     from depthpose.core import hub
     from depthpose.core.checkpoint import find_weights, read_checkpoint
-    from depthpose.core.errors import InputError
-    from depthpose.core.files import read_text
-    from depthpose.core.loop import card_text
 
     path = find_weights(weights)
     facts = read_checkpoint(path).facts
-    if terms := facts.get("terms", ""):
-        print(f"{weights}: {terms}")
-        if not accept_terms:
-            raise InputError(
-                f"{weights}: has terms for passing it on, printed above. If you may, add "
-                "--accept-terms."
-            )
-    card = path.with_suffix(".md")
-    text = read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))
-    url = hub.push_weights(path, hub.readme_of(text, facts), repository, is_private=not public)
-    print(f"{url}: {path.name} ({path.stat().st_size / 1e6:.1f} MB) and its card; load them by "
-          f"hf://{repository}")  # fmt: skip
+    _print_terms(weights, facts.get("terms", ""), is_accepted=accept_terms)
+    readme = hub.readme_of(_card(path, facts), facts)
+    url = hub.push_weights(path, readme, repository, is_private=not public)
+    size = f"{path.stat().st_size / 1e6:.1f} MB"
+    print(f"{url}: {path.name} ({size}) and its card; load them by hf://{repository}")
     return 0
+
+
+def _print_terms(weights: str, terms: str, *, is_accepted: bool) -> None:
+    """Print the terms of weights, if any, and refuse to pass them on without the user's word."""
+    if terms:
+        print(f"{weights}: {terms}")
+    if terms and not is_accepted:
+        raise InputError(
+            f"{weights}: has terms for passing it on, printed above. If you may, add "
+            "--accept-terms."
+        )
+
+
+def _card(path: Path, facts: Mapping[str, str]) -> str:
+    """Read the card beside a weights file, or write one of its facts."""
+    from depthpose.core.files import read_text
+    from depthpose.core.loop import card_text
+
+    card = path.with_suffix(".md")
+    return read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))

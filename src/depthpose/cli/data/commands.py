@@ -3,13 +3,84 @@
 import math
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from depthpose.cli.help import group
+from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:
+    from depthpose.depth.estimator import FakestereoNet
+    from depthpose.depth.labels import LabelConfig
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions:
+    """What matches the pairs, and what counts as known."""
+
+    weights: str = "default"
+    """with a matcher, by name or file; their terms hold for the labels too."""
+    device: Device = "cpu"
+    max_difference_px: float = 1.0
+    """largest difference of the two views' disparities."""
+    max_difference_share: float = 0.03
+    """the same as a share of the disparity; the larger limit counts."""
+    min_confidence: float = 0.5
+    """least confidence of the matcher."""
+
+    @property
+    def config(self) -> "LabelConfig":
+        """Limits of the labels."""
+        from depthpose.depth.labels import LabelConfig  # --help must not load torch
+
+        return LabelConfig(
+            largest_difference_px=self.max_difference_px,
+            largest_share=self.max_difference_share,
+            least_confidence=self.min_confidence,
+        )
+
+    def load(self) -> "FakestereoNet":
+        """Build the matcher of the weights."""
+        from depthpose.depth.config import MatcherConfig
+        from depthpose.depth.estimator import FakestereoNet  # --help must not load torch
+
+        return FakestereoNet.load(self.weights, config=MatcherConfig(device=self.device))
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Whose files are written."""
+
+    files: Literal["png", "npy"] = "png"
+    """of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all."""
+    images: Path | None = None
+    """of colmap: folder that image names are relative to; by default that of each image."""
+    scale: float = 1.0
+    """units of the reconstruction in a metre."""
+
+    def refuse_unusable(self, format: str) -> None:
+        """Refuse a scale out of its range, and images of another format.
+
+        Raises:
+            InputError: which, and the rule.
+        """
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise InputError(
+                f"--scale {self.scale:g}: units a metre are positive; 1 where metres are meant"
+            )
+        if self.images is not None and format != "colmap":
+            raise InputError(f"--images {self.images} is for --format colmap; remove it")
+
+
+Labels = Annotated[LabelOptions, tyro.conf.OmitArgPrefixes]
+Exports = Annotated[ExportOptions, tyro.conf.OmitArgPrefixes]
 
 
 def check(
@@ -17,14 +88,13 @@ def check(
 ) -> int:
     """Read a data set and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
 
-    A line for each file that is missing, truncated or of the wrong size, then a summary. Exit code
-    0: nothing wrong. 1: something is. 2: the layout of the folder is unknown.
+    Prints a line for each file that is missing, truncated or of the wrong size, and a summary.
+    Exit code 0: nothing wrong. 1: something is. 2: the layout of the folder is unknown.
 
     Args:
         path: the dataset's folder.
-        split: check only these frames: eigen-train, eigen-val, eigen-train-val, eigen-test,
-            eigen-benchmark, or a file of monodepth's or monodepth2's form; of a BOP dataset, one
-            of its splits.
+        split: only these frames: eigen-train, -val, -train-val, -test, -benchmark, or a file of
+            monodepth's or monodepth2's form; of a BOP dataset, one of its splits.
         with_decoding: decode every image in full, which finds truncation; off reads headers only.
     """
     from tqdm import tqdm
@@ -34,11 +104,7 @@ def check(
 
     check_folder = check_bop if is_bop(path) else check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+        show = partial(_show_done, bar)
         report = check_folder(path, split, with_decoding=with_decoding, progress=show)
     for problem in (*report.notices, *report.problems):
         print(f"{problem.kind}: {problem.path}: {problem.message}")
@@ -46,18 +112,18 @@ def check(
     return 0 if report.is_ok else 1
 
 
+def _show_done(bar: Any, done: int, total: int) -> None:  # noqa: ANN401  tqdm's
+    bar.total = total
+    bar.update(done - bar.n)
+
+
 def pack(
-    path: tyro.conf.Positional[Path],
-    out: Path,
-    split: str | None = None,
-    shard_mb: int = 256,
+    path: tyro.conf.Positional[Path], out: Path, split: str | None = None, shard_mb: int = 256
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
 
-    OUT, or a URL to which it was copied (s3://, gs://), can be used wherever a data set can.
-    Samples are read by index; a remote shard is cached in ~/.cache/depthpose or $DEPTHPOSE_CACHE
-    when it is first read. Files are copied unchanged. index.json is written last; after an
-    interruption packing begins again.
+    OUT, or a URL of its copy (s3://, gs://), is used as any data set; a URL's shards are cached in
+    ~/.cache/depthpose or $DEPTHPOSE_CACHE. Files are unchanged. Interrupted, packing begins again.
 
         depthpose data pack KITTI --split eigen-train-val --out shards
 
@@ -103,41 +169,39 @@ def duplicates(
         at_least: least similarity of a listed pair; 0.3 by default.
         out: folder to write the list to as well: duplicates.json, .csv and .md.
     """
-    from dataclasses import asdict
-
     from tqdm import tqdm
 
-    from depthpose.core.run import claim_folder
     from depthpose.depth.datasets import DUPLICATE_LIKENESS, find_duplicates, open_dataset
-    from depthpose.report.tables import markdown_table, table_files, write_table
 
     threshold = DUPLICATE_LIKENESS if at_least is None else at_least
     if not -1 <= threshold <= 1:
         raise InputError(f"--at-least {threshold:g}: a likeness is -1 .. 1; take 0.3")
     first, second = open_dataset(train), open_dataset(evaluation)
-    ranked = find_duplicates(
-        first, second, threshold, lambda frames: tqdm(frames, unit=" frames", disable=None)
-    )
+    show = partial(tqdm, unit=" frames", disable=None)
+    ranked = find_duplicates(first, second, threshold, show)
     rows = [asdict(pair) for pair in ranked if pair.likeness >= threshold]
-    if rows:
-        print(markdown_table(rows))
-    if out is not None:
-        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
-        write_table(out, rows, name="duplicates")
+    _list_duplicates(rows, out)
     likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
     what = f"{len(first)} x {len(second)} images"
     print(f"{what}: {len(rows)} pairs of likeness {threshold:g} or more; {likest}")
     return 1 if rows else 0
 
 
+def _list_duplicates(rows: list[dict[str, Any]], out: Path | None) -> None:
+    from depthpose.core.run import claim_folder
+    from depthpose.report.tables import markdown_table, table_files, write_table
+
+    if rows:
+        print(markdown_table(rows))
+    if out is not None:
+        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
+        write_table(out, rows, name="duplicates")
+
+
 def label(
     path: tyro.conf.Positional[Path],
     out: Path,
-    weights: str = "default",
-    device: str = "cpu",
-    max_difference_px: float = 1.0,
-    max_difference_share: float = 0.03,
-    min_confidence: float = 0.5,
+    labels: Labels = LabelOptions(),
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
@@ -149,34 +213,17 @@ def label(
     Args:
         path: a dataset with right views and calibration.
         out: folder to write to.
-        weights: with a matcher, by name or file; their terms hold for the labels too.
-        device: cpu, cuda, cuda:1, ...
-        max_difference_px: largest difference of the two views' disparities.
-        max_difference_share: the same as a share of the disparity; the larger limit counts.
-        min_confidence: least confidence of the matcher.
     """
-    from tqdm import tqdm
-
     from depthpose.core.checkpoint import file_sha256, find_weights
-    from depthpose.depth.config import MatcherConfig
     from depthpose.depth.datasets import open_dataset
-    from depthpose.depth.estimator import FakestereoNet
-    from depthpose.depth.labels import LabelConfig, label_pairs
+    from depthpose.depth.labels import label_pairs
 
-    config = LabelConfig(
-        largest_difference_px=max_difference_px,
-        largest_share=max_difference_share,
-        least_confidence=min_confidence,
-    )
+    config = labels.config
     dataset = open_dataset(path)
-    settings = {
-        "dataset": dataset.name,
-        "weights_sha256": file_sha256(find_weights(weights)),
-        **asdict(config),
-    }
-    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
-    labelled = label_pairs(net, dataset, config, out, settings)
-    shares = [share for _, share in tqdm(labelled, unit=" pairs", leave=False, disable=None)]
+    sha256 = file_sha256(find_weights(labels.weights))
+    settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
+    labelled = label_pairs(labels.load(), dataset, config, out, settings)
+    shares = [share for _, share in _shown(labelled, None, "pairs")]
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
     return 0
@@ -186,9 +233,7 @@ def export_depth(
     results: tyro.conf.Positional[Path],
     format: Literal["colmap", "nerfstudio"],
     out: Path,
-    files: Literal["png", "npy"] = "png",
-    images: Path | None = None,
-    scale: float = 1.0,
+    export: Exports = ExportOptions(),
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 
@@ -197,7 +242,6 @@ def export_depth(
     nerfstudio: OUT/depths/NAME.png or .npy in millimetres, 0 where nothing is known. Where OUT
     holds transforms.json, transforms_depth.json is written beside it, with depth_file_path of
     each frame: ns-train depth-nerfacto --data OUT/transforms_depth.json.
-
     Depth is in metres; a reconstruction from images alone has another unit: --scale is the number
     of its units in a metre.
 
@@ -208,39 +252,50 @@ def export_depth(
         results: folder of predictions.
         format: whose files.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
-        files: of nerfstudio: png holds at most 65.535 m, farther pixels are unknown; npy holds all.
-        images: of colmap: folder that image names are relative to; by default that of each image.
-        scale: units of the reconstruction in a metre.
     """
+    export.refuse_unusable(format)
+    if format == "colmap":
+        return _export_colmap(results, out, export)
+    return _export_nerfstudio(results, out, export)
+
+
+def _export_colmap(results: Path, out: Path, options: ExportOptions) -> int:
     from depthpose.core.run import claim_folder
     from depthpose.depth import exchange
 
-    if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"--scale {scale:g}: units a metre are positive; 1 where metres are meant")
-    if images is not None and format != "colmap":
-        raise InputError(f"--images {images} is for --format colmap; remove it")
-    settings = {"command": "data export-depth", "results": str(results.resolve()), "scale": scale}
-    if format == "colmap":
-        named = exchange.colmap_files(results, images)
-        claim_folder(out, {**settings, "format": format}, named.values())
-        _count(exchange.write_colmap(results, out, named, scale), len(named))
-        print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
-        return 0
-    named = exchange.nerfstudio_files(results, files)
+    named = exchange.colmap_files(results, options.images)
+    claim_folder(out, _export_settings(results, options, "colmap"), named.values())
+    list(_shown(exchange.write_colmap(results, out, named, options.scale), len(named), "frames"))
+    print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
+    return 0
+
+
+def _export_nerfstudio(results: Path, out: Path, options: ExportOptions) -> int:
+    from depthpose.core.run import claim_folder
+    from depthpose.depth import exchange
+
+    named = exchange.nerfstudio_files(results, options.files)
     frames = exchange.nerfstudio_frames(out, named)
-    own = {**settings, "format": format, "files": files}
+    own = {**_export_settings(results, options, "nerfstudio"), "files": options.files}
     claim_folder(out, own, [*named.values(), exchange.TRANSFORMS_DEPTH])
-    lost = sum(_count(exchange.write_nerfstudio(results, out, named, scale), len(named)))
+    written = exchange.write_nerfstudio(results, out, named, options.scale)
+    lost = sum(_shown(written, len(named), "frames"))
     if frames is not None:
         exchange.write_transforms(out, frames)
     _say_nerfstudio(out, len(named), lost, is_listed=frames is not None)
     return 0
 
 
-def _count(written: "Iterable[Any]", total: int) -> list[Any]:
+def _export_settings(results: Path, options: ExportOptions, format: str) -> dict[str, Any]:
+    folder = str(results.resolve())
+    own = {"command": "data export-depth", "results": folder, "scale": options.scale}
+    return {**own, "format": format}
+
+
+def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[Any]":
     from tqdm import tqdm
 
-    return list(tqdm(written, total=total, unit=" frames", leave=False, disable=None))
+    return tqdm(written, total=total, unit=f" {what}", leave=False, disable=None)
 
 
 def _say_nerfstudio(out: Path, frames: int, lost: int, *, is_listed: bool) -> None:

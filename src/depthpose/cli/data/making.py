@@ -1,9 +1,13 @@
 """``depthpose data make ...``."""
 
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
+
+from depthpose.cli.help import group
 from depthpose.core.errors import InputError
 
 _FRAMES_A_SCENE = 50
@@ -11,18 +15,89 @@ _SCENES_A_SEED = 1000
 
 if TYPE_CHECKING:
     from depthpose.depth.config import StreetsConfig
+    from depthpose.pose.config import ObjectsConfig
+    from depthpose.pose.types import ObjectModel
 
 
-def make_streets(
-    out: Path,
-    number: int = 100,
-    first: int = 0,
-    seed: int = 0,
-    scale: float = 1.0,
-    with_antialiasing: bool = True,
-    with_lidar: bool = True,
-    clutter_share: float = 0.0,
-) -> int:
+@group
+@dataclass(frozen=True, kw_only=True)
+class StreetsOptions:
+    """Which streets are rendered, and how."""
+
+    number: int = 100
+    """how many frames."""
+    first: int = 0
+    """number of the first one."""
+    seed: int = 0
+    """of the random streets, and number of the drives."""
+    scale: float = 1.0
+    """size of the images: 0.5 gives half as many rows and columns."""
+    with_antialiasing: bool = True
+    """smooth edges."""
+    with_lidar: bool = True
+    """scan each scene with a LiDAR of 64 beams."""
+    clutter_share: float = 0.0
+    """share of scenes that show random shapes before a ground, a wall or in a box instead of a
+    street; for training matchers."""
+
+    @property
+    def config(self) -> "StreetsConfig":
+        """Settings of the streets.
+
+        Raises:
+            InputError: a value is out of its range.
+        """
+        from depthpose.depth.config import StreetsConfig
+
+        if self.number < 1 or self.first < 0 or not 0 <= self.seed <= 9999:
+            raise InputError(
+                f"--number {self.number} --first {self.first} --seed {self.seed}: at least 1 "
+                "frame, from 0 on, and a seed of four digits at most"
+            )
+        own = {k: v for k, v in asdict(self).items() if k not in ("number", "first")}
+        return StreetsConfig(**own)
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class ObjectsOptions:
+    """Which frames are rendered, and how."""
+
+    unit: Literal["m", "mm"] = "mm"
+    """of the numbers in the files."""
+    number: int = 100
+    """how many frames."""
+    split: str = "train"
+    """name of the part of the data set."""
+    seed: int = 0
+    """of the random frames."""
+    distance: tuple[float, float] = (0.6, 1.1)
+    """nearest and farthest view [m]."""
+    sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light"
+    """whose errors the depth has."""
+    symmetries: Literal["none", "found"] = "none"
+    """found: declare the symmetries that are found from a part's shape; none: only print them."""
+
+    @property
+    def config(self) -> "ObjectsConfig":
+        """Settings of the frames.
+
+        Raises:
+            InputError: a value is out of its range.
+        """
+        from depthpose.pose.config import ObjectsConfig, SensorConfig
+
+        sensor = SensorConfig(kinds=(self.sensor,))
+        return ObjectsConfig(
+            seed=self.seed, distance_m=self.distance, sensor=sensor, number=self.number
+        )
+
+
+Streets = Annotated[StreetsOptions, tyro.conf.OmitArgPrefixes]
+Objects = Annotated[ObjectsOptions, tyro.conf.OmitArgPrefixes]
+
+
+def make_streets(out: Path, streets: Streets = StreetsOptions()) -> int:
     """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
     Existing frames are skipped, so an interrupted run can be resumed, and several
@@ -31,56 +106,30 @@ def make_streets(
 
     Args:
         out: folder to write to.
-        number: how many frames.
-        first: number of the first one.
-        seed: of the random streets, and number of the drives.
-        scale: size of the images: 0.5 gives half as many rows and columns.
-        with_antialiasing: smooth edges.
-        with_lidar: scan each scene with a LiDAR of 64 beams.
-        clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
-            instead of a street; for training matchers.
     """
     from tqdm import tqdm
 
     from depthpose.core.run import claim_folder
-    from depthpose.depth.config import StreetsConfig
     from depthpose.depth.datasets import has_raw_frame
     from depthpose.depth.synthetic import rig_number
 
-    if number < 1 or first < 0 or not 0 <= seed <= 9999:
-        raise InputError(
-            f"--number {number} --first {first} --seed {seed}: at least 1 frame, from 0 on, and a "
-            "seed of four digits at most"
-        )
-    config = StreetsConfig(
-        seed=seed,
-        scale=scale,
-        clutter_share=clutter_share,
-        with_antialiasing=with_antialiasing,
-        with_lidar=with_lidar,
-    )
+    config = streets.config
     # Seeds have drives of their own, so they may share a folder.
     days = [_day(day) for day in range(1, 6)]
     claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
-    indices = range(first, first + number)
+    indices = range(streets.first, streets.first + streets.number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
     wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
     for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
         _make_street(out, drives[index], config, index)
-    print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
+    print(f"{out}: {len(wanted)} frames made, {streets.number - len(wanted)} were there")
     return 0
 
 
 def make_objects(
     cad: tuple[Path, ...],
     out: Path,
-    unit: Literal["m", "mm"] = "mm",
-    number: int = 100,
-    split: str = "train",
-    seed: int = 0,
-    distance: tuple[float, float] = (0.6, 1.1),
-    sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light",
-    symmetries: Literal["none", "found"] = "none",
+    frames: Objects = ObjectsOptions(),
 ) -> int:
     """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
 
@@ -92,56 +141,71 @@ def make_objects(
     Args:
         cad: model files with a surface or points; the first is object 1.
         out: folder to write to.
-        unit: of the numbers in the files.
-        number: how many frames.
-        split: name of the part of the data set.
-        seed: of the random frames.
-        distance: nearest and farthest view [m].
-        sensor: whose errors the depth has.
-        symmetries: found: declare the symmetries that are found from a part's shape; none: only
-            print them.
     """
-    from tqdm import tqdm
-
-    from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
-    from depthpose.pose.config import ObjectsConfig, SensorConfig
-    from depthpose.pose.datasets import write_bop_models, write_bop_scene
-    from depthpose.pose.mesh import read_model, with_found_symmetries
-    from depthpose.pose.synthetic import make_frames
+    from depthpose.pose.datasets import write_bop_models
 
-    if number < 1:
-        raise InputError(f"--number {number}: at least 1 frame")
-    models = [
-        with_found_symmetries(
-            read_model(path, unit, number=i), tqdm.write, is_taken=symmetries == "found"
-        )
-        for i, path in enumerate(cad, start=1)
-    ]
-    config = ObjectsConfig(
-        seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number
-    )
-    said = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
-    files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
-    settings = {**said, "cad": files, "unit": unit, "symmetries": symmetries}
-    claim_folder(out, settings, ["models", split])
+    if frames.number < 1:
+        raise InputError(f"--number {frames.number}: at least 1 frame")
+    models = _read_models(cad, frames)
+    claim_folder(out, _object_settings(cad, frames), ["models", frames.split])
     write_bop_models(out, models)
-    scenes = [
-        range(first, min(first + _FRAMES_A_SCENE, number))
-        for first in range(0, number, _FRAMES_A_SCENE)
-    ]
-    # Of another seed, other scenes: they may share a folder.
-    number_of = {scene: seed * _SCENES_A_SEED + scene.start // _FRAMES_A_SCENE for scene in scenes}
-    wanted = [scene for scene in scenes if not _is_made(out / split, number_of[scene], scene)]
-    with tqdm(total=sum(map(len, wanted)), unit=" frames", leave=False, disable=None) as bar:
-        for scene in wanted:
-            frames = []
-            for frame in make_frames(models, config, len(scene), scene.start):
-                frames.append(frame)
-                bar.update()
-            write_bop_scene(out, split, number_of[scene], frames)
+    scenes = _scenes(frames)
+    wanted = {k: v for k, v in scenes.items() if not _is_made(out / frames.split, k, v)}
+    _make_scenes(wanted, models, frames, out)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
     return 0
+
+
+def _read_models(cad: Sequence[Path], options: ObjectsOptions) -> "list[ObjectModel]":
+    from tqdm import tqdm
+
+    from depthpose.pose.mesh import read_model, with_found_symmetries
+
+    is_taken = options.symmetries == "found"
+    read = [read_model(path, options.unit, number=i) for i, path in enumerate(cad, start=1)]
+    return [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in read]
+
+
+def _object_settings(cad: Sequence[Path], options: ObjectsOptions) -> dict[str, Any]:
+    """What decides the frames of a folder; of another seed, other scenes: they may share it."""
+    from depthpose.core.config import config_to_dict
+
+    own = {k: v for k, v in config_to_dict(options.config).items() if k not in ("number", "seed")}
+    files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
+    return {**own, "cad": files, "unit": options.unit, "symmetries": options.symmetries}
+
+
+def _scenes(options: ObjectsOptions) -> dict[int, range]:
+    """Give the frames of each scene by its number."""
+    starts = range(0, options.number, _FRAMES_A_SCENE)
+    return {
+        options.seed * _SCENES_A_SEED + k: range(
+            first, min(first + _FRAMES_A_SCENE, options.number)
+        )
+        for k, first in enumerate(starts)
+    }
+
+
+def _make_scenes(
+    scenes: Mapping[int, range],
+    models: "Sequence[ObjectModel]",
+    options: ObjectsOptions,
+    out: Path,
+) -> None:
+    from tqdm import tqdm
+
+    from depthpose.pose.datasets import write_bop_scene
+    from depthpose.pose.synthetic import make_frames
+
+    total = sum(map(len, scenes.values()))
+    with tqdm(total=total, unit=" frames", leave=False, disable=None) as bar:
+        for number, scene in scenes.items():
+            frames = []
+            for frame in make_frames(models, options.config, len(scene), scene.start):
+                frames.append(frame)
+                bar.update()
+            write_bop_scene(out, options.split, number, frames)
 
 
 def _fingerprint(path: Path) -> dict[str, str]:

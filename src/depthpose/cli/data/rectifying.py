@@ -1,11 +1,13 @@
 """``depthpose data rectify``."""
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from depthpose.cli.help import group
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,15 +22,37 @@ _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class RectifyOptions:
+    """What the calibration says, and what is kept of the images."""
+
+    unit: Literal["m", "mm"] = "m"
+    """of the translation between the cameras; mm if the calibration board was given in mm."""
+    fisheye: bool = False
+    """the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it."""
+    keep: float = 0.0
+    """0 keeps only what the raw images show, 1 all of it, with black borders."""
+    check: bool = True
+    """refuse what is swapped or differs by more than a row."""
+
+    def read(self, camera: Path) -> "RawPair":
+        """Read the calibration of both cameras."""
+        from depthpose.core.camera import read_raw_pair
+
+        unit_m = 0.001 if self.unit == "mm" else 1.0
+        return read_raw_pair(camera, unit_m=unit_m, is_fisheye=self.fisheye or None)
+
+
+Rectifying = Annotated[RectifyOptions, tyro.conf.OmitArgPrefixes]
+
+
 def rectify(
     left: tyro.conf.Positional[str],
     right: tyro.conf.Positional[str],
     camera: Path,
     out: Path,
-    unit: Literal["m", "mm"] = "m",
-    fisheye: bool = False,
-    keep: float = 0.0,
-    check: bool = True,
+    rectifying: Rectifying = RectifyOptions(),
 ) -> int:
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
@@ -48,34 +72,35 @@ def rectify(
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.
         out: folder for the results.
-        unit: of the translation between the cameras; mm if the calibration board was given in mm.
-        fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it.
-        keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
-        check: refuse what is swapped or differs by more than a row.
     """
-    from tqdm import tqdm
-
     from depthpose.cli.depth.matching import list_pairs
-    from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
-    from depthpose.core.files import image_size, write_image
+    from depthpose.core.camera import make_rectifier
+    from depthpose.core.files import image_size
     from depthpose.core.run import claim_folder, claim_names
 
-    calibration = read_raw_pair(
-        camera, unit_m=0.001 if unit == "mm" else 1.0, is_fisheye=True if fisheye else None
-    )
+    calibration = rectifying.read(camera)
     lefts, rights = list_pairs(left, right)
     _refuse_own_results(out, [*lefts, *rights])
-    rectifier = make_rectifier(calibration, image_size(lefts[0]), keep)
+    rectifier = make_rectifier(calibration, image_size(lefts[0]), rectifying.keep)
     pairs = list(zip(lefts, rights, strict=True))
-    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=check)
-    claim_folder(out, _settings(calibration, keep), [*_SIDES, "camera.json"])
+    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=rectifying.check)
+    claim_folder(out, _settings(calibration, rectifying.keep), [*_SIDES, "camera.json"])
     claim_names(out, {path.stem: path for path in lefts})
+    _write_rectified(rectifier, pairs, out)
+    print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
+    return 0
+
+
+def _write_rectified(rectifier: "Rectifier", pairs: list[tuple[Path, Path]], out: Path) -> None:
+    from tqdm import tqdm
+
+    from depthpose.core.camera import write_camera
+    from depthpose.core.files import write_image
+
     for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
         for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
             write_image(out / side / f"{first.stem}.png", image)
     write_camera(out / "camera.json", rectifier.rig)
-    print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
-    return 0
 
 
 def _measure(rectifier: "Rectifier", pairs: list[tuple[Path, Path]]) -> "EpipolarResidual":

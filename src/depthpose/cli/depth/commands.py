@@ -15,7 +15,9 @@ from depthpose.cli.depth.options import (
     Networks,
     Output,
     PairMatching,
+    PairNetworks,
     PairOptions,
+    Pairs,
     PredictOutput,
     Protocol,
     ProtocolOptions,
@@ -108,11 +110,8 @@ def match(
     *,
     camera: Path,
     out: str,
-    weights: str | None = None,
-    matcher: str | None = None,
-    matching: MatchMatching = MatchOptions(),  # noqa: B008  frozen
-    cloud: bool = False,
-    check: bool = True,
+    pairs: Pairs = PairNetworks(),  # noqa: B008  frozen
+    matching: MatchMatching = MatchOptions(),  # noqa: B008
     engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
     """Match real stereo pairs to metric depth.
@@ -133,17 +132,12 @@ def match(
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
         out: folder for the results.
-        weights: weights with a matcher, by name or file; 'default' unless sgbm matches.
-        matcher: what matches the two views: sgbm (OpenCV's, which needs no weights), or weights
-            with a matcher, by name or file. Left out, or psmnet: that of the weights.
-        cloud: write a coloured point cloud, NAME.cloud.ply.
-        check: look at the first pair for swapped or unrectified images before any work.
     """
     from depthpose.cli.depth import matching as pairs_of
     from depthpose.cli.depth import methods
     from depthpose.core.run import refuse_among_inputs
 
-    weights = _weights_that_match(weights, matcher)
+    weights = pairs.used
     config = matching.config
     if weights is None and config != MatcherConfig():
         raise InputError(
@@ -151,34 +145,20 @@ def match(
             "matchers with weights; sgbm takes none."
         )
     if engine.is_ray:
-        return _match_on_ray(left, right, camera, weights, config, out, engine, cloud, check)
+        return _match_on_ray(left, right, camera, weights, config, out, engine, pairs)
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    pairs = pairs_of.Pairs.find(left, right, camera)
-    refuse_among_inputs(Path(out), (left, right), (*pairs.left, *pairs.right))
-    if check:
-        pairs_of.refuse_unusable_first(pairs)
+    found = pairs_of.Pairs.find(left, right, camera)
+    refuse_among_inputs(Path(out), (left, right), (*found.left, *found.right))
+    if pairs.check:
+        pairs_of.refuse_unusable_first(found)
     if weights is None:
         method = methods.sgbm_method(with_filled_holes=False)
     else:
         method = methods.weights_method(weights, config, with_right=True)
     if matching.tile is not None:
-        pairs_of.say_tile_change(pairs, method)
-    return pairs_of.match_all(pairs, method, Path(out), with_cloud=cloud)
-
-
-def _weights_that_match(weights: str | None, matcher: str | None) -> str | None:
-    """Name the weights whose matcher matches; None where sgbm does."""
-    from depthpose.depth.stereo import is_own_matcher
-
-    if is_own_matcher(matcher):
-        return "default" if weights is None else weights
-    if weights is not None:
-        raise InputError(
-            f"--weights {weights} and --matcher {matcher}: one of the two matches the pair; leave "
-            "the other away"
-        )
-    return None if matcher == "sgbm" else matcher
+        pairs_of.say_tile_change(found, method)
+    return pairs_of.match_all(found, method, Path(out), with_cloud=pairs.cloud)
 
 
 def _match_on_ray(
@@ -189,8 +169,7 @@ def _match_on_ray(
     config: MatcherConfig,
     out: str,
     on: EngineOptions,
-    cloud: bool,
-    check: bool,
+    pairs: PairNetworks,
 ) -> int:
     from depthpose.cli.depth import engine as engine_depth
 
@@ -201,7 +180,9 @@ def _match_on_ray(
         with_sgbm=False,
     )
     words = [left] if right is None else [left, right]
-    return engine_depth.match(words, camera, recipe, out, on, with_cloud=cloud, with_check=check)
+    return engine_depth.match(
+        words, camera, recipe, out, on, with_cloud=pairs.cloud, with_check=pairs.check
+    )
 
 
 def evaluate(

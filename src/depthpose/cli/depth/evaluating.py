@@ -112,10 +112,7 @@ def measure(
     out: Path,
     ready: Sequence[Evaluation] = (),
 ) -> int:
-    """Measure the predictions, write rows.json, rows.csv, table.md and report.html, and print.
-
-    Rows that are ``ready`` stand below the others.
-    """
+    """Measure, write rows, a table and a page, and print; rows that are ``ready`` come last."""
     if find_shard().rank > 0:
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 from tqdm import tqdm
@@ -68,23 +69,9 @@ def weights_method(
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
     if not is_matcher:
         facts["sees"] = "both views" if is_shown else "left view"
-    if matcher == "sgbm":
-        facts["matcher"] += " with sgbm"
-        sgbm = SGBMConfig(with_filled_holes=True)
-        net = FakestereoNet.load(
-            path, matcher="sgbm", config=sgbm, answer="matched", with_unlike=with_unlike
-        )
-        return Method(f"{path.stem}-sgbm", net, {**facts, **config_to_dict(sgbm)}, is_shown)
-    config = replace(config, device=own_device(config.device))
     if not is_own_matcher(matcher):
-        other = find_weights(str(matcher))
-        facts["matcher"] += f" with {other.stem}"
-        facts["matcher_sha256"] = file_sha256(other)
-        net = FakestereoNet.load(
-            path, matcher=other, config=config, answer="matched", with_unlike=with_unlike
-        )
-        name = f"{path.stem}-{other.stem}"
-        return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+        return _matched_by(path, str(matcher), config, facts, is_shown, with_unlike)
+    config = replace(config, device=own_device(config.device))
     net = FakestereoNet.load(path, config=config, answer=answer, with_unlike=with_unlike)
     if is_shown and net.matcher is None:
         raise InputError(
@@ -96,6 +83,28 @@ def weights_method(
         facts["answer"] = answer
         name += f"-{answer}"
     return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+
+
+def _matched_by(
+    path: Path,
+    matcher: str,
+    config: MatcherConfig,
+    facts: dict[str, str],
+    is_shown: bool,
+    with_unlike: bool,
+) -> Method:
+    """Build the network of weights whose drawn view is matched by OpenCV, or by other weights."""
+    if matcher == "sgbm":
+        name, other, used = "sgbm", "sgbm", SGBMConfig(with_filled_holes=True)
+    else:
+        other = find_weights(matcher)
+        name, used = other.stem, replace(config, device=own_device(config.device))
+        facts["matcher_sha256"] = file_sha256(other)
+    facts["matcher"] += f" with {name}"
+    net = FakestereoNet.load(
+        path, matcher=other, config=used, answer="matched", with_unlike=with_unlike
+    )
+    return Method(f"{path.stem}-{name}", net, {**facts, **config_to_dict(used)}, is_shown)
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:

@@ -73,6 +73,40 @@ class MatchOptions(PairOptions):
 
 @group
 @dataclass(frozen=True, kw_only=True)
+class PairNetworks:
+    """What matches real pairs, whether the first is checked, and what is written."""
+
+    weights: str | None = None
+    """weights with a matcher, by name or file; 'default' unless sgbm matches."""
+    matcher: str | None = None
+    """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
+    matcher, by name or file. Left out, or psmnet: that of the weights."""
+    cloud: bool = False
+    """write a coloured point cloud, NAME.cloud.ply."""
+    check: bool = True
+    """look at the first pair for swapped or unrectified images before any work."""
+
+    @property
+    def used(self) -> str | None:
+        """The weights whose matcher matches; None where sgbm does.
+
+        Raises:
+            InputError: both options are given.
+        """
+        from depthpose.depth.stereo import is_own_matcher  # --help must not load torch
+
+        if is_own_matcher(self.matcher):
+            return "default" if self.weights is None else self.weights
+        if self.weights is not None:
+            raise InputError(
+                f"--weights {self.weights} and --matcher {self.matcher}: one of the two matches "
+                "the pair; leave the other away"
+            )
+        return None if self.matcher == "sgbm" else self.matcher
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
 class ImageNetworks:
     """Which networks answer depth of one image."""
 
@@ -192,6 +226,7 @@ class ProtocolOptions:
 Matching = Annotated[MatcherOptions, tyro.conf.OmitArgPrefixes]
 PairMatching = Annotated[PairOptions, tyro.conf.OmitArgPrefixes]
 MatchMatching = Annotated[MatchOptions, tyro.conf.OmitArgPrefixes]
+Pairs = Annotated[PairNetworks, tyro.conf.OmitArgPrefixes]
 Networks = Annotated[ImageNetworks, tyro.conf.OmitArgPrefixes]
 Output = Annotated[PredictOutput, tyro.conf.OmitArgPrefixes]
 Methods = Annotated[MethodOptions, tyro.conf.OmitArgPrefixes]

@@ -62,46 +62,34 @@ def frame_sections(
         rows: of each folder's frames, as they were measured.
         protocol: by which.
     """
-    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
     for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
         cap_m = of_folder[0].cap_m
         of_cap = [row for row in of_folder if row.cap_m == cap_m]
         metric = ranking_metric(cap_m)
         sign = 1 if metric.better == "lower" else -1
+        cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
         for role, k in choose_ranked([sign * row.metrics[metric.name] for row in of_cap], most):
-            row = of_cap[k]
-            cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
-            text = (
-                f"The {role} of {_count(len(of_cap), 'frame')} by {metric.name}: "
-                f"{row.metrics[metric.name]:.4f}{cap}."
-            )
-            title = f"{folder.name}: {row.frame}, {role}"
-            index = places[row.frame]
-            section = _frame_section(dataset, index, folder, (protocol, cap_m), title, text)
-            columns = row.to_dict()
-            own = {name: value for name, value in columns.items() if name not in _SAID_ABOVE}
-            sections.append(replace(section, rows=[own]))
+            value = of_cap[k].metrics[metric.name]
+            frames = _count(len(of_cap), "frame")
+            text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
+            title = f"{folder.name}: {of_cap[k].frame}, {role}"
+            sections.append(_frame_section(dataset, of_cap[k], folder, protocol, title, text))
     return sections
 
 
 def _frame_section(
-    dataset: Dataset,
-    index: int,
-    folder: Path,
-    how: tuple[str, float | None],
-    title: str,
-    text: str,
+    dataset: Dataset, row: FrameRow, folder: Path, protocol: str, title: str, text: str
 ) -> Section:
-    protocol, cap_m = how
-    found = frame_result(dataset, index, folder, protocol, cap_m)
+    index = next(i for i, frame in enumerate(dataset.frames) if frame.name == row.frame)
+    found = frame_result(dataset, index, folder, protocol, row.cap_m)
+    is_disparity = PROTOCOLS[protocol].truth == "disparity"
     error = DepthError(
-        error=found.error,
-        is_disparity=PROTOCOLS[protocol].truth == "disparity",
-        true_depth_m=found.true_depth_m,
+        error=found.error, is_disparity=is_disparity, true_depth_m=found.true_depth_m
     )
-    pair = dataset.read_input(index)
-    return depth_section(title, DepthShown(pair=pair, estimate=found.estimate, error=error), text)
+    shown = DepthShown(pair=dataset.read_input(index), estimate=found.estimate, error=error)
+    own = {name: value for name, value in row.to_dict().items() if name not in _SAID_ABOVE}
+    return replace(depth_section(title, shown, text), rows=[own])
 
 
 def _count(number: int, what: str) -> str:

@@ -1,12 +1,14 @@
 """``depthpose depth train view|select|stereo|finetune``."""
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from depthpose.cli.options import Training, TrainingOptions, changed
+from depthpose.cli.help import group
+from depthpose.cli.options import Device, Training, TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
@@ -15,16 +17,72 @@ _LOOKED_AT = 20
 """Held-out pairs of a folder, by default."""
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class PairsOptions:
+    """What a training learns from."""
+
+    data: tuple[str, ...] = ()
+    """folders of pairs; they replace the config's."""
+    held_out: tuple[str, ...] = ()
+    """folders of pairs for validation, none of which is learnt from; of each 20, evenly taken,
+    unless the config sets another number."""
+
+    def applied(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
+        """Give the config of a training with these folders."""
+        from depthpose.depth.config import PairsConfig
+
+        pairs = changed(chosen.pairs, folders=self.data or None)
+        if not self.held_out:
+            return dataclasses.replace(chosen, pairs=pairs)
+        held_out = chosen.held_out or PairsConfig(
+            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
+        )
+        held_out = dataclasses.replace(held_out, folders=self.held_out)
+        return dataclasses.replace(chosen, pairs=pairs, held_out=held_out)
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class BeginningOptions:
+    """Weights that a training begins with."""
+
+    generator: str | None = None
+    """finetune: weights of the generator to begin with."""
+    matcher: str | None = None
+    """finetune: what matches the drawn view: weights with a matcher, by name or file, which are not
+    changed."""
+    start: str | None = None
+    """view, select, stereo: weights to begin with."""
+    encoder: str | None = None
+    """select: weights of the encoder to begin with, of 'depthpose weights import
+    efficientnet-lite0'."""
+
+    def applied(self, chosen: Any, stage: str) -> Any:  # noqa: ANN401 - any config of a training
+        """Give the config of a stage with these weights.
+
+        Raises:
+            InputError: the stage takes none of these.
+        """
+        settings = {field.name for field in dataclasses.fields(chosen)}
+        if stage != "finetune":
+            settings -= {"generator", "matcher"}
+        for name, value in vars(self).items():
+            if value is not None and name not in settings:
+                raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
+        return changed(chosen, **vars(self))
+
+
+Pairs = Annotated[PairsOptions, tyro.conf.OmitArgPrefixes]
+Beginning = Annotated[BeginningOptions, tyro.conf.OmitArgPrefixes]
+
+
 def train(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: Path,
     config: Path | None = None,
-    data: tuple[str, ...] = (),
-    held_out: tuple[str, ...] = (),
-    generator: str | None = None,
-    matcher: str | None = None,
-    start: str | None = None,
-    encoder: str | None = None,
+    pairs: Pairs = PairsOptions(),
+    beginning: Beginning = BeginningOptions(),
     training: Training = TrainingOptions(),  # noqa: B008  frozen
 ) -> int:
     """Train a generator, the matcher, or the first through the second, by stages.
@@ -46,40 +104,15 @@ def train(
         stage: what is trained: view, select, stereo or finetune.
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
-        data: folders of pairs; they replace the config's.
-        held_out: folders of pairs for validation, none of which is learnt from; of
-            each 20, evenly taken, unless the config sets another number.
-        generator: finetune: weights of the generator to begin with.
-        matcher: finetune: what matches the drawn view: weights with a matcher, by name or file,
-            which are not changed.
-        start: view, select, stereo: weights to begin with.
-        encoder: select: weights of the encoder to begin with, of 'depthpose weights import
-            efficientnet-lite0'.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
-    from depthpose.depth.config import PairsConfig
     from depthpose.depth.train import STAGES, Run
 
     kind, run_stage = STAGES[stage]
     chosen = kind() if config is None else read_config(config, kind)
-    loop = training.applied(chosen.loop)
-    pairs = changed(chosen.pairs, folders=data or None)
-    if held_out:
-        looked_at = chosen.held_out or PairsConfig(
-            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
-        )
-        chosen = dataclasses.replace(
-            chosen, held_out=dataclasses.replace(looked_at, folders=held_out)
-        )
-    words = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
-    settings = {field.name: field.type for field in dataclasses.fields(kind)}
-    for word, value in words.items():
-        if value is not None and (
-            word not in settings or (word in ("generator", "matcher") and stage != "finetune")
-        ):
-            raise InputError(f"--{word} has no meaning for '{stage}'; see --help.")
-    chosen = changed(dataclasses.replace(chosen, loop=loop, pairs=pairs), **words)
+    chosen = dataclasses.replace(chosen, loop=training.applied(chosen.loop))
+    chosen = beginning.applied(pairs.applied(chosen), stage)
     with progress_bar(training.view) as on_step:
         run = Run(folder=out, resume=training.resume, finish=training.finish, on_step=on_step)
         path = run_stage(chosen, run)
@@ -94,7 +127,7 @@ def calibrate(
     out: Path,
     alarm_share: float = 0.01,
     split: str | None = None,
-    device: str = "cpu",
+    device: Device = "cpu",
 ) -> int:
     """Choose when one image is refused as unlike what weights know.
 
@@ -109,7 +142,6 @@ def calibrate(
         out: the file of the calibrated weights.
         alarm_share: share of these images that may be refused.
         split: name or file of a split, for the first folder.
-        device: cpu, cuda, cuda:1, ...
     """
     from tqdm import tqdm
 

@@ -82,22 +82,10 @@ def _predict_here(
     view: str | None,
 ) -> int:
     """Pose clouds, or masked depth images, in this process."""
-    from depthpose.cli.pose import inputs, predicting
+    from depthpose.cli.pose import predicting
     from depthpose.cli.pose.page import write_pose_page
 
-    name = inputs.object_named(given.object, method)
-    if given.cloud is not None:
-        unit = given.unit or "m"
-        jobs = inputs.cloud_jobs(Path(given.cloud), unit, name, out)
-        settings: dict[str, Any] = {"unit": unit}
-    elif given.depth is None or given.mask is None or given.camera is None:
-        raise InputError("--depth needs --camera beside it, and --mask unless it is to be found")
-    else:
-        files = (Path(given.depth), Path(given.mask), given.camera)
-        jobs = inputs.view_jobs(files, name, given.unit, out)
-        settings = {"camera": str(given.camera.resolve()), "mask": str(files[1].resolve())}
-        settings |= {} if given.unit is None else {"unit": given.unit}
-    settings = {**method.settings, "object": name, **settings}
+    jobs, settings = _jobs_of(method, given, out)
     predicting.claim(out, settings, jobs, Path(given.cloud or given.depth or out))
     predictions = predicting.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
@@ -105,6 +93,28 @@ def _predict_here(
     predicting.write_files(predictions, jobs, out, method)
     write_pose_page(out, predictions, jobs, method)
     return predicting.say_result(predictions, out)
+
+
+def _jobs_of(
+    method: Any,  # noqa: ANN401
+    given: OneObjectOptions,
+    out: Path,
+) -> tuple[list[Any], dict[str, Any]]:
+    """List the inputs, and what decides their results."""
+    from depthpose.cli.pose import inputs
+
+    name = inputs.object_named(given.object, method)
+    settings = {**method.settings, "object": name}
+    if given.cloud is not None:
+        unit = given.unit or "m"
+        jobs = inputs.cloud_jobs(Path(given.cloud), unit, name, out)
+        return jobs, {**settings, "unit": unit}
+    if given.depth is None or given.mask is None or given.camera is None:
+        raise InputError("--depth needs --camera beside it, and --mask unless it is to be found")
+    files = (Path(given.depth), Path(given.mask), given.camera)
+    jobs = inputs.view_jobs(files, name, given.unit, out)
+    settings |= {"camera": str(given.camera.resolve()), "mask": str(files[1].resolve())}
+    return jobs, settings | ({} if given.unit is None else {"unit": given.unit})
 
 
 def evaluate(

@@ -1,5 +1,6 @@
 """``depthpose pose predict`` of depth images without masks."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,22 +47,27 @@ def find_all(
     settings: dict[str, Any] = {**method.settings, "find": sorted(objects)}
     settings |= {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
     claim(out, settings, [], depth)
-    predictions: list[Prediction] = []
-    jobs: list[Job[Any]] = []
+    found: list[tuple[Prediction, Job[Any]]] = []
     for path in tqdm(depths, disable=None, unit=" images"):
         view = view_input(path, None, camera, objects[0], path.stem, unit)
-        for estimate in method.find(view, objects) or [
-            nothing_found(view.name, ", ".join(objects))
-        ]:
-            predictions.append(Prediction(estimate=estimate))
-            jobs.append(explained_job(Job(name=path.stem, read=lambda v=view: v), estimate, method))
+        found += _find(method, view, objects)
+    predictions, jobs = [prediction for prediction, _ in found], [job for _, job in found]
     claim(out, settings, jobs, depth)
     write_predictions(out, predictions)
-    shown = [k for k, p in enumerate(predictions) if p.estimate.is_ok]
-    answers, own = [predictions[k] for k in shown], [jobs[k] for k in shown]
+    answered = [pair for pair in found if pair[0].estimate.is_ok]
+    answers, own = [prediction for prediction, _ in answered], [job for _, job in answered]
     write_files(answers, own, out, method)
     write_pose_page(out, answers, own, method)
     return say_result(predictions, out)
+
+
+def _find(
+    method: PoseMethod, view: ViewInput, objects: tuple[str, ...]
+) -> Iterator[tuple[Prediction, Job[Any]]]:
+    assert method.find is not None
+    whole = Job[Any](name=view.name, read=lambda: view)
+    for one in method.find(view, objects) or [nothing_found(view.name, ", ".join(objects))]:
+        yield Prediction(estimate=one), explained_job(whole, one, method)
 
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:

@@ -51,31 +51,38 @@ def write_pose_page(
         method: by which.
         dataset: that they are of, if they are of one.
     """
-    instances = () if dataset is None else dataset.instances
-    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
-    models = {model.name: model for model in method.models}
-    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
-    answered = [predictions[k].estimate.is_ok for k in readable]
-    chosen = [readable[k] for k in choose_answers(answered)]
-    sections: list[Section] = []
-    for k in chosen:
-        given = jobs[k].read()
-        if isinstance(given, Unreadable):  # by now; it was read when it was estimated
-            continue
-        estimate, place = predictions[k].estimate, predictions[k].place
-        rgb = None if place is None else image_of[place[:2]]
-        shown = PoseShown(
-            given=given,
-            estimate=estimate,
-            model=models[estimate.object],
-            image=None if rgb is None else read_image(rgb),
-        )
-        sections.append(pose_section(estimate.name, shown))
+    sections = _answer_sections(predictions, jobs, method, dataset)
     sections.insert(0, _results(predictions, len(sections)))
     page = out / PAGE
     number = len(predictions)
     write_page(page, f"Poses of {number} input{'s' * (number != 1)}", sections, environment())
     print(f"the page: {page}")
+
+
+def _answer_sections(
+    predictions: Sequence[Prediction],
+    jobs: Sequence[Job[Any]],
+    method: PoseMethod,
+    dataset: BopDataset | None,
+) -> list[Section]:
+    """Show some of the inputs that could be read, answered and refused."""
+    instances = () if dataset is None else dataset.instances
+    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
+    models = {model.name: model for model in method.models}
+    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
+    answered = [predictions[k].estimate.is_ok for k in readable]
+    sections: list[Section] = []
+    for k in (readable[chosen] for chosen in choose_answers(answered)):
+        given = jobs[k].read()
+        if isinstance(given, Unreadable):  # by now; it was read when it was estimated
+            continue
+        estimate, place = predictions[k].estimate, predictions[k].place
+        rgb = None if place is None else image_of[place[:2]]
+        image = None if rgb is None else read_image(rgb)
+        model = models[estimate.object]
+        shown = PoseShown(given=given, estimate=estimate, model=model, image=image)
+        sections.append(pose_section(estimate.name, shown))
+    return sections
 
 
 def instance_sections(

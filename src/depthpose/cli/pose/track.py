@@ -1,23 +1,60 @@
 """``depthpose pose track``."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
+
+from depthpose.cli.help import group
+from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, Unit
 
 
-def track(
-    out: Path,
-    weights: str = "parts",
-    depth: Path | None = None,
-    camera: Path | None = None,
-    cloud: Path | None = None,
-    bop: Path | None = None,
-    split: str = "test",
-    object: str | None = None,
-    unit: Unit | None = None,
-    device: str = "cpu",
-) -> int:
+@group
+@dataclass(frozen=True, kw_only=True)
+class SequenceOptions:
+    """The frames, and what is followed in them."""
+
+    depth: Path | None = None
+    """folder of 16-bit PNG files, whole images without masks."""
+    camera: Path | None = None
+    """of the depth images; a JSON file, as for 'pose predict'."""
+    cloud: Path | None = None
+    """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of what is
+    about it too. A lost object is found in clouds of it alone."""
+    bop: Path | None = None
+    """folder of a data set in BOP's layout; every object of each scene is followed that the weights
+    know, or --object alone."""
+    split: str = "test"
+    """of the data set."""
+    object: str | None = None
+    """which of the objects that the weights know."""
+    unit: Unit | None = None
+    """of the clouds, metres by default; of depth images, where their camera says none."""
+    device: Device = "cpu"
+
+    def refuse_unusable(self) -> None:
+        """Refuse none of the three kinds of input, or several, and several processes.
+
+        Raises:
+            InputError: which, and the rule.
+        """
+        from depthpose.core.run import find_shard
+
+        if sum(given is not None for given in (self.depth, self.cloud, self.bop)) != 1:
+            raise InputError("give one of --depth with --camera, --cloud and --bop")
+        if self.depth is not None and self.camera is None:
+            raise InputError("--depth needs --camera beside it")
+        if find_shard().world > 1:
+            raise InputError("a sequence is followed by one process; start one")
+
+
+Frames = Annotated[SequenceOptions, tyro.conf.OmitArgPrefixes]
+
+
+def track(out: Path, weights: str = "parts", frames: Frames = SequenceOptions()) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
     Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
@@ -32,30 +69,15 @@ def track(
     Args:
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
-        depth: folder of 16-bit PNG files, whole images without masks.
-        camera: of the depth images; a JSON file, as for 'pose predict'.
-        cloud: folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of
-            what is about it too. A lost object is found in clouds of it alone.
-        bop: folder of a data set in BOP's layout; every object of each scene is followed that the
-            weights know, or --object alone.
-        split: of the data set.
-        object: which of the objects that the weights know.
-        unit: of the clouds, metres by default; of depth images, where their camera says none.
-        device: cpu, cuda, cuda:1, ...
     """
     from depthpose.cli.pose.methods import pose_methods
     from depthpose.cli.pose.tracking import track_bop, track_folder
-    from depthpose.core.run import find_shard
 
-    if sum(given is not None for given in (depth, cloud, bop)) != 1:
-        raise InputError("give one of --depth with --camera, --cloud and --bop")
-    if depth is not None and camera is None:
-        raise InputError("--depth needs --camera beside it")
-    if find_shard().world > 1:
-        raise InputError("a sequence is followed by one process; start one")
-    (method,) = pose_methods([weights], EstimateConfig(device=device))
+    frames.refuse_unusable()
+    (method,) = pose_methods([weights], EstimateConfig(device=frames.device))
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
-    if bop is not None:
-        return track_bop(method, (bop, split, object), out)
-    return track_folder(method, (depth, camera, cloud), object, unit, out)
+    if frames.bop is not None:
+        return track_bop(method, (frames.bop, frames.split, frames.object), out)
+    files = (frames.depth, frames.camera, frames.cloud)
+    return track_folder(method, files, frames.object, frames.unit, out)

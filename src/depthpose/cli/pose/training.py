@@ -1,15 +1,20 @@
 """``depthpose pose train`` and ``pose calibrate``."""
 
 import dataclasses
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from depthpose.cli.help import group
 from depthpose.cli.options import Training, TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
+
+if TYPE_CHECKING:
+    from depthpose.pose.train import PoseTraining
 
 _START = "parts"
 """The weights that ship and may go with any licence."""
@@ -18,15 +23,57 @@ _NOTHING = "nothing"
 """The word for no weights."""
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class LearntOptions:
+    """What is learnt, and from what."""
+
+    cad: tuple[str, ...] = ()
+    """model files; one network learns them all."""
+    unit: Literal["m", "mm"] | None = None
+    """of the numbers in the files."""
+    symmetries: Literal["none", "found"] | None = None
+    """found looks whether the part looks alike from several sides, and counts these poses as one;
+    without, you are told of what is found."""
+    data: str | None = None
+    """folder of a data set; it takes the place of the config's, for models and frames."""
+    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
+    """which network; all but pose are compared with it, or cut the object out for it."""
+    start: str | None = None
+    """weights to begin with, by name or file. A CAD file without a config begins with 'parts',
+    which saves two thirds of the first minutes; 'nothing' begins anew."""
+
+    def applied(self, chosen: Any, config: Path | None) -> Any:  # noqa: ANN401 - any config
+        """Give the config of a training, or the default where no file was named, with these."""
+        start = self.start
+        if start is None and self.what == "pose" and self.cad and config is None:
+            start = _START
+        if start is not None:
+            chosen = dataclasses.replace(chosen, start=None if start == _NOTHING else start)
+        if self.cad or self.unit or self.symmetries:
+            chosen = dataclasses.replace(chosen, models=self._models(chosen))
+        return chosen if self.data is None else _with_data(chosen, self.data)
+
+    def _models(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
+        if self.what == "segmentation":
+            raise InputError(
+                "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
+                "'depthpose data make objects --cad ...' and name the folder in the config"
+            )
+        taken = changed(chosen.models, cad=self.cad or None, unit=self.unit)
+        if self.cad:  # they take the place of a data set's models
+            taken = dataclasses.replace(taken, bop=None, objects=(), parts=())
+        found = None if self.symmetries is None else self.symmetries == "found"
+        return changed(taken, with_found_symmetries=found)
+
+
+Learnt = Annotated[LearntOptions, tyro.conf.OmitArgPrefixes]
+
+
 def train(
     out: Path,
-    cad: tuple[str, ...] = (),
-    unit: Literal["m", "mm"] | None = None,
-    symmetries: Literal["none", "found"] | None = None,
     config: Path | None = None,
-    data: str | None = None,
-    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose",
-    start: str | None = None,
+    learnt: Learnt = LearntOptions(),
     workers: int | None = None,
     training: Training = TrainingOptions(),  # noqa: B008  frozen
 ) -> int:
@@ -43,35 +90,19 @@ def train(
 
     Args:
         out: the run folder.
-        cad: model files; one network learns them all.
-        unit: of the numbers in the files.
-        symmetries: found looks whether the part looks alike from several sides, and counts these
-            poses as one; without, you are told of what is found.
         config: YAML with what differs from the defaults.
-        data: folder of a data set; it takes the place of the config's, for models and frames.
-        what: which network; all but pose are compared with it, or cut the object out for it.
-        start: weights to begin with, by name or file. A CAD file without a config begins with
-            'parts', which saves two thirds of the first minutes; 'nothing' begins anew.
         workers: processes that make views beside the one that trains.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
     from depthpose.pose.train import STAGES, Run
 
-    kind, run_stage = STAGES[what]
+    kind, run_stage = STAGES[learnt.what]
     chosen = kind() if config is None else read_config(config, kind)
-    if cad and unit is None:
+    if learnt.cad and learnt.unit is None:
         raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
-    loop = training.applied(chosen.loop, workers=workers)
-    if start is None and what == "pose" and cad and config is None:
-        start = _START
-    chosen = dataclasses.replace(chosen, loop=loop)
-    if start is not None:
-        chosen = dataclasses.replace(chosen, start=None if start == _NOTHING else start)
-    if cad or unit or symmetries:
-        chosen = dataclasses.replace(chosen, models=_models(chosen, what, cad, unit, symmetries))
-    if data is not None:
-        chosen = _with_data(chosen, data)
+    chosen = dataclasses.replace(chosen, loop=training.applied(chosen.loop, workers=workers))
+    chosen = learnt.applied(chosen, config)
     is_first = find_shard().rank == 0
     with progress_bar(training.view) as on_step:
         tell = partial(print, flush=True) if is_first else None
@@ -84,12 +115,36 @@ def train(
     return 0
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class CalibrationOptions:
+    """How the refusal is chosen."""
+
+    config: Path | None = None
+    """YAML of the training: its sensor and distances, and what is not said here."""
+    max_wrong_share: float | None = None
+    """of the answers that are given."""
+    number: int | None = None
+    """views of each object to choose by."""
+
+    @property
+    def chosen(self) -> "PoseTraining":
+        """Settings of the training with these."""
+        from depthpose.core.config import read_config
+        from depthpose.pose.train import PoseTraining
+
+        chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
+        limits = changed(
+            chosen.calibration, max_wrong_share=self.max_wrong_share, number=self.number
+        )
+        return dataclasses.replace(chosen, calibration=limits)
+
+
+Calibration = Annotated[CalibrationOptions, tyro.conf.OmitArgPrefixes]
+
+
 def calibrate(
-    weights: tyro.conf.Positional[str],
-    out: Path,
-    config: Path | None = None,
-    max_wrong_share: float | None = None,
-    number: int | None = None,
+    weights: tyro.conf.Positional[str], out: Path, calibration: Calibration = CalibrationOptions()
 ) -> int:
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
@@ -101,20 +156,13 @@ def calibrate(
     Args:
         weights: a file, a name or hf://OWNER/NAME.
         out: the .safetensors file to write.
-        config: YAML of the training: its sensor and distances, and what is not said here.
-        max_wrong_share: of the answers that are given.
-        number: views of each object to choose by.
     """
     from depthpose.core.checkpoint import find_weights
-    from depthpose.core.config import read_config
     from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.train import PoseTraining, recalibrate
+    from depthpose.pose.train import recalibrate
 
     refuse_to_replace(out)
-    chosen = PoseTraining() if config is None else read_config(config, PoseTraining)
-    knobs = changed(chosen.calibration, max_wrong_share=max_wrong_share, number=number)
-    chosen = dataclasses.replace(chosen, calibration=knobs)
-    print(recalibrate(find_weights(weights), out, chosen))
+    print(recalibrate(find_weights(weights), out, calibration.chosen))
     print(f"calibrated weights: {out}")
     return 0
 
@@ -130,23 +178,3 @@ def _with_data(chosen: Any, data: str) -> Any:  # noqa: ANN401 - any config of a
     if not changes:
         raise InputError(f"--data {data}: the config learns from no data set; see --cad and --what")
     return dataclasses.replace(chosen, **changes)
-
-
-def _models(
-    chosen: Any,  # noqa: ANN401 - any config of a training
-    what: str,
-    cad: tuple[str, ...],
-    unit: str | None,
-    symmetries: str | None,
-) -> Any:  # noqa: ANN401
-    if what == "segmentation":
-        raise InputError(
-            "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
-            "'depthpose data make objects --cad ...' and name the folder in the config"
-        )
-    taken = changed(chosen.models, cad=cad or None, unit=unit)
-    if cad:  # they take the place of a data set's models
-        taken = dataclasses.replace(taken, bop=None, objects=(), parts=())
-    return changed(
-        taken, with_found_symmetries=None if symmetries is None else symmetries == "found"
-    )

@@ -1,8 +1,18 @@
 """``depthpose figure 3-2``, ``3-4`` and ``3-5``."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from depthpose.cli.options import PoseData, PoseDataOptions
+
+if TYPE_CHECKING:
+    from depthpose.cli.thesis.views import Views
+    from depthpose.pose.estimator import GeoPoseNet
+
+_FEATURES = (
+    "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the model "
+    "is black, each cloud posed on it by the truth."
+)
 
 
 def figure_3_2(
@@ -27,17 +37,10 @@ def figure_3_2(
         perplexity: of t-SNE.
     """
     from depthpose.cli.thesis import pose_figures
-    from depthpose.cli.thesis.views import open_views
-    from depthpose.pose.estimator import GeoPoseNet
 
-    net = GeoPoseNet.load(weights)
-    views = open_views(net, data, number, number)
+    net, views = _open(weights, data, number)
     panels = pose_figures.feature_panels(net, views, perplexity)
-    text = (
-        "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
-        "model is black, each cloud posed on it by the truth."
-    )
-    return pose_figures.write_figure("3-2", text, panels, out, columns=4)
+    return pose_figures.write_figure("3-2", _FEATURES, panels, out, columns=4)
 
 
 def figure_3_4(
@@ -62,11 +65,8 @@ def figure_3_4(
         keypoint: only this one, from 0 on.
     """
     from depthpose.cli.thesis import pose_figures
-    from depthpose.cli.thesis.views import open_views
-    from depthpose.pose.estimator import GeoPoseNet
 
-    net = GeoPoseNet.load(weights)
-    views = open_views(net, data, number, number)
+    net, views = _open(weights, data, number)
     panels = pose_figures.field_panels(net, views, keypoint)
     text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
     return pose_figures.write_figure("3-4", text, panels, out, columns=3)
@@ -91,10 +91,15 @@ def figure_3_5(
         number: how many views.
     """
     from depthpose.cli.thesis import pose_figures
+
+    net, views = _open(weights, data, number)
+    panels = pose_figures.box_panels(net, views)
+    return pose_figures.write_figure("3-5", pose_figures.BOXES, panels, out, columns=3)
+
+
+def _open(weights: str, data: PoseDataOptions, number: int) -> "tuple[GeoPoseNet, Views]":
     from depthpose.cli.thesis.views import open_views
     from depthpose.pose.estimator import GeoPoseNet
 
     net = GeoPoseNet.load(weights)
-    views = open_views(net, data, number, number)
-    panels = pose_figures.box_panels(net, views)
-    return pose_figures.write_figure("3-5", pose_figures.BOXES, panels, out, columns=3)
+    return net, open_views(net, data, number, number)

@@ -96,27 +96,29 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Pa
         for k, case in cases.items()
     }
     truths = {k: _true_keypoints(case) for k, case in cases.items()}
-    errors = {k: (votes[k] - truths[k]).norm(dim=-1) for k in cases}
-    count = len(next(iter(truths.values())))
+    index, which = _worst({k: (votes[k] - truths[k]).norm(dim=-1) for k in cases}, keypoint)
+    case, true_m, voted_m = cases[index], truths[index][which], votes[index][which]
+    exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
+    error_mm = 1000 * float((voted_m - true_m).norm())
+    view = views.samples[index]
+    image, _ = close_up(views.picture(index), view.input.mask, view.input.K)
+    predicted = draw_field(case.points_m, case.directions[:, which], true_m, voted_m)
+    said = f"(c) predicted directions; the voted keypoint errs by {error_mm:.1f} mm"
+    return [
+        Panel(f"(a) {view.input.name}, keypoint {which}", image),
+        Panel("(b) true directions and keypoint", draw_field(case.points_m, exact, true_m)),
+        Panel(said, predicted),
+    ]
+
+
+def _worst(errors: dict[int, Float[Tensor, " k"]], keypoint: int | None) -> tuple[int, int]:
+    """Give the view and the keypoint that err most; of one keypoint, the view."""
+    count = len(next(iter(errors.values())))
     if keypoint is not None and not 0 <= keypoint < count:
         raise InputError(f"--keypoint {keypoint}: there are {count}, from 0 on")
     own = {k: e if keypoint is None else e[[keypoint]] for k, e in errors.items()}
     index = max(own, key=lambda k: float(own[k].max()))
-    which = int(errors[index].argmax()) if keypoint is None else keypoint
-    case, true_m, voted_m = cases[index], truths[index][which], votes[index][which]
-    exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
-    error_mm = 1000 * float(errors[index][which])
-    view = views.samples[index]
-    image, _ = close_up(views.picture(index), view.input.mask, view.input.K)
-    name = f"{view.input.name}, keypoint {which}"
-    return [
-        Panel(f"(a) {name}", image),
-        Panel("(b) true directions and keypoint", draw_field(case.points_m, exact, true_m)),
-        Panel(
-            f"(c) predicted directions; the voted keypoint errs by {error_mm:.1f} mm",
-            draw_field(case.points_m, case.directions[:, which], true_m, voted_m),
-        ),
-    ]
+    return index, int(errors[index].argmax()) if keypoint is None else keypoint
 
 
 def box_panels(net: GeoPoseNet, views: Views) -> list[Panel]:

@@ -1,26 +1,67 @@
 """``depthpose reproduce`` and ``depthpose figure``."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from depthpose.cli.depth.options import MatcherOptions, Matching, Protocol, ProtocolOptions
+from depthpose.cli.help import group
 from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+
+if TYPE_CHECKING:
+    from depthpose.cli.depth.methods import Method
+    from depthpose.thesis.depth_tables import PublishedTable
 
 TableNumber = Literal["2.1", "2.2", "2.3"]
 FigureNumber = Literal["2-1", "2-5"]
+
+
+@group
+@dataclass(frozen=True, kw_only=True)
+class RowOptions:
+    """The methods of a table, a row each."""
+
+    weights: tuple[str, ...] = ()
+    """weights files; 2.2 takes a stereo matcher's too."""
+    matcher: Literal["sgbm"] | None = None
+    """sgbm: OpenCV's StereoSGBM as a row of table 2.2."""
+    beside: tuple[str, ...] = ("default",)
+    """tables 2.1 and 2.3: weights of other methods, a row each; by default those that ship.
+    '--beside' without a name: none."""
+    train: tuple[Path, ...] = ()
+    """training folders, for two baselines (best depth of each row, nearest image)."""
+    train_without: tuple[str, ...] = ()
+    """names of training frames to leave out."""
+
+    def methods(self, table: "PublishedTable", config: MatcherConfig) -> "list[tuple[str, Method]]":
+        """Build each method, with the thesis's own row that it stands for, if any."""
+        from depthpose.cli.depth import evaluating, methods
+        from depthpose.cli.thesis.depth_tables import own_methods
+
+        chosen = own_methods(table, self.weights, self.matcher, config)
+        names = {method.name for _, method in chosen}
+        if not table.with_right:
+            others = [methods.weights_method(n, config, with_right=False) for n in self.beside]
+            chosen += [("", other) for other in others if other.name not in names]
+        if self.train:
+            training = evaluating.open_training(self.train, self.train_without)
+            baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
+            # A baseline uses no right image, but is measured on the frames of the other rows.
+            chosen += [("", one._replace(with_right=table.with_right)) for one in baselines]
+        return chosen
+
+
+Rows = Annotated[RowOptions, tyro.conf.OmitArgPrefixes]
 
 
 def reproduce(
     table: tyro.conf.Positional[TableNumber],
     kitti: Path,
     out: Path,
-    weights: tuple[str, ...] = (),
-    matcher: Literal["sgbm"] | None = None,
-    beside: tuple[str, ...] = ("default",),
-    train: tuple[Path, ...] = (),
-    train_without: tuple[str, ...] = (),
+    rows: Rows = RowOptions(),
     split: str = "eigen-test",
     pictures: int = 3,
     comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
@@ -39,16 +80,10 @@ def reproduce(
         table: number in the thesis.
         kitti: KITTI raw with LiDAR; or any folder that 'depth evaluate' takes, with --split all.
         out: folder to write to.
-        weights: weights files; 2.2 takes a stereo matcher's too.
-        matcher: sgbm: OpenCV's StereoSGBM as a row of table 2.2.
-        beside: tables 2.1 and 2.3: weights of other methods, a row each; by default those that
-            ship. '--beside' without a name: none.
-        train: training folders, for two baselines (best depth of each row, nearest image).
-        train_without: names of training frames to leave out.
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth import evaluating, methods
+    from depthpose.cli.depth import evaluating
     from depthpose.cli.thesis import depth_tables as reproducing
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth_tables import find_table
@@ -59,19 +94,9 @@ def reproduce(
         raise InputError(
             f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
         )
-    reproducing.refuse_wrong_count(published, weights, matcher)
+    reproducing.refuse_wrong_count(published, rows.weights, rows.matcher)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
-    config = matching.config
-    chosen = reproducing.own_methods(published, weights, matcher, config)
-    names = {method.name for _, method in chosen}
-    if not published.with_right:
-        others = [methods.weights_method(name, config, with_right=False) for name in beside]
-        chosen += [("", other) for other in others if other.name not in names]
-    if train:
-        training = evaluating.open_training(train, train_without)
-        baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
-        # A baseline uses no right image, but is measured on the frames of the other rows.
-        chosen += [("", one._replace(with_right=published.with_right)) for one in baselines]
+    chosen = rows.methods(published, matching.config)
     order = reproducing.Order(
         table=published,
         dataset=dataset,

@@ -112,12 +112,7 @@ def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
     Raises:
         InputError: frames of the tables are missing, or the folder is that of other settings.
     """
-    from depthpose.cli.depth.evaluating import open_frames
-
-    open_frames(source.data, None if split == "all" else split)  # not only after days of training
-    home = source.out / "depth"
-    _claim(home, source, [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")],
-           {"split": split, "protocol": protocol})  # fmt: skip
+    home = _claim_depth(source, split, protocol)
     generator, matcher = home / "view/generator.safetensors", home / "stereo/matcher.safetensors"
     apart, tuned = home / "apart.safetensors", home / "finetune/fakestereo.safetensors"
     begin = ("--generator", str(generator), "--matcher", str(matcher))
@@ -125,8 +120,7 @@ def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
     how = ("--split", split, "--protocol", protocol)
 
     def trained(stage: str, makes: Path, *more: str, of: Sequence[Path] = ()) -> Step:
-        words = ("depth", "train", stage, *more)
-        return _training(source, words, f"depth/{stage}.yaml", makes, of)
+        return _training(source, ("depth", "train", stage, *more), f"depth/{stage}.yaml", makes, of)
 
     def table(number: str, *weights: Path) -> Step:
         words = ("reproduce", number, "--kitti", str(source.data), *how)
@@ -141,6 +135,17 @@ def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
         trained("finetune", tuned, *begin, of=(generator, matcher)),
         table("2.3", apart, tuned),
     ]
+
+
+def _claim_depth(source: Source, split: str, protocol: str) -> Path:
+    """Claim the folder of the steps from KITTI, whose frames must be there; give it."""
+    from depthpose.cli.depth.evaluating import open_frames
+
+    open_frames(source.data, None if split == "all" else split)  # not only after days of training
+    home = source.out / "depth"
+    configs = [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")]
+    _claim(home, source, configs, {"split": split, "protocol": protocol})
+    return home
 
 
 def pose_steps(source: Source) -> list[Step]:
@@ -164,15 +169,20 @@ def pose_steps(source: Source) -> list[Step]:
         )
         for name, what in _POSE.items()
     ]
-    ours, pointnet, depth_image, masks = (step.makes for step in steps)
+    return [*steps, *_pose_tables(source, home, [step.makes for step in steps])]
+
+
+def _pose_tables(source: Source, home: Path, weights: Sequence[Path]) -> list[Step]:
+    ours, pointnet, depth_image, masks = weights
     shown = ("--no-icp", "--masks", "truth", str(masks))
-    for number, more, weights in (
+    steps: list[Step] = []
+    for number, more, own in (
         ("3.1", shown, (ours, pointnet, depth_image)),
         ("3.2", shown, (ours,)),
         ("3.3", (), (ours,)),
     ):
         words = ("reproduce", number, "--linemod", str(source.data), *more)
-        table = _table(number, words, weights, source, home)
+        table = _table(number, words, own, source, home)
         steps.append(table._replace(of=(*table.of, masks)) if more else table)
     return steps
 

@@ -54,14 +54,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     """
     folder = data.folder
     if folder is None:
-        config = ObjectsConfig(number=synthetic, seed=MADE_SEED)
-        objects = Objects(net.weights.models, config, net.weights.cloud)
-        samples = [objects.view(i) for i in range(synthetic)]
-        return Views(
-            samples=samples,
-            instances=[None] * len(samples),
-            facts={"frames": f"made, seed {MADE_SEED}"},
-        )
+        return _synthetic_views(net, synthetic)
     dataset = pose_evaluating.open_instances(folder, data.split, data.objects, None)
     facts = {
         "frames": f"{folder.resolve().name} {data.split}",
@@ -73,6 +66,14 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     return Views(
         samples=list(_views_of(dataset, net)), instances=list(dataset.instances), facts=facts
     )
+
+
+def _synthetic_views(net: GeoPoseNet, number: int) -> Views:
+    config = ObjectsConfig(number=number, seed=MADE_SEED)
+    objects = Objects(net.weights.models, config, net.weights.cloud)
+    samples = [objects.view(i) for i in range(number)]
+    facts = {"frames": f"made, seed {MADE_SEED}"}
+    return Views(samples=samples, instances=[None] * number, facts=facts)
 
 
 def _views_of(dataset: BopDataset, net: GeoPoseNet) -> Iterator[ViewSample]:
