@@ -15,7 +15,6 @@ from importlib.metadata import version
 from inspect import cleandoc, signature
 
 from depthpose import __version__
-from depthpose.cli.help import refuse_missing
 from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
 
 COMMANDS = {
@@ -226,7 +225,7 @@ def _run(name: str, rest: list[str]) -> int:
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
 
-    from depthpose.cli.help import in_words_of
+    from depthpose.cli.help import in_words_of, refuse_missing
 
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:

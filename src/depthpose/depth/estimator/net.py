@@ -113,10 +113,9 @@ class FakestereoNet:
         Weights whose terms bind the user say so (:class:`LicenceNotice`).
 
         Args:
-            weights: weights of both networks, of the generator alone (then ``matcher`` is
-                needed, for pairs at least), or of PSMNet alone (then real pairs only). None:
-                ``default``, or ``matcher`` alone where that is sgbm, weights or your own.
-                What names weights: :func:`depthpose.core.hub.find_weights`.
+            weights: weights of both networks, of the generator alone (pairs then need a
+                ``matcher``), or of a matcher alone (real pairs only). None: ``default``, or
+                ``matcher`` alone. What names weights: :func:`depthpose.core.hub.find_weights`.
             matcher: a kind such as ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's),
                 weights with a matcher by file or name, or any matcher of your own.
             config: how the matcher runs.
