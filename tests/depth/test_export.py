@@ -124,6 +124,16 @@ def test_depth_from_one_image_is_the_estimators_at_every_size(exported: Path) ->
     assert record["facts"]["licence"] == "MIT"
 
 
+@pytest.mark.filterwarnings("ignore:proof. unlike")
+def test_weights_that_refuse_unlike_images_are_exported(selection: Path) -> None:
+    """The scenes of the proof are unlike what such weights were trained on."""
+    generator = of_all_kinds()
+    generator.config = dataclasses.replace(generator.config, least_confidence=0.99)
+    write_depth_weights(selection / "strict.safetensors", generator=generator, facts=TERMS)
+    words = ["--weights", str(selection / "strict.safetensors")]
+    assert main(["export", "depth", *words, "--out", str(selection / "d.onnx")]) == 0
+
+
 @pytest.mark.slow
 def test_a_pair_needs_no_focal_length_where_the_weights_know_none(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

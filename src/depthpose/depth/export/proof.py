@@ -117,7 +117,8 @@ def _rig_facts(weights: DepthWeights) -> dict[str, Any]:
 def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None
     matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
-    net = FakestereoNet(matcher, make_synthesiser(weights.generator))
+    # The scenes of the proof need not be like the images that the weights were trained on.
+    net = FakestereoNet(matcher, make_synthesiser(weights.generator), with_unlike=True)
     sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
     for size in _SIZES:
         scenes, _ = _scenes(*size)
