@@ -79,7 +79,7 @@ def real_frames(folder: Path, models: Sequence[ObjectModel]) -> Iterator[Frame]:
                 yield Frame(f"{part} {image[1]}", depth_m, here[0].K, shown)
 
 
-def judge(frame: Frame, found: Sequence[PoseEstimate]) -> Row:
+def measure(frame: Frame, found: Sequence[PoseEstimate]) -> Row:
     """Count found instances and answers that fit none."""
     right: set[int] = set()
     wrong = []
@@ -127,7 +127,7 @@ def main() -> None:
             began, cpu = time.perf_counter(), time.process_time()
             found = net.find(frame.depth_m, camera)
             spent = {"s": time.perf_counter() - began, "cpu s": time.process_time() - cpu}
-            rows.append(judge(frame, found) | spent)
+            rows.append(measure(frame, found) | spent)
             print(rows[-1], flush=True)
         total = {key: sum(row[key] for row in rows)
                  for key in ("instances", "right", "missed", "wrong", "s", "cpu s")}  # fmt: skip

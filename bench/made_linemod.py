@@ -193,14 +193,14 @@ def draw(rows: Sequence[Row], out: Path) -> None:
     """Plot success of all objects over each condition, the others at their usual value."""
     usual = Condition()._asdict()
     plots: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for knob, what in (("occlusion", "share of the silhouette that is hidden"),
+    for setting, what in (("occlusion", "share of the silhouette that is hidden"),
                        ("noise", "times the sensor's usual noise"),
                        ("resolution", "times 640 x 480")):  # fmt: skip
         curves: dict[str, list[tuple[float, float]]] = {}
         for row in rows:
-            others_usual = all(row[k] == v for k, v in usual.items() if k != knob)
+            others_usual = all(row[k] == v for k, v in usual.items() if k != setting)
             if row["object"] == "all" and others_usual:
-                curves.setdefault(row["method"], []).append((row[knob], row["success"]))
+                curves.setdefault(row["method"], []).append((row[setting], row["success"]))
         if any(len(points) > 1 for points in curves.values()):
             plots[what] = curves
     if plots:

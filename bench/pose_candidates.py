@@ -70,7 +70,7 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
     return [case for case in found if case is not None], len(views)
 
 
-def judge(cases: Sequence[Case]) -> list[tuple[float, bool]]:
+def measure(cases: Sequence[Case]) -> list[tuple[float, bool]]:
     """Give each case's largest share and whether its candidate is right, cross-validated."""
     pairs: list[tuple[float, bool]] = []
     for fold in range(5):
@@ -94,7 +94,7 @@ def main() -> None:
         every += cases
         first = sum(right == 0 for _, right in cases)
         print(f"{name}: {views} views, {len(cases)} cases, ICP's best right in {first}")
-    pairs = judge(every)
+    pairs = measure(every)
     rows = []
     for low, high in BANDS:
         some = [ok for share, ok in pairs if low <= share < high]

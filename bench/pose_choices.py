@@ -47,16 +47,16 @@ def config_of(arm: str, cad: Path, steps: int, seed: int) -> tuple[str, PoseTrai
     part, change = ARMS[arm]
     stage = "pointnet" if isinstance(change, PointNetConfig) else "pose"
     base = read_config(CONFIG, STAGES["pose"][0])
-    knobs = {name: getattr(base, name) for name in vars(base)}
-    knobs |= {
+    settings = {name: getattr(base, name) for name in vars(base)}
+    settings |= {
         "models": ModelsConfig(cad=(str(cad),), unit="mm"),
         "start": None,
         "held_out": HeldOutConfig(number=200),
         "calibration": CalibrationConfig(number=0),
         "loop": replace(base.loop, steps=steps, validate_every_steps=steps, seed=seed),
-        part: change if stage == "pointnet" else replace(knobs[part], **change),
+        part: change if stage == "pointnet" else replace(settings[part], **change),
     }
-    return stage, STAGES[stage][0](**knobs)
+    return stage, STAGES[stage][0](**settings)
 
 
 def run_arm(arm: str, cad: Path, steps: int, seed: int, out: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ Row = dict[str, Any]
 Method = Callable[[CloudInput], PoseEstimate]
 
 
-def judge(case: RealCase, estimate: PoseEstimate) -> Row:
+def measure(case: RealCase, estimate: PoseEstimate) -> Row:
     """Errors of one estimate in diameters, and the verdict."""
     row: Row = {
         "metric": "ADD-S" if case.is_symmetric else "ADD",
@@ -105,7 +105,7 @@ def run_method(
             began = time.perf_counter()
             estimate = method(case.sample.input)
             seconds = time.perf_counter() - began
-            row = {"instance": case.name, "method": name, "seed": seed, **judge(case, estimate)}
+            row = {"instance": case.name, "method": name, "seed": seed, **measure(case, estimate)}
             rows.append(row | {"seconds": seconds})
     return rows
 

@@ -80,7 +80,7 @@ def train(
     """Train a network on your CAD file, or by a config.
 
     Views of the object are made while it trains: no photograph is needed. At the end the refusal
-    is calibrated and the whole is judged on views that it has not seen; OUT holds the weights with
+    is calibrated and the whole is measured on held-out views; OUT holds the weights with
     the model in them, their card, and all that led there. What stopped a training is made good by
     --resume; --finish, or Ctrl-C twice, makes do with the steps so far. Without a terminal a line
     is printed each minute.
@@ -149,7 +149,7 @@ def calibrate(
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
     A larger share of wrong answers buys more answers. The network stays as it is; the views by
-    which it is then judged are others.
+    which it is then measured are others.
 
         depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
 

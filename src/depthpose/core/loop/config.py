@@ -1,4 +1,4 @@
-"""Knobs of the loop and of Adam, and how a learning rate changes over a training."""
+"""Settings of the loop and of Adam, and how a learning rate changes over a training."""
 
 import math
 from collections.abc import Iterable
