@@ -13,6 +13,7 @@ import threading
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from fnmatch import fnmatch
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib import import_module
@@ -148,9 +149,11 @@ def test_what_starts_is_a_command_with_its_options() -> None:
     (entry,), (first, *options) = (json.loads(of(name)[0]) for name in ("ENTRYPOINT", "CMD"))
     assert entry in PROJECT["project"]["scripts"]
     home, _, function = COMMANDS[first][0].partition(":")
-    known = signature(getattr(import_module(f"depthpose.cli.{home}"), function)).parameters
+    parameters = signature(getattr(import_module(f"depthpose.cli.{home}"), function)).parameters
+    groups = [vars(p.default) for p in parameters.values() if is_dataclass(p.default)]
+    known = set(parameters).union(*groups)
     given = dict(zip(options[::2], options[1::2], strict=True))
-    assert {name.removeprefix("--").replace("-", "_") for name in given} <= set(known)
+    assert {name.removeprefix("--").replace("-", "_") for name in given} <= known
     assert given["--host"] == "0.0.0.0"  # else nothing outside the container reaches it
     assert given["--port"] == of("EXPOSE")[0]
     assert f"127.0.0.1:{given['--port']}/" in of("HEALTHCHECK")[0]
