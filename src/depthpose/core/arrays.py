@@ -1,7 +1,7 @@
 """Shape names, and the units and conventions they carry; rows taken at even steps.
 
-All data are tensors; only files hold bytes. Batched forms put ``*batch`` in front. Invalid values of
-a map are NaN in memory and in NPY files, and 0 in 16-bit PNG files.
+All data are tensors; only files hold bytes. Batched forms put ``*batch`` in front. Invalid values
+of a map are NaN in memory and in NPY files, and 0 in 16-bit PNG files.
 """
 
 import torch
