@@ -21,7 +21,7 @@ from typing import Any, get_args
 import torch
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.synthetic import Objects
@@ -48,7 +48,7 @@ def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
 
 def things(weights: PoseWeights, kind: str, number: int) -> tuple[list[ObjectModel], list[int]]:
     """Give the model in view, and the name of the requested object."""
-    generator = ticket_generator(sum(map(ord, kind)), SEED)
+    generator = sample_generator(sum(map(ord, kind)), SEED)
     asked = [k % len(weights.models) for k in range(number)]
     models = [weights.models[k] for k in asked]
     if kind == ITSELF:

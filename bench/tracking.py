@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.augment import measure, random_rotation
@@ -92,7 +92,7 @@ def background(generator: torch.Generator) -> Tensor:
 
 def sequence(model: ObjectModel, number: int, speed: float, seed: int) -> Iterator[Frame]:
     """Render the frames of one object."""
-    generator = ticket_generator(seed, SEED)
+    generator = sample_generator(seed, SEED)
     behind_m = background(generator)
     triangles = drawn_triangles(model).double()
     middle_m = triangles.reshape(-1, 3).mean(0)

@@ -280,10 +280,10 @@ def test_the_columns_of_a_row_are_its_fields_in_order(pairs: Dataset, tmp_path: 
     depth = ["abs_rel", "sq_rel", "rmse", "rmse_log", "d1", "d2", "d3"]
     first = ["protocol", "dataset"]
     counts = ["pixels", "coverage"]
-    assert list(result.rows[0].to_dict()) == [*first, "cap_m", "frames", *counts, *depth]
-    assert list(result.per_frame[0].to_dict()) == [*first, "frame", "cap_m", *counts, *depth]
+    assert list(result.rows[0].columns()) == [*first, "cap_m", "frames", *counts, *depth]
+    assert list(result.per_frame[0].columns()) == [*first, "frame", "cap_m", *counts, *depth]
     (row,) = evaluate(pairs, folder, "kitti-2015").rows
-    assert list(row.to_dict()) == [*first, "frames", *counts, "epe_px", "d1_all"]
+    assert list(row.columns()) == [*first, "frames", *counts, "epe_px", "d1_all"]
 
 
 def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ def test_our_row_follows_the_printed_ones_and_then_the_difference() -> None:
     assert difference.metrics["abs_rel"] == pytest.approx(0.15 - 0.141)
     assert difference.metrics["rmse"] == pytest.approx(5.0 - 5.20)
     assert difference.protocol == "eigen-raw"
-    assert rows[8].to_dict() == {"source": "ours"} | OURS.to_dict()
-    columns = [list(row.to_dict()) for row in (rows[0], rows[8], difference)]
+    assert rows[8].columns() == {"source": "ours"} | OURS.columns()
+    columns = [list(row.columns()) for row in (rows[0], rows[8], difference)]
     assert columns[0] == [
         "source", "method", "weights", "cap_m", "abs_rel", "sq_rel", "rmse", "rmse_log", "d1",
         "d2", "d3", "protocol", "note",

@@ -7,7 +7,7 @@ import torch
 from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.scale import scale_of
@@ -69,7 +69,7 @@ def test_a_share_beyond_its_range_is_refused() -> None:
 @pytest.mark.parametrize("kind", get_args(NegativeKind))
 def test_negatives_bear_the_name_and_are_something_else(kind: NegativeKind) -> None:
     model = bracket()
-    other = negative_of(model, kind, [model], ticket_generator(1, 0))
+    other = negative_of(model, kind, [model], sample_generator(1, 0))
     assert other.name == model.name
     assert 0.2 < other.diameter_m / model.diameter_m < 3
     if kind in ("scaled", "mirrored"):

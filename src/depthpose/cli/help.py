@@ -1,4 +1,4 @@
-"""Words of a command's ``--help``: what belongs into the place of a value, and what holds without.
+"""The values of options in ``--help``; paths and weights that do not exist, refused early.
 
 Types become words (``{None}|PATH`` is PATH), and a default that is nothing is not shown.
 """

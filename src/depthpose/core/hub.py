@@ -1,6 +1,11 @@
 """Weights by what names them: a file, a folder, a name in the package, or one on the hub.
 
 Nothing heavy is imported here, so that a name that leads nowhere is refused at once.
+
+On the Hugging Face hub a name is ``hf://OWNER/NAME``, ``hf://OWNER/NAME@REVISION`` or
+``hf://OWNER/NAME/FILE.safetensors``, as huggingface_hub's own file system writes it. Nothing else
+is fetched. Files lie in that library's cache, and its settings hold: HF_HOME, HF_ENDPOINT,
+HF_HUB_OFFLINE, the token of ``hf auth login``.
 """
 
 import re

@@ -1,4 +1,7 @@
-"""Random changes that keep a stereo pair a stereo pair."""
+"""Random changes that keep a stereo pair a stereo pair, and degradations of the input alone.
+
+Degradations are what a camera, weather and files do to a picture; truth never changes by them.
+"""
 
 import math
 from io import BytesIO

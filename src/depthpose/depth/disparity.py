@@ -1,4 +1,4 @@
-"""Disparity to depth and back, resizing, warping, and the left-right check."""
+"""Disparity to depth and back, warping, the left-right check, and maps at other sizes."""
 
 import torch
 from jaxtyping import Float

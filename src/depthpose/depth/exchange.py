@@ -1,4 +1,7 @@
-"""Predicted depth as other tools keep it: COLMAP's dense workspace, nerfstudio's data sets."""
+"""Predicted depth as other tools keep it: COLMAP's dense workspace, nerfstudio's data sets.
+
+COLMAP's maps are those of its dense reconstruction (``stereo/depth_maps``).
+"""
 
 import re
 from collections.abc import Iterator, Mapping

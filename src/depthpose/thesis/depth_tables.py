@@ -131,7 +131,7 @@ def _ours(row: MeanRow) -> JoinedRow:
         cap_m=_cap_m(row),
         metrics={name: row.metrics[name] for name in _METRICS},
         protocol=row.protocol,
-        others={name: cell for name, cell in row.to_dict().items() if name not in _FIRST},
+        others={name: cell for name, cell in row.columns().items() if name not in _FIRST},
     )
 
 

@@ -1,4 +1,4 @@
-"""Figure 3-2: what the network makes of each point, as a colour, on the posed cloud."""
+"""Figures 3-2 (features as colours on the posed cloud) and 3-4 (directions to a keypoint)."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What the page shows of one estimate."""
+"""A checked form that a browser sent, and what the page shows of one estimate."""
 
 import math
 import re

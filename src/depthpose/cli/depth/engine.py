@@ -1,4 +1,8 @@
-"""The work behind ``depthpose depth predict|match --engine ray``."""
+"""The work behind ``--engine ray`` of ``depth predict`` and ``match``, and of measuring shards.
+
+Where shards are measured, each frame is measured where its shard is read; the rows of all frames
+are collected here in the order of the data set, and summed as if one process had measured them.
+"""
 
 import json
 import tempfile

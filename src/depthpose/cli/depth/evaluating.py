@@ -39,7 +39,7 @@ def printed_columns() -> list[str]:
 
 def columns(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Give rows as files and pages take them."""
-    return [row.to_dict() for row in rows]
+    return [row.columns() for row in rows]
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:

@@ -88,7 +88,7 @@ def _frame_section(
         error=found.error, is_disparity=is_disparity, true_depth_m=found.true_depth_m
     )
     shown = DepthShown(pair=dataset.read_input(index), estimate=found.estimate, error=error)
-    own = {name: value for name, value in row.to_dict().items() if name not in _SAID_ABOVE}
+    own = {name: value for name, value in row.columns().items() if name not in _SAID_ABOVE}
     return replace(depth_section(title, shown, text), rows=[own])
 
 

@@ -1,4 +1,4 @@
-"""``depthpose depth train view|select|stereo|finetune``."""
+"""``depthpose depth train view|select|stereo|finetune`` and ``depth calibrate``."""
 
 import dataclasses
 from dataclasses import dataclass

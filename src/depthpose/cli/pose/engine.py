@@ -1,4 +1,8 @@
-"""The work behind ``depthpose pose predict --engine ray``."""
+"""The work behind ``depthpose pose predict --engine ray``, ``--bop`` included.
+
+With ``--bop`` workers open the data set themselves, as a mask or a camera is not a file of its own
+there; their estimates come back in shards, and the files of the plain command are made of these.
+"""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,7 @@
-"""Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written."""
+"""Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written.
+
+What a caller has in place of a file, a matrix, a mapping or a focal length, becomes a camera too.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Cameras in plain text: KITTI, Middlebury, pairs of one's own, TUM RGB-D and bare matrices."""
+"""Cameras in text and JSON: KITTI, Middlebury, TUM RGB-D, BOP, bare matrices, and our own."""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,8 @@
-"""Projection, back-projection, and what cropping, scaling and padding do to a camera."""
+"""The two cameras, a pinhole and the left one of a rectified pair, and their geometry.
+
+Projection, back-projection, and what cropping, scaling and padding do to a camera; fundamental and
+essential matrices of a rectified rig (Hartley and Zisserman 2004, chapters 9 and 11).
+"""
 
 import math
 from dataclasses import dataclass, replace

@@ -3,6 +3,10 @@
 Corners of the left image are sought in the right one over a window that a rectified pair does not
 need: rows above and below, columns on both sides. Where they are found tells what was done to the
 pair.
+
+Corners of one image are found in the other by zero-mean normalised cross-correlation, computed by
+FFT (Lewis 1995), of corners chosen by the smaller eigenvalue of the structure tensor (Shi and
+Tomasi 1994). A match is kept where it is good, has no rival and is mutual.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Blocks of inputs, each of which becomes one shard of results; fixed by the first run."""
+"""The inputs of a job, and their blocks, each of which becomes one shard of results.
+
+Inputs are found in folders, patterns, manifests and tar shards; blocks are fixed by the first run.
+"""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Write a graph and its proof, or neither."""
+"""A module to an ONNX model by ``torch.export``; a graph and its proof written, or neither."""
 
 import logging
 import warnings

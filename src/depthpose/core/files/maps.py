@@ -1,4 +1,4 @@
-"""Float maps in NPY and PFM files."""
+"""Float maps in NPY and PFM files; depth and disparity in 16-bit PNG, 0 where unknown."""
 
 import math
 import re

@@ -1,4 +1,7 @@
-"""PLY point files (Turk 1994): text and binary of both byte orders to columns, and back."""
+"""PLY point files (Turk 1994), and the named columns that all binary point files share.
+
+Text and binary of both byte orders are read; little-endian binary is written.
+"""
 
 import re
 from collections.abc import Iterable

@@ -17,7 +17,6 @@ from depthpose.core.loop.task import (
     Turn,
     sample_generator,
     shuffled_index,
-    ticket_generator,
 )
 
 __all__ = [
@@ -38,6 +37,5 @@ __all__ = [
     "run_files",
     "sample_generator",
     "shuffled_index",
-    "ticket_generator",
     "train",
 ]

@@ -1,4 +1,4 @@
-"""The run folder: metrics, pictures, TensorBoard, and the state that a training resumes from.
+"""The run folder: metrics, pictures, TensorBoard, the state to resume from, and the card.
 
 ::
 

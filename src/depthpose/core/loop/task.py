@@ -90,10 +90,6 @@ def sample_generator(sample_index: int, seed: int) -> torch.Generator:
     return _generator(seed, sample_index, 2)
 
 
-ticket_generator = sample_generator
-"""The name of before."""
-
-
 def mixed_seed(*numbers: int) -> int:
     """Mix numbers into one seed, so that neighbours have nothing in common (splitmix64)."""
     state = 0

@@ -1,4 +1,4 @@
-"""To the rig that a generator imitates, or a matcher was trained at, and back."""
+"""The rig of a generator or a matcher and the way there and back; the matcher an estimator gets."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One frame: its truth and its prediction, brought to one size and ready to be compared."""
+"""The named protocols, and one frame: truth and prediction of one size, ready to be compared."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path

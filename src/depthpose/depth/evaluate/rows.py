@@ -14,16 +14,16 @@ class Row:
     A field that is None is no column; a mapping is a column for each of its entries.
     """
 
-    def to_dict(self) -> dict[str, Cell]:
+    def columns(self) -> dict[str, Cell]:
         """Give the columns by name, as files and printed tables hold them."""
-        columns: dict[str, Cell] = {}
+        found: dict[str, Cell] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Mapping):
-                columns |= value
+                found |= value
             elif value is not None:
-                columns[field.name] = value
-        return columns
+                found[field.name] = value
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)

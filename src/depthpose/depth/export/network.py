@@ -1,4 +1,4 @@
-"""The networks in operations that bake no size in: what the exporter is given."""
+"""The networks, and what a synthesiser does around its own, in operations of any size."""
 
 from dataclasses import dataclass
 

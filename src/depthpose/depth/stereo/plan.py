@@ -1,4 +1,7 @@
-"""How much memory a match takes, and how large its slabs may be under a bound."""
+"""How much memory a match takes, slabs that stay below a bound, and matching by tiles.
+
+Tiles take less memory than a whole pair, and only nearly give the same disparity.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

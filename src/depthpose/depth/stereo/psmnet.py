@@ -2,6 +2,8 @@
 
 This is the network as it is trained, said plainly. ``inference`` runs the same weights faster
 and in bounded memory.
+
+The features of one view come first: residual layers and a spatial pyramid, at 1/4 size.
 """
 
 from typing import NamedTuple, cast

@@ -1,4 +1,4 @@
-"""The first volume convolution, without the volume.
+"""PSMNet without the whole volume: first convolution, slabs of rows, expected disparity.
 
 The concatenation volume holds ``left[y, x]`` and ``right[y, x - d]``: a convolution over it is a
 2D convolution of each view, looked up and added for each disparity. Only the four columns beside

@@ -1,4 +1,7 @@
-"""U-Net generator of pix2pix (Isola et al., CVPR 2017): left view to right view."""
+"""U-Net generator of pix2pix (Isola et al., CVPR 2017): left view to right view.
+
+With the discriminators of pix2pix: is this right view real, given its left one?
+"""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Synthetic street scenes as a dataset."""
+"""Synthetic street scenes as a dataset: both views, disparity, occlusion and a LiDAR scan."""
 
 from dataclasses import dataclass
 

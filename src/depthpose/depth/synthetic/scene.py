@@ -1,4 +1,7 @@
-"""One synthetic street: its mesh, its light and where the camera is mounted."""
+"""One synthetic street: its mesh, its weather, and the rig with its place.
+
+Rigs are those of KITTI's recording days, and others.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,4 +1,8 @@
-"""From light to a picture: exposure, glare, blur, noise, tone, 8 bits, JPEG."""
+"""The sensors: from light to a picture, and a LiDAR of 64 beams as that of KITTI.
+
+A picture gets exposure, glare, blur, noise, tone, 8 bits and JPEG; a scan exact ranges, then noise
+and dropouts.
+"""
 
 from dataclasses import dataclass
 

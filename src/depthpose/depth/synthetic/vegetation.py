@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges, as models that are made once and placed many times."""
+"""Trees, bushes and hedges, and the balls and clouds of leaves that they are made of."""
 
 from functools import cache
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""The light that one camera of a stage receives, pixel by pixel."""
+"""What one camera of a stage sees at pixel centres and between them, and the light of it."""
 
 from dataclasses import dataclass, replace
 

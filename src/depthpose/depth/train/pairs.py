@@ -10,7 +10,7 @@ from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
-from depthpose.core.loop import shuffled_index, ticket_generator
+from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
@@ -72,7 +72,7 @@ class TrainingPairs:
     def __getitem__(self, ticket: int) -> TrainingPair:
         """Make the n-th sample."""
         index = shuffled_index(ticket, len(self), self.seed)
-        return augment(self.read(index), self.config.augment, ticket_generator(ticket, self.seed))
+        return augment(self.read(index), self.config.augment, sample_generator(ticket, self.seed))
 
     def read(self, index: int) -> TrainingPair:
         """Read one whole pair at the config's focal length, unchanged otherwise."""

@@ -1,4 +1,7 @@
-"""Stage 1 of the generator that selects: disparity where there is truth, the view where a pair."""
+"""Stage 1 of the generator that selects: disparity where there is truth, the view where a pair.
+
+Its samples are pairs and single images, synthetic and real, mixed.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -9,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
-from depthpose.core.loop import Evidence, Turn, make_adam, ticket_generator
+from depthpose.core.loop import Evidence, Turn, make_adam, sample_generator
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
@@ -71,7 +74,7 @@ class SelectionSamples:
         """Make the n-th sample."""
         before, now = int(ticket * self.more_share), int((ticket + 1) * self.more_share)
         pair = self.sources[1][before] if now > before else self.sources[0][ticket - before]
-        seen = degrade(pair.left, self.config, ticket_generator(ticket, self.seed + 1))
+        seen = degrade(pair.left, self.config, sample_generator(ticket, self.seed + 1))
         return as_sample(pair, seen)
 
 

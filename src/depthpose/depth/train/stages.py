@@ -1,4 +1,4 @@
-"""Stage 2: the matcher from pairs with truth."""
+"""The stages of the thesis: generator against discriminator, matcher, one through the other."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,7 @@
-"""The depth image regressed by a 2D network: the first baseline of table 3.1."""
+"""The depth image regressed by a 2D network: the first baseline of table 3.1.
+
+With the square that a view is cut to, and the frame in which the regressed pose is given.
+"""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Settings of an estimate: how a cloud becomes a pose, and when the pose is withheld."""
+"""Settings of an estimate and of the metrics: when a pose is withheld, when it is right."""
 
 from dataclasses import dataclass, field
 from typing import Literal, get_args

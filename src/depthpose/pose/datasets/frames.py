@@ -1,4 +1,7 @@
-"""Folders of BOP's layout to instances: one object in one image, and where its parts lie."""
+"""Folders of BOP's layout to instances: one object in one image, and where its parts lie.
+
+And those that an evaluation asks for (``test_targets_bop19.json``).
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Masks of one object: pictures, and COCO's run lengths in JSON."""
+"""Masks of one object: pictures, COCO's run lengths, and detections as BOP shares them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

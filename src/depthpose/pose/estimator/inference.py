@@ -1,4 +1,7 @@
-"""Clouds and masked views that are read already, through the network to poses."""
+"""Clouds and masked views that are read already, through the network to poses.
+
+Several clouds go through the network at once.
+"""
 
 import time
 from collections.abc import Iterator, Sequence

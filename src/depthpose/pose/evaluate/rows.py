@@ -1,4 +1,7 @@
-"""The rows of an evaluation, each with its columns in order."""
+"""The rows of an evaluation, each with its columns in order.
+
+With what they depend on: the list of instances, the diameters, and which of the two ADDs.
+"""
 
 import math
 from collections.abc import Mapping

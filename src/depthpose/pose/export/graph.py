@@ -1,4 +1,10 @@
-"""The sparse ResUNet in ONNX operators: gather, multiply, add."""
+"""The sparse ResUNet and its kernel maps in ONNX operators: gather, multiply, add.
+
+For kernel maps the clouds' common box is laid out as a table of cells for each level; a cell holds
+the row of its voxel, or one past the last row where it is empty. The neighbours of a kernel are
+then one gather. All tables count in cells of the finest level, so that one addition moves a voxel
+of any level.
+"""
 
 from typing import cast
 

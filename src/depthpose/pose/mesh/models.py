@@ -1,4 +1,7 @@
-"""Model files to :class:`ObjectModel`: PLY, STL, OBJ and GLB, with faces or points alone."""
+"""Model files to :class:`ObjectModel`: PLY, STL, OBJ and GLB, with faces or points alone.
+
+What a file declares, or may grow to, is checked before it is read in full.
+"""
 
 import json
 import struct

@@ -1,4 +1,7 @@
-"""Import of weights in MinkowskiEngine's layout: FCGF's ResUNetBN2C, with or without norms."""
+"""Import of weights in MinkowskiEngine's layout: FCGF's ResUNetBN2C, with or without norms.
+
+What the import writes is a bare network, without any object.
+"""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,7 @@
-"""FCN (Long, Shelhamer and Darrell, CVPR 2015) on a residual encoder."""
+"""FCN (Long, Shelhamer and Darrell, CVPR 2015) on a residual encoder.
+
+With its settings and its weights on disk, which hold the names of its objects.
+"""
 
 import dataclasses
 from collections.abc import Mapping

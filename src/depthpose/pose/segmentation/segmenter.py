@@ -1,4 +1,4 @@
-"""One image to the masks of its objects."""
+"""One image to the masks of its objects, and their intersection over union over many images."""
 
 import math
 from collections.abc import Mapping

@@ -1,7 +1,9 @@
-"""The sparse convolution itself, behind one seam: ``conv(features, weight, kernel_map)``.
+"""The sparse convolution, ``conv(features, weight, kernel_map)``, and its matrix products.
 
 Every way of computing it is gather, multiply, add up; the ways differ in how much is gathered at
 once. A faster kernel would replace :func:`conv` and nothing else.
+
+Products go in blocks of rows through the faster of torch's two CPU libraries.
 """
 
 from functools import cache

@@ -1,4 +1,7 @@
-"""Which input voxel is the neighbour of which output voxel at which offset of a kernel."""
+"""Which input voxel is the neighbour of which output voxel at which offset of a kernel.
+
+All levels and kernel maps of one set of voxels are made once (:class:`CoordinateCache`).
+"""
 
 from dataclasses import dataclass
 from functools import cached_property

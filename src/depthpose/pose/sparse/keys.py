@@ -3,6 +3,8 @@
 A key holds 12 bits of the cloud's number and 17 bits of each coordinate, z lowest. Adding packed
 offsets to a key moves the voxel; coordinates keep off the ends of their field by more than any
 kernel reaches, so that a move never carries into the next field.
+
+Rows are found by keys through a table of a box, or by binary search.
 """
 
 from collections.abc import Sequence

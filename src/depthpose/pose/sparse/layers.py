@@ -1,4 +1,4 @@
-"""Sparse convolutions as modules."""
+"""Features on voxels, and sparse convolutions of them as modules."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import (
     measure,
@@ -121,7 +121,7 @@ class Objects:
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
-        generator = ticket_generator(index, self.config.seed)
+        generator = sample_generator(index, self.config.seed)
         clean = self._clean_view(number, generator)
         silhouette = silhouette_of(clean)
         depth_m, visible = clean.depth_m, silhouette
@@ -183,7 +183,7 @@ class Objects:
     def _stored(self, number: int, place: int) -> _Stored:
         if (number, place) not in self._views:
             ticket = place * len(self.models) + number
-            R, distance_m, K = self._pose(ticket_generator(ticket, self.config.seed + _BANK_SEED))
+            R, distance_m, K = self._pose(sample_generator(ticket, self.config.seed + _BANK_SEED))
             shape = self._shape(number)
             middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, pose_of_middle(shape, R, middle), K)

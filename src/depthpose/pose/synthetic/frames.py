@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.core.render import Raster, rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import measure, random_rotation, uniform, whole
@@ -65,7 +65,7 @@ def make_frames(
 
 
 def _make_frame(solids: Sequence[Solid], config: ObjectsConfig, index: int) -> BopFrame:
-    generator = ticket_generator(index, config.seed + _FRAMES_SEED)
+    generator = sample_generator(index, config.seed + _FRAMES_SEED)
     world = _arranged(solids, config, generator)
     camera_from_world = _viewpoint(config, generator)
     placed = [

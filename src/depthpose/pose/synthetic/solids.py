@@ -1,4 +1,7 @@
-"""Solids of a scene: triangles with normals, a colour and a pattern."""
+"""Solids of a scene, triangles with normals, colour and pattern, and the light on them.
+
+Light is linear RGB.
+"""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import back_project
-from depthpose.core.loop import ticket_generator
+from depthpose.core.loop import sample_generator
 from depthpose.core.render import Raster
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import uniform, whole
@@ -91,7 +94,7 @@ def random_pattern(
 
 def solid_of(model: ObjectModel) -> Solid:
     """Prepare a known object: it looks alike in every frame of every data set."""
-    generator = ticket_generator(model.number, _COLOUR_SEED)
+    generator = sample_generator(model.number, _COLOUR_SEED)
     pattern = random_pattern(generator, model.diameter_m, (0.7, 1.0))
     if len(model.faces):
         corners, normals = model.triangles_m, model.normals[model.faces]

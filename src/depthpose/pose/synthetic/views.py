@@ -3,6 +3,8 @@
 A camera that turns about its own centre sees the same surface points, along other rays. A stored
 view is therefore a view from every direction of gaze, and only its pixels are interpolated: inverse
 depth, which is linear in the picture of a plane, so that flat parts stay exact.
+
+With the triangles that a camera may see of a model, and the box of their picture.
 """
 
 import math

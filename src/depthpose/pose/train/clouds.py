@@ -1,4 +1,4 @@
-"""Partial clouds by sample index, synthetic or of real frames, and their batches."""
+"""The objects of a training, and their partial clouds by sample index, synthetic or real."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import shuffled_index, ticket_generator
+from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
@@ -112,7 +112,7 @@ class TrainingClouds:
         Raises:
             InputError: so many in a row have too few points that the config must be wrong.
         """
-        generator = ticket_generator(index, self.seed)
+        generator = sample_generator(index, self.seed)
         for attempt in range(_TRIES):
             # Far beyond any training, and the same object.
             sample = self._sample(index + attempt * len(self._class_of) * 2**32, generator)

@@ -17,8 +17,8 @@ from depthpose.core.loop import (
     held_out_text,
     leave_card,
     make_adam,
+    sample_generator,
     shuffled_index,
-    ticket_generator,
     train,
 )
 from depthpose.core.rigid import Rigid
@@ -107,7 +107,7 @@ class TrainingCrops:
     def _view(self, index: int) -> ViewSample:
         if self._real is None or self.config.frames is None:
             return self.made.view(index)
-        generator = ticket_generator(index, self.seed)
+        generator = sample_generator(index, self.seed)
         if float(torch.rand((), generator=generator)) >= self.config.frames.share:
             return self.made.view(index)
         place = shuffled_index(index, len(self._real), self.seed)

@@ -1,4 +1,4 @@
-"""Held-out synthetic views: how often does the current network find the pose?"""
+"""Held-out synthetic views: how often the network finds the pose, and its refusal calibrated."""
 
 import dataclasses
 import math
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Evidence, ticket_generator
+from depthpose.core.loop import Evidence, sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig, RefusalConfig
@@ -108,7 +108,7 @@ class HeldOut:
         for index in range(len(objects)):
             sample = objects[index]
             if refusal_of(sample.input.points_m, self._cloud) is None:
-                generator = ticket_generator(index, HELD_OUT_SEED)
+                generator = sample_generator(index, HELD_OUT_SEED)
                 number = index % len(self.models)
                 yield voxelised_cloud(sample, number, self._cloud, generator)
 

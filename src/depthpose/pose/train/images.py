@@ -12,7 +12,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.core.loop import shuffled_index, ticket_generator
+from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.pose.augment import uniform, whole
 from depthpose.pose.datasets import Instance, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
@@ -134,7 +134,7 @@ class TrainingImages:
 
     def __getitem__(self, index: int) -> LabelledImage:
         """Make the sample of an index."""
-        generator = ticket_generator(index, self.seed)
+        generator = sample_generator(index, self.seed)
         given = self.images[shuffled_index(index, len(self), self.seed)]
         scale = self._long_side_px / max(given.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)

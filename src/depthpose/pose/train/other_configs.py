@@ -1,4 +1,4 @@
-"""Settings of the trainings of the baselines: the same views, other networks."""
+"""Settings of the trainings of the baselines and of segmentation."""
 
 from dataclasses import dataclass, field
 

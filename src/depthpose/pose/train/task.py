@@ -1,4 +1,4 @@
-"""The direction network as a task of the loop."""
+"""The direction network as a task of the loop, and the folder of its training."""
 
 import dataclasses
 import shlex

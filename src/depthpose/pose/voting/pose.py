@@ -1,4 +1,7 @@
-"""Keypoints to pose: Kabsch, then the most likely pose under the keypoints' own covariances."""
+"""Keypoints to pose: Kabsch, then the most likely pose under the keypoints' own covariances.
+
+A check needs no truth: found keypoints must have the distances that the model's have.
+"""
 
 import torch
 from jaxtyping import Bool, Float, Float64
