@@ -28,7 +28,7 @@ from depthpose.depth.stereo import (
     normalise,
     psmnet_from_published,
 )
-from depthpose.depth.stereo.psmnet_matcher import pad_top_right
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.weights import read_psmnet
 
 Pair = tuple[Tensor, Tensor]
@@ -136,8 +136,7 @@ def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     double = PSMNet(network.config).double().eval()
     double.load_state_dict(network.state_dict())
     h, w = pair[0].shape[-2:]
-    least = network.config.min_side_px
-    left, right = (pad_top_right(normalise(i.double()), least)[None] for i in pair)
+    left, right = (pad_top_right(normalise(i.double()), network.config)[None] for i in pair)
     found = PSMNetInference(double, torch.float64).match(left, right, Steps())
     return found[0].disparity_px[-h:, :w]
 

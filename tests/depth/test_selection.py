@@ -12,8 +12,8 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
+from depthpose.depth.lite0 import Lite0Encoder, import_lite0, read_lite0
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
-from depthpose.depth.synthesis.lite0 import Lite0Encoder, import_lite0, read_lite0
 from depthpose.depth.synthesis.selection import (
     log_expectation,
     make_planes,

@@ -21,9 +21,9 @@ from depthpose.depth.stereo import (
     normalise,
     tile_change_px,
 )
+from depthpose.depth.stereo.network_matcher import lower_where_disagreeing, pad_top_right
 from depthpose.depth.stereo.plan import Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
-from depthpose.depth.stereo.psmnet_matcher import lower_where_disagreeing, pad_top_right
 from depthpose.depth.stereo.volume import FirstLayer, Size, expected_disparity
 from depthpose.depth.types import Match
 
@@ -48,7 +48,7 @@ def random_network(config: PSMNetConfig, seed: int = 0) -> PSMNet:
 def plain(network: PSMNet, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     """The plain network with the matcher's padding."""
     h, w = left.shape[-2:]
-    pair = [pad_top_right(normalise(i), network.config.min_side_px)[None] for i in (left, right)]
+    pair = [pad_top_right(normalise(i), network.config)[None] for i in (left, right)]
     with torch.no_grad():
         return network(*pair)[-1][0, -h:, :w]
 

@@ -21,9 +21,9 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.lite0 import KIND, Lite0Encoder
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import SelectionGenerator
-from depthpose.depth.synthesis.lite0 import KIND, Lite0Encoder
 from depthpose.depth.train import (
     FinetuneTask,
     Run,

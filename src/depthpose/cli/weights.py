@@ -109,7 +109,7 @@ def import_weights(
 
         import_resnet18(file, out)
     else:
-        from depthpose.depth.synthesis.lite0 import import_lite0
+        from depthpose.depth.lite0 import import_lite0
 
         import_lite0(file, out)
     return show_weights(str(out))

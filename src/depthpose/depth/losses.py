@@ -72,9 +72,10 @@ def heads_loss(
     *,
     with_sky: bool = False,
 ) -> Float[Tensor, ""]:
-    """Sum the loss of PSMNet's three heads, the later the heavier."""
+    """Sum the loss of up to three heads, the later the heavier; the last has the weight 1."""
     losses = [disparity_loss(head, truth_px, max_px, with_sky=with_sky) for head in heads_px]
-    return torch.stack([w * x for w, x in zip(HEAD_WEIGHTS, losses, strict=True)]).sum()
+    weights = HEAD_WEIGHTS[-len(losses) :]
+    return torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum()
 
 
 def log_disparity_loss(

@@ -55,8 +55,8 @@ class BeginningOptions:
     start: str | None = None
     """view, select, stereo: weights to begin with."""
     encoder: str | None = None
-    """select: weights of the encoder to begin with, of 'depthpose weights import
-    efficientnet-lite0'."""
+    """select, stereo with a light network: weights of the encoder to begin with, of 'depthpose
+    weights import efficientnet-lite0'."""
 
     def applied(self, chosen: Any, stage: str) -> Any:  # noqa: ANN401 - any config of a training
         """Give the config of a stage with these weights.

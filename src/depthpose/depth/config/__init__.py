@@ -6,6 +6,7 @@ from depthpose.depth.config.data import PairsConfig as PairsConfig
 from depthpose.depth.config.data import StreetsConfig as StreetsConfig
 from depthpose.depth.config.data import TruthKind as TruthKind
 from depthpose.depth.config.matching import BaselineName as BaselineName
+from depthpose.depth.config.matching import LightConfig as LightConfig
 from depthpose.depth.config.matching import MatcherConfig as MatcherConfig
 from depthpose.depth.config.matching import PSMNetConfig as PSMNetConfig
 from depthpose.depth.config.matching import SGBMConfig as SGBMConfig

@@ -52,9 +52,74 @@ class PSMNetConfig:
             raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
 
     @property
+    def step_px(self) -> int:
+        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
+        return 16
+
+    @property
     def min_side_px(self) -> int:
         """Smallest image side that the network takes [px]: its largest pool sees one window."""
         return max(16, -(-4 * max(self.pools) // 16) * 16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightConfig:
+    """Size and conventions of the light stereo network."""
+
+    max_disparity_px: int = 192
+    """Disparities below this are considered; a multiple of 32."""
+
+    groups: int = 8
+    """Channels of the correlation volume: features are correlated in so many groups."""
+
+    width: int = 48
+    """Features of each pixel that is matched; a multiple of ``groups``."""
+
+    volume_widths: tuple[int, int, int, int] = (8, 16, 32, 48)
+    """Channels of the volume at 1/4, 1/8, 1/16 and 1/32 of the image's sides."""
+
+    candidates: int = 2
+    """Disparities of the highest scores whose mean is the answer."""
+
+    encoder_width: float = 1.0
+    """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
+
+    work_focal_px: float | None = None
+    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        if not 32 <= self.max_disparity_px <= 2**14 or self.max_disparity_px % 32:
+            raise InputError(
+                f"max_disparity_px must be a multiple of 32 up to {2**14} (the volume is a quarter "
+                f"of it and is halved three times), got {self.max_disparity_px}; take 192"
+            )
+        if self.groups < 1 or self.width < 1 or self.width % self.groups:
+            raise InputError(
+                f"width must be a multiple of groups, got width={self.width} and "
+                f"groups={self.groups}; take 48 and 8"
+            )
+        if min(self.volume_widths) < 1:
+            raise InputError(f"volume_widths must be positive, got {self.volume_widths}")
+        if not 1 <= self.candidates <= self.max_disparity_px // 4:
+            raise InputError(
+                f"candidates must be from 1 to {self.max_disparity_px // 4}, a quarter of "
+                f"max_disparity_px, got {self.candidates}; take 2"
+            )
+        if not 0 < self.encoder_width <= 4:
+            raise InputError(f"encoder_width must be in (0, 4], got {self.encoder_width}; take 1")
+        if self.work_focal_px is not None and self.work_focal_px <= 0:
+            raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
+
+    @property
+    def step_px(self) -> int:
+        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
+        return 32
+
+    @property
+    def min_side_px(self) -> int:
+        """Smallest image side that the network takes [px]."""
+        return 32
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,8 +25,8 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
+from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.weights import DepthWeights, as_psmnet
 
 _IMAGES = ("batch", 3, "height", "width")

@@ -1,6 +1,8 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
 from depthpose.depth.stereo.inference import PSMNetInference
+from depthpose.depth.stereo.light import LightStereo
+from depthpose.depth.stereo.light_matcher import LightMatcher
 from depthpose.depth.stereo.matcher import (
     CallableMatcher,
     CameraMatcher,
@@ -8,14 +10,15 @@ from depthpose.depth.stereo.matcher import (
     TiledMatcher,
     check_pair,
 )
-from depthpose.depth.stereo.plan import Footprint, Steps
-from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import (
-    PSMNetMatcher,
+from depthpose.depth.stereo.network_matcher import (
+    NetworkMatcher,
     normalise,
     tile_change_px,
     with_usable_precision,
 )
+from depthpose.depth.stereo.plan import Footprint, Steps
+from depthpose.depth.stereo.psmnet import PSMNet
+from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
 from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
 from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, is_own_matcher, make_matcher
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
@@ -25,8 +28,11 @@ __all__ = [
     "CallableMatcher",
     "CameraMatcher",
     "Footprint",
+    "LightMatcher",
+    "LightStereo",
     "Matcher",
     "MatcherKind",
+    "NetworkMatcher",
     "PSMNet",
     "PSMNetInference",
     "PSMNetMatcher",

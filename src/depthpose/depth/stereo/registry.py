@@ -7,7 +7,9 @@ from typing import Any
 from torch import nn
 
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig, PSMNetConfig
+from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
+from depthpose.depth.stereo.light import LightStereo
+from depthpose.depth.stereo.light_matcher import LightMatcher
 from depthpose.depth.stereo.matcher import Matcher
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
@@ -28,7 +30,10 @@ class MatcherKind:
     matcher: Callable[[Any, MatcherConfig], Matcher]
 
 
-MATCHERS = {"psmnet": MatcherKind(config=PSMNetConfig, network=PSMNet, matcher=PSMNetMatcher)}
+MATCHERS = {
+    "psmnet": MatcherKind(config=PSMNetConfig, network=PSMNet, matcher=PSMNetMatcher),
+    "light": MatcherKind(config=LightConfig, network=LightStereo, matcher=LightMatcher),
+}
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 

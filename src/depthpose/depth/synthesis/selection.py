@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.synthesis.lite0 import Lite0Encoder
+from depthpose.depth.lite0 import Lite0Encoder
 
 Images = Float[Tensor, "b 3 h w"]
 Logits = Float[Tensor, "b classes rows columns"]

@@ -8,6 +8,7 @@ from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
     DegradeConfig,
     GeneratorConfig,
+    LightConfig,
     PairsConfig,
     PSMNetConfig,
     SelectionConfig,
@@ -145,8 +146,22 @@ class StereoTraining:
     matcher: PSMNetConfig = field(default_factory=PSMNetConfig)
     """The network that is trained."""
 
+    light: LightConfig | None = None
+    """Train this light network in place of ``matcher``."""
+
     start: str | None = None
-    """Weights to begin with (PSMNet, or a whole set)."""
+    """Weights of the whole network to begin with (or a whole set)."""
+
+    encoder: str | None = None
+    """light: weights of the encoder to begin with ('depthpose weights import
+    efficientnet-lite0')."""
+
+    with_fixed_start: bool = True
+    """light: keep the encoder's first layers and its batch norm statistics: right for ImageNet's
+    weights, wrong for an encoder that begins at random."""
+
+    encoder_rate: float = 0.3
+    """light: learning rate of the encoder as a share of the rest's."""
 
     with_sky: bool = False
     """Learn a disparity of 0 where the truth knows the sky, in place of leaving it out."""
@@ -162,6 +177,16 @@ class StereoTraining:
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=20.0))
     """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse a share that is none."""
+        if not 0 <= self.encoder_rate <= 1:
+            raise InputError(f"encoder_rate must be from 0 to 1, got {self.encoder_rate}")
+
+    @property
+    def network(self) -> PSMNetConfig | LightConfig:
+        """Config of the network that is trained."""
+        return self.light or self.matcher
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
+from torch import nn
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
@@ -21,9 +22,9 @@ from depthpose.core.loop import (
 )
 from depthpose.core.run import claim_folder, find_shard
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
-from depthpose.depth.stereo import PSMNet
+from depthpose.depth.lite0 import load_lite0
+from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
-from depthpose.depth.synthesis.lite0 import read_lite0
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -33,7 +34,7 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-from depthpose.depth.weights import read_generator, read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_generator, read_matcher, read_psmnet, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Settings of the loop that change no weight: a resumed run may have others."""
@@ -91,12 +92,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
-    if config.with_fixed_start and config.encoder is None and config.start is None:
-        raise InputError(
-            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
-            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
-            "--start, or with_fixed_start: false with encoder_rate: 1.0."
-        )
+    _refuse_fixed_chance(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
@@ -116,7 +112,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     samples = SelectionSamples(sources, config.more_share, config.degrade, config.loop.seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
-        generator.encoder.load_state_dict(read_lite0(find_weights(config.encoder)).state_dict())
+        load_lite0(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         _start_from(generator, read_generator(find_weights(config.start)), config.start)
     held_out = _held_out(config.held_out, needs_truth=True)
@@ -130,11 +126,28 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     pairs = _pairs(config.pairs, config.loop, needs_truth=True)
     held_out = _held_out(config.held_out, needs_truth=True)
-    matcher = PSMNet(config.matcher)
-    if config.start is not None:
-        _start_from(matcher, read_psmnet(find_weights(config.start)), config.start)
+    matcher = _make_matcher(config)
     facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
+
+
+def _make_matcher(config: StereoTraining) -> PSMNet | LightStereo:
+    """Make the network that a config trains, with the weights that it begins with."""
+    if config.light is None and config.encoder is not None:
+        raise InputError(
+            f"--encoder {config.encoder}: PSMNet has no encoder of its own kind; give the config "
+            "a light network (light: {}), or leave it out."
+        )
+    if config.light is None:
+        matcher = PSMNet(config.matcher)
+    else:
+        _refuse_fixed_chance(config)
+        matcher = LightStereo(config.light)
+        if config.encoder is not None:
+            load_lite0(matcher.features.encoder, find_weights(config.encoder))
+    if config.start is not None:
+        _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
+    return matcher
 
 
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
@@ -229,7 +242,7 @@ def _leave(
     seconds: float,
     *,
     generator: Generator | None = None,
-    matcher: PSMNet | None = None,
+    matcher: PSMNet | LightStereo | None = None,
 ) -> Path:
     """Write the weights and their card."""
     names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]
@@ -270,28 +283,45 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
     Seen with torch 2.13: a 3x3x3 convolution over two planes gives values near 1e35 or NaN where
     one, three or more planes agree with fp32 within 0.5 %.
     """
-    is_two_deep = config.matcher.max_disparity_px == 32
+    step_px = config.network.step_px
+    is_two_deep = config.network.max_disparity_px == 2 * step_px
     if is_two_deep and config.loop.precision == "bf16" and not torch.cuda.is_available():
         raise InputError(
-            "max_disparity_px is 32 and precision bf16: at its coarsest the volume is two planes "
-            "deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
-            "max_disparity_px 48, or precision fp32."
+            f"max_disparity_px is {2 * step_px} and precision bf16: at its coarsest the volume is "
+            "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
+            f"max_disparity_px {3 * step_px}, or precision fp32."
         )
 
 
-_FREE = ("max_disparity_px",)
+_FREE_OF_WEIGHTS = ("max_disparity_px",)
 """Settings that no weight depends on: a matcher searches any disparities in the same way."""
 
 
-def _start_from(network: Generator | PSMNet, found: Generator | PSMNet, source: str) -> None:
+def _refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
+    """Refuse to keep the first layers of an encoder that begins at random."""
+    if config.with_fixed_start and config.encoder is None and config.start is None:
+        raise InputError(
+            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
+            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
+            "--start, or with_fixed_start: false with encoder_rate: 1.0."
+        )
+
+
+def _start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
     """Copy weights whose config is the network's own, but for the range of disparities.
 
     Raises:
-        InputError: a setting differs, so the weights would mean something else.
+        InputError: another kind of network, or a setting differs, so the weights would mean
+            something else.
     """
-    wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    if type(found) is not type(network):
+        raise InputError(
+            f"{source}: holds weights of {type(found).__name__}, but the config trains "
+            f"{type(network).__name__}. Give weights of that network."
+        )
+    wanted, given = config_to_dict(network.config), config_to_dict(cast("Any", found).config)
     for setting, value in wanted.items():
-        if given[setting] != value and setting not in _FREE:
+        if given[setting] != value and setting not in _FREE_OF_WEIGHTS:
             raise InputError(
                 f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."

@@ -17,8 +17,8 @@ from depthpose.depth.losses import (
     l1_loss,
     valid_disparity,
 )
-from depthpose.depth.stereo import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import normalise, pad_top_right
+from depthpose.depth.stereo import LightStereo, PSMNet, normalise
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.synthesis import Generator, UNetGenerator, make_discriminator
 from depthpose.depth.synthesis.synthesiser import draw_right
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
@@ -26,15 +26,35 @@ from depthpose.depth.train.pairs import TrainingPairs
 
 
 class StereoTask:
-    """Smooth L1 on the three heads (eq. 2.6)."""
+    """Smooth L1 on all heads (eq. 2.6)."""
 
     def __init__(
-        self, matcher: PSMNet, config: StereoTraining, held_out: TrainingPairs | None
+        self,
+        matcher: PSMNet | LightStereo,
+        config: StereoTraining,
+        held_out: TrainingPairs | None,
     ) -> None:
         self.config, self.held_out = config, held_out
-        self.matcher = matcher.train()
+        self.matcher = matcher
+        if isinstance(matcher, LightStereo) and config.with_fixed_start:
+            matcher.features.encoder.freeze_early()
+        self._train()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
-        self.optimizers = {"matcher": (make_adam(matcher.parameters(), config.adam), config.adam)}
+        self.optimizers = {"matcher": (make_adam(self._groups(), config.adam), config.adam)}
+
+    def _groups(self) -> list[dict[str, object]]:
+        if not isinstance(self.matcher, LightStereo):
+            return [{"params": list(self.matcher.parameters())}]
+        encoder = list(self.matcher.features.encoder.parameters())
+        ours = set(encoder)
+        rest = [p for p in self.matcher.parameters() if p not in ours]
+        learnt = [p for p in encoder if p.requires_grad]
+        return [{"params": learnt, "rate": self.config.encoder_rate}, {"params": rest}]
+
+    def _train(self) -> None:
+        self.matcher.train()
+        if isinstance(self.matcher, LightStereo) and self.config.with_fixed_start:
+            self.matcher.features.encoder.keep_statistics()
 
     def step(self, batch: TrainingPair) -> Iterator[Turn]:
         """One turn: match and compare."""
@@ -50,12 +70,14 @@ class StereoTask:
             return Evidence()
         self.matcher.eval()
         evidence = held_out_evidence(self.matcher, self.held_out)
-        self.matcher.train()
+        self._train()
         return evidence
 
 
 def held_out_evidence(
-    matcher: PSMNet, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
+    matcher: PSMNet | LightStereo,
+    held_out: TrainingPairs,
+    draw: Callable[[Tensor], Tensor] | None = None,
 ) -> Evidence:
     """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws."""
     errors, bad, pictures = [], [], {}
@@ -80,13 +102,14 @@ def held_out_evidence(
 
 @torch.no_grad()
 def match_whole(
-    matcher: PSMNet, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"]
+    matcher: PSMNet | LightStereo,
+    left: Float[Tensor, "3 h w"],
+    right: Float[Tensor, "3 h w"],
 ) -> Float[Tensor, "h w"]:
     """Match one pair of any size with the network as it stands."""
     device = next(matcher.parameters()).device
     height, width = left.shape[-2:]
-    least = matcher.config.min_side_px
-    padded = [pad_top_right(normalise(v.to(device)), least)[None] for v in (left, right)]
+    padded = [pad_top_right(normalise(v.to(device)), matcher.config)[None] for v in (left, right)]
     return matcher(*padded)[-1][0, -height:, :width].float().cpu()
 
 

@@ -39,18 +39,21 @@ _FROZEN_BLOCKS = 3
 class Lite0Encoder(nn.Module):
     """Features at strides 2, 4, 8, 16 and 32 of RGB in [0, 1]; 2,958,848 weights at width 1.
 
+    With ``levels`` below 5 it ends at stride ``2 ** levels``, and has the weights up to there.
+
     Convolutions of stride 2 pad below and to the right, as TensorFlow's SAME does for sides that
     are multiples of 32: that is what the published weights were trained with.
     """
 
-    def __init__(self, width: float = 1.0) -> None:
+    def __init__(self, width: float = 1.0, levels: int = 5) -> None:
         super().__init__()
         stem = _scaled(_STEM, width)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
         inputs, self._taps = stem, []
         self.channels: list[int] = []
-        for number, (count, kernel, stride, expansion, channels) in enumerate(_STAGES):
+        stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
+        for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
             outputs = _scaled(channels, width)
             for place in range(count):
                 step = stride if place == 0 else 1
@@ -62,7 +65,7 @@ class Lite0Encoder(nn.Module):
         self.blocks = nn.ModuleList(blocks)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Float[Tensor, "b c rows columns"]]:
-        """Answer features from stride 2 to stride 32; sides are multiples of 32."""
+        """Answer features from stride 2 to stride 32; sides are multiples of the last."""
         x = F.relu6(self.stem((image * 255 - 127) / 128))
         features = []
         for number, block in enumerate(self.blocks):
@@ -159,6 +162,22 @@ def import_lite0(file: Path, out: Path) -> None:
     }
     state = encoder.state_dict()
     save_checkpoint(out, Checkpoint(kind=KIND, config={}, state=state, facts=facts))
+
+
+def load_lite0(encoder: Lite0Encoder, path: Path) -> None:
+    """Give an encoder of full width the weights of a file, as far as it reaches.
+
+    Raises:
+        InputError: not a file that :func:`import_lite0` wrote, or the encoder is narrower.
+    """
+    state = read_lite0(path).state_dict()
+    own = encoder.state_dict()
+    if any(state[name].shape != tensor.shape for name, tensor in own.items()):
+        raise InputError(
+            f"{path}: holds EfficientNet-Lite0 at its full width, and this encoder is narrower; "
+            "set encoder_width to 1, or begin at random."
+        )
+    encoder.load_state_dict({name: state[name] for name in own})
 
 
 def read_lite0(path: Path) -> Lite0Encoder:

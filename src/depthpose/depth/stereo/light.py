@@ -1,0 +1,249 @@
+"""The light matcher: correlation of groups of features at 1/4 size, a small hourglass.
+
+- Features: EfficientNet-Lite0 sees the image at half size, two convolutions see it at full size,
+  and a decoder joins both at 1/4.
+- Volume: cosines of groups of features (Guo et al., CVPR 2019), refined by one 3D hourglass that
+  the image steers (Bangunharcana et al., CoEx, IROS 2021).
+- Disparity: the mean over the few best disparities (CoEx), enlarged by learned convex combinations
+  of nine neighbours (Teed and Deng, RAFT, ECCV 2020).
+"""
+
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import LightConfig
+from depthpose.depth.lite0 import Lite0Encoder
+from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
+from depthpose.depth.stereo.psmnet import (
+    Shape,
+    conv_norm_2d,
+    conv_norm_3d,
+    deconv_norm_3d,
+)
+
+Features = Float[Tensor, "b _ _ _"]
+Volume = Float[Tensor, "b _ _ _ _"]
+Maps = Float[Tensor, "b h w"]
+
+_STEM = 16
+"""Channels at half size."""
+_DEEP = 96
+"""Channels of the decoder at 1/32, twice those at 1/16 and 1/8."""
+
+
+class Described(NamedTuple):
+    """Features of a view.
+
+    Attributes:
+        half: at 1/2 of the image's sides.
+        levels: at 1/4, 1/8, 1/16 and 1/32.
+    """
+
+    half: Features
+    levels: tuple[Features, ...]
+
+
+class LightFeatures(nn.Module):
+    """One view to features at 1/2 to 1/32 of its sides."""
+
+    def __init__(self, config: LightConfig) -> None:
+        super().__init__()
+        w = config.width
+        self.stem = conv_norm_2d(3, _STEM, Shape(3, 2))
+        self.quarter = nn.ModuleList([conv_norm_2d(_STEM, w, Shape(3, 2)), conv_norm_2d(w, w)])
+        self.encoder = Lite0Encoder(config.encoder_width, levels=4)
+        self.top = conv_norm_2d(self.encoder.channels[3], _DEEP, Shape(1))
+        quarter, eighth, sixteenth, _ = self.encoder.channels
+        skips = (sixteenth, eighth, quarter + w)
+        self.widths = (w, _DEEP // 2, _DEEP // 2, _DEEP)
+        outputs, above = self.widths[-2::-1], self.widths[:0:-1]
+        self.decoder = nn.ModuleList(
+            conv_norm_2d(a + skip, out) for a, skip, out in zip(above, skips, outputs, strict=True)
+        )
+        mean, deviation = (torch.tensor(v)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD))
+        self.register_buffer("mean", mean, persistent=False)
+        self.register_buffer("deviation", deviation, persistent=False)
+
+    mean: Tensor
+    deviation: Tensor
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Described:
+        """Describe each pixel by its surroundings near and far."""
+        image = image.contiguous(memory_format=torch.channels_last)
+        half = F.relu(self.stem(image))
+        quarter = half
+        for layer in self.quarter:
+            quarter = F.relu(layer(quarter))
+        skips = self.encoder(F.avg_pool2d(image, 2) * self.deviation + self.mean)
+        levels = [F.relu(self.top(skips[3]))]
+        seen = (skips[2], skips[1], torch.cat([skips[0], quarter], 1))
+        for layer, skip in zip(self.decoder, seen, strict=True):
+            above = F.interpolate(levels[-1], scale_factor=2.0, mode="nearest")
+            levels.append(F.relu(layer(torch.cat([above, skip], 1))))
+        return Described(half, tuple(levels[::-1]))
+
+
+def correlation_volume(
+    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int, groups: int
+) -> Float[Tensor, "b {groups} {bins} h w"]:
+    """Give the cosine of each group of features of ``left[y, x]`` and ``right[y, x - d]``.
+
+    Zero where the right pixel falls outside the image.
+    """
+    width = left.shape[-1]
+    left, right = _unit(left, groups), _unit(right, groups)
+    planes = [
+        F.pad((left[..., d:] * right[..., : width - d]).sum(2), (d, 0))
+        for d in range(min(bins, width))
+    ]
+    planes += [torch.zeros_like(planes[0])] * (bins - len(planes))
+    return torch.stack(planes, 2)
+
+
+def _unit(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
+    """Bring each group of features to length 1."""
+    b, c, h, w = features.shape
+    grouped = features.contiguous().view(b, groups, c // groups, h, w)
+    return grouped * (grouped.square().sum(2, keepdim=True) + 1e-6).rsqrt()
+
+
+class Aggregation(nn.Module):
+    """Correlation volume to one score a voxel: an hourglass of three scales, led by the image."""
+
+    def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
+        super().__init__()
+        v = config.volume_widths
+        self.first = conv_norm_3d(config.groups, v[0])
+        steps = list(pairwise(v))
+        self.down = nn.ModuleList(conv_norm_3d(a, b, stride=2) for a, b in steps)
+        self.same = nn.ModuleList(conv_norm_3d(b, b) for _, b in steps)
+        self.up = nn.ModuleList(deconv_norm_3d(b, a) for a, b in steps)
+        self.joined = nn.ModuleList(conv_norm_3d(a, a) for a in v[:-1])
+        self.guides = nn.ModuleList(
+            nn.Conv2d(g, c, 1) for g, c in zip(guide_widths, v, strict=True)
+        )
+        self.score = nn.Conv3d(v[0], 1, 3, 1, 1, bias=False)
+
+    def forward(self, volume: Volume, levels: tuple[Features, ...]) -> Float[Tensor, "b d h w"]:
+        """Score each disparity; more is likelier."""
+        volume = volume.contiguous(memory_format=torch.channels_last_3d)
+        guides = [
+            torch.sigmoid(guide(level))[:, :, None]
+            for guide, level in zip(self.guides, levels, strict=True)
+        ]
+        scales = [F.relu(self.first(volume)) * guides[0]]
+        for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
+            scales.append(F.relu(same(F.relu(down(scales[-1])))) * guide)
+        x = scales.pop()
+        for up, joined in zip(reversed(self.up), reversed(self.joined), strict=True):
+            x = F.relu(joined(F.relu(up(x) + scales.pop())))
+        return self.score(x)[:, 0]
+
+
+class Enlargement(nn.Module):
+    """Weights of the nine neighbours at 1/4 size, for each pixel of the image."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.hidden = conv_norm_2d(_STEM + width, 32)
+        self.weights = nn.Conv2d(32, 4 * 9, 1)
+
+    def forward(self, described: Described) -> Float[Tensor, "b 9 4 h2 w2"]:
+        """Answer weights that sum to one, for the four pixels of each one at half size."""
+        wide = F.interpolate(described.levels[0], scale_factor=2.0, mode="nearest")
+        x = F.relu(self.hidden(torch.cat([described.half, wide], 1)))
+        b, _, h, w = x.shape
+        return self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
+
+
+def enlarge(
+    quarter: Float[Tensor, "b h4 w4"], weights: Float[Tensor, "b 9 4 h2 w2"]
+) -> Float[Tensor, "b h w"]:
+    """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
+    h, w = quarter.shape[1:]
+    padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
+    near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]
+    wide = F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
+    return F.pixel_shuffle((weights * wide[:, :, None]).sum(1), 2)[:, 0]
+
+
+def mean_of_best(scores: Float[Tensor, "b d h w"], candidates: int) -> Float[Tensor, "b h w"]:
+    """Give the expected disparity [bins] over the disparities of the highest scores."""
+    best = scores.topk(candidates, 1)
+    return (best.values.softmax(1) * best.indices).sum(1)
+
+
+def mean_of_all(scores: Float[Tensor, "b d h w"]) -> Float[Tensor, "b h w"]:
+    """Give the expected disparity [bins] over all disparities."""
+    bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
+    return (scores.softmax(1) * bins[:, None, None]).sum(1)
+
+
+class LightStereo(nn.Module):
+    """Rectified pair to disparity at a fraction of PSMNet's operations.
+
+    Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 32.
+    """
+
+    def __init__(self, config: LightConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or LightConfig()
+        self.features = LightFeatures(self.config)
+        self.describe = nn.Conv2d(self.config.width, self.config.width, 1, bias=False)
+        self.aggregation = Aggregation(self.config, self.features.widths)
+        self.enlargement = Enlargement(self.config.width)
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Maps, ...]:
+        """Match the pair.
+
+        Returns:
+            Disparity of the left view [px]: while training that of all scores, enlarged without
+            the image, then the answer; in eval mode the answer alone.
+
+        Raises:
+            InputError: the images' size does not suit the network.
+        """
+        scores, weights = self.scores(left, right, self.config.max_disparity_px)
+        found_px = enlarge(4 * mean_of_best(scores, self.config.candidates), weights)
+        if not self.training:
+            return (found_px,)
+        coarse_px = 4 * mean_of_all(scores)[:, None]
+        return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], found_px
+
+    def scores(
+        self,
+        left: Float[Tensor, "b 3 h w"],
+        right: Float[Tensor, "b 3 h w"],
+        max_disparity_px: int,
+    ) -> tuple[Float[Tensor, "b d h4 w4"], Float[Tensor, "b 9 4 h2 w2"]]:
+        """Answer a score for each disparity at 1/4 size, and the weights that enlarge maps.
+
+        Scores are float32 at least: 8 bits would round the expectation to whole pixels.
+        """
+        self._check_size(left)
+        near, far = self.features(left), self.features(right).levels[0]
+        volume = correlation_volume(
+            self.describe(near.levels[0]),
+            self.describe(far),
+            max_disparity_px // 4,
+            self.config.groups,
+        )
+        scores = self.aggregation(volume, near.levels)
+        wide = torch.promote_types(scores.dtype, torch.float32)
+        return scores.to(wide), self.enlargement(near).to(wide)
+
+    def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
+        h, w = image.shape[-2:]
+        if h % 32 or w % 32:
+            raise InputError(
+                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
+                "pair, as LightMatcher does"
+            )

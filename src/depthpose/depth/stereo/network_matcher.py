@@ -1,0 +1,262 @@
+"""A network as a matcher: images of any size in, disparity and confidence out.
+
+What every network with weights shares: normalisation, padding, the working focal length, tiles, the
+check from right to left.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera
+from depthpose.core.devices import usable_device, usable_precision
+from depthpose.core.errors import InputError
+from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
+from depthpose.depth.disparity import (
+    focal_size,
+    left_right_difference_px,
+    resize_image,
+    resized_match,
+)
+from depthpose.depth.stereo.matcher import TiledMatcher, check_pair
+from depthpose.depth.stereo.plan import Tiling, match_tiles
+from depthpose.depth.types import Match
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
+
+Views = Float[Tensor, "b 3 h w"]
+
+NetworkConfig = PSMNetConfig | LightConfig
+
+_MOST_REACH = 1.5
+"""Times the disparities of training that a fine match looks through at most."""
+
+AGREEMENT_PX = 3.0
+"""Difference of left and right disparity at which their agreement is down to 1/e."""
+
+
+class NetworkMatcher(ABC):
+    """A network with the world around it: normalisation, padding, device, tiles.
+
+    A kind of network adds :meth:`run`. Where the processor has no bf16, ``config`` says fp32 in its
+    place.
+
+    Raises:
+        InputError: the device does not exist on this machine.
+    """
+
+    fine_pixels: ClassVar[int]
+    """Pixels of a fine match at most."""
+
+    def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
+        config = config or MatcherConfig()
+        self.device = usable_device(config.device)
+        self.config = with_usable_precision(config)
+        self.network_config = network
+
+    @abstractmethod
+    def run(self, left: Views, right: Views, network: Any) -> list[Match]:  # noqa: ANN401
+        """Match normalised pairs whose sides suit the network.
+
+        Args:
+            left: left views.
+            right: right views, the same size.
+            network: the network's config, perhaps with more disparities than it was trained with.
+
+        Raises:
+            InputError: a memory bound that is too small for them.
+        """
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return DTYPES[self.config.precision]
+
+    @torch.no_grad()
+    def match(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair of any size.
+
+        Raises:
+            InputError: unusable images, or a memory bound that is too small for them.
+        """
+        return self.match_many([(left, right)])[0]
+
+    @torch.no_grad()
+    def match_many(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], camera: Camera | None = None
+    ) -> list[Match]:
+        """Match pairs; those of one size together, unless memory is bounded or there are tiles.
+
+        Pairs of a known camera are matched at the size of :meth:`work_size`. A processor is busy
+        with one pair; it is a GPU that gains from several.
+
+        Raises:
+            InputError: as :meth:`match`.
+        """
+        for left, right in pairs:
+            check_pair(left, right)
+        if camera is None or self.network_config.work_focal_px is None:
+            return self._match_alike(pairs, self.network_config)
+        size = self.work_size(camera)
+        network = self._reaching(self._work_focal_px(camera))
+        seen = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
+        found = self._match_alike(seen, network)
+        sizes = [left.shape[1:] for left, _ in pairs]
+        return [resized_match(match, *own) for match, own in zip(found, sizes, strict=True)]
+
+    def work_size(self, camera: Camera) -> tuple[int, int]:
+        """Rows and columns at which images of a camera are matched [px]."""
+        if self.network_config.work_focal_px is None:
+            return camera.height, camera.width
+        return focal_size(camera, self._work_focal_px(camera))
+
+    def _work_focal_px(self, camera: Camera) -> float:
+        """Focal length at which images of a camera are matched [px]."""
+        trained_px = self.network_config.work_focal_px
+        assert trained_px is not None
+        if self.config.speed == "quick":
+            return trained_px
+        share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
+        return max(trained_px, float(camera.K[0, 0]) * min(share, 1.0))
+
+    def _reaching(self, focal_px: float) -> NetworkConfig:
+        """Give the network with the disparities that a larger size needs."""
+        trained = self.network_config
+        assert trained.work_focal_px is not None
+        larger = min(focal_px / trained.work_focal_px, _MOST_REACH)
+        reach_px = round(trained.max_disparity_px * larger, 3)
+        step_px = trained.step_px
+        return replace(trained, max_disparity_px=step_px * math.ceil(reach_px / step_px))
+
+    def _match_alike(
+        self, pairs: Sequence[tuple[Tensor, Tensor]], network: NetworkConfig
+    ) -> list[Match]:
+        with_tiles = self.config.tile_px is not None
+        is_alone = with_tiles or self.config.max_memory_bytes is not None
+        if is_alone or len({left.shape for left, _ in pairs}) > 1:
+            groups = [[pair] for pair in pairs]
+        else:
+            groups = [list(pairs)]
+        found = [self._match(group, network, with_tiles=with_tiles) for group in groups]
+        return list(chain(*found))
+
+    @torch.no_grad()
+    def match_whole(self, left: Tensor, right: Tensor) -> Match:
+        """Match one pair without tiles, whatever the config says: what tiles are compared with.
+
+        Raises:
+            InputError: as :meth:`match`.
+        """
+        check_pair(left, right)
+        return self._match([(left, right)], self.network_config, with_tiles=False)[0]
+
+    def _match(
+        self, pairs: list[tuple[Tensor, Tensor]], network: NetworkConfig, *, with_tiles: bool
+    ) -> list[Match]:
+        """Match pairs of one size together."""
+        views = [self._normalised(torch.stack(list(of))) for of in zip(*pairs, strict=True)]
+        way = self._match_tiled if with_tiles else self._match_padded
+        found = self._match_both_ways(partial(way, network=network), views[0], views[1])
+        return [_moved(match, pairs[0][0].device) for match in found]
+
+    def _normalised(self, views: Views) -> Views:
+        return normalise(views.to(self.device, torch.float32))
+
+    def _match_both_ways(
+        self, one_way: Callable[[Views, Views], list[Match]], left: Views, right: Views
+    ) -> list[Match]:
+        found = one_way(left, right)
+        if self.config.with_left_right_check:
+            mirrored = one_way(right.flip(-1), left.flip(-1))
+            found = [
+                lower_where_disagreeing(match, other.disparity_px.flip(-1))
+                for match, other in zip(found, mirrored, strict=True)
+            ]
+        return found
+
+    def _match_tiled(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        assert self.config.tile_px is not None
+        reach = network.max_disparity_px
+        tiling = Tiling(*self.config.tile_px, self.config.tile_overlap_px, reach)
+
+        def match_tile(one: Tensor, other: Tensor) -> Match:
+            return self._match_padded(one[None], other[None], network)[0]
+
+        both = zip(left, right, strict=True)
+        return [match_tiles(match_tile, one, other, tiling) for one, other in both]
+
+    def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        """Match normalised pairs of any size: pad, run, crop back."""
+        h, w = left.shape[-2:]
+        found = self.run(pad_top_right(left, network), pad_top_right(right, network), network)
+        return [_cropped(match, h, w) for match in found]
+
+
+def _cropped(match: Match, height: int, width: int) -> Match:
+    confidence = None if match.confidence is None else match.confidence[-height:, :width]
+    return Match(disparity_px=match.disparity_px[-height:, :width], confidence=confidence)
+
+
+def _moved(match: Match, device: torch.device) -> Match:
+    confidence = None if match.confidence is None else match.confidence.to(device)
+    return Match(disparity_px=match.disparity_px.to(device), confidence=confidence)
+
+
+def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
+    """Give a config whose precision its device computes in; says so where it is another."""
+    is_bf16 = usable_precision(config.precision, config.device) == "bf16"
+    return replace(config, precision="bf16" if is_bf16 else "fp32")
+
+
+def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
+    """RGB in [0, 1] to what the network was trained on: ImageNet's mean 0 and deviation 1."""
+    mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
+    return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
+
+
+def pad_top_right(
+    image: Float[Tensor, "*batch 3 h w"], network: NetworkConfig
+) -> Float[Tensor, "*batch 3 h2 w2"]:
+    """Pad a normalised image with zeros, top and right, to a size that suits the network.
+
+    Top and right, as PSMNet's authors do: columns stay where they are, so disparity does too.
+    """
+    step, least = network.step_px, network.min_side_px
+    h, w = (max(least, -(-side // step) * step) for side in image.shape[-2:])
+    return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
+
+
+def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Match:
+    """Lower the confidence where the right view's own disparity is another.
+
+    Halved at least where the matching point lies outside the right view: nothing there can
+    agree, and nothing contradicts.
+    """
+    difference_px = left_right_difference_px(found.disparity_px, right_px)
+    agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
+    confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
+    return Match(disparity_px=found.disparity_px, confidence=confidence)
+
+
+def tile_change_px(matcher: TiledMatcher, left: Tensor, right: Tensor) -> float:
+    """Mean difference that tiles make to the disparity of a pair [px].
+
+    Raises:
+        InputError: the matcher uses no tiles, or the pair is unusable.
+    """
+    if matcher.config.tile_px is None:
+        raise InputError("tile_change_px needs a matcher with tiles; set tile_px in its config")
+    tiled = matcher.match(left, right).disparity_px
+    whole = matcher.match_whole(left, right).disparity_px
+    return float((tiled - whole).abs().mean())
