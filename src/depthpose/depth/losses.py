@@ -141,6 +141,42 @@ def plane_loss(
     return torch.where(is_known, loss, 0.0).sum() / is_known.sum().clamp(min=1)
 
 
+def photometric_error(
+    one: Float[Tensor, "b 3 h w"], other: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b h w"]:
+    """Dissimilarity of each pixel's neighbourhood, 0 to 1: 0.85 (1 - SSIM) / 2 + 0.15 L1.
+
+    SSIM over 3x3 pixels, as Godard et al. (CVPR 2017) use it for views of one scene.
+    """
+    means = [F.avg_pool2d(F.pad(v, (1, 1, 1, 1), mode="reflect"), 3, 1) for v in (one, other)]
+    squares = [
+        F.avg_pool2d(F.pad(a * b, (1, 1, 1, 1), mode="reflect"), 3, 1)
+        for a, b in ((one, one), (other, other), (one, other))
+    ]
+    products = (means[0] ** 2, means[1] ** 2, means[0] * means[1])
+    spread, other_spread, common = (s - p for s, p in zip(squares, products, strict=True))
+    first = (2 * products[2] + _SSIM[0]) * (2 * common + _SSIM[1])
+    second = (products[0] + products[1] + _SSIM[0]) * (spread + other_spread + _SSIM[1])
+    unlike = ((1 - first / second) / 2).clamp(0, 1).mean(1)
+    return 0.85 * unlike + 0.15 * (one - other).abs().mean(1)
+
+
+_SSIM = (0.01**2, 0.03**2)
+"""Constants of SSIM for values in [0, 1] (Wang et al. 2004)."""
+
+
+def smoothness_loss(
+    disparity_px: Float[Tensor, "b h w"], image: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, ""]:
+    """Mean change of disparity between neighbours [px], less where the image changes as well."""
+    total = disparity_px.new_zeros(())
+    for axis in (1, 2):
+        change = disparity_px.diff(dim=axis).abs()
+        edge = image.diff(dim=axis + 1).abs().mean(1)
+        total = total + (change * torch.exp(-10 * edge)).mean()
+    return total
+
+
 def view_loss(
     drawn: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, " b"]:

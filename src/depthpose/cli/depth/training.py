@@ -1,4 +1,4 @@
-"""``depthpose depth train view|select|stereo|finetune`` and ``depth calibrate``."""
+"""``depthpose depth train view|select|stereo|adapt|finetune`` and ``depth calibrate``."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -29,12 +29,21 @@ class PairsOptions:
     unless the config sets another number."""
 
     def applied(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
-        """Give the config of a training with these folders."""
+        """Give the config of a training with these folders.
+
+        Raises:
+            InputError: the stage takes no held-out pairs.
+        """
         from depthpose.depth.config import PairsConfig
 
         pairs = changed(chosen.pairs, folders=self.data or None)
         if not self.held_out:
             return dataclasses.replace(chosen, pairs=pairs)
+        if not hasattr(chosen, "held_out"):
+            raise InputError(
+                "--held-out has no meaning for 'adapt', which keeps a share of the pairs back "
+                "itself (kept_back in the config); leave it out."
+            )
         held_out = chosen.held_out or PairsConfig(
             focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
         )
@@ -53,7 +62,7 @@ class BeginningOptions:
     """finetune: what matches the drawn view: weights with a matcher, by name or file, which are not
     changed."""
     start: str | None = None
-    """view, select, stereo: weights to begin with."""
+    """view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default."""
     encoder: str | None = None
     """select, stereo with a light network: weights of the encoder to begin with, of 'depthpose
     weights import efficientnet-lite0'."""
@@ -78,7 +87,7 @@ Beginning = Annotated[BeginningOptions, tyro.conf.OmitArgPrefixes]
 
 
 def train(
-    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
+    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
     out: Path,
     config: Path | None = None,
     pairs: Pairs = PairsOptions(),
@@ -91,6 +100,9 @@ def train(
         select    a generator that looks the right view up in the left image, and answers depth
                   itself; needs pairs with truth
         stereo    the matcher; needs pairs with truth
+        adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. A fifth
+                  of them is kept back, and weights are written only if these fit better and
+                  synthetic streets no worse
         finetune  either generator through the frozen matcher; needs weights of both
 
     A config holds every setting; the options below change what they name. The run folder keeps
@@ -101,7 +113,7 @@ def train(
         depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
 
     Args:
-        stage: what is trained: view, select, stereo or finetune.
+        stage: what is trained: view, select, stereo, adapt or finetune.
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
     """

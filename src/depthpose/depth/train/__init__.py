@@ -4,6 +4,7 @@ from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.runs import (
     STAGES,
     Run,
+    train_adapt,
     train_finetune,
     train_select,
     train_stereo,
@@ -21,6 +22,7 @@ __all__ = [
     "StereoTask",
     "TrainingPairs",
     "ViewTask",
+    "train_adapt",
     "train_finetune",
     "train_select",
     "train_stereo",

@@ -1,4 +1,4 @@
-"""Settings of the three stages; the defaults are the thesis's schedules (2.4.2, 2.5.3)."""
+"""Settings of the stages; the defaults of the thesis's three are its schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -6,6 +6,7 @@ from typing import Literal
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
+    AugmentConfig,
     DegradeConfig,
     GeneratorConfig,
     LightConfig,
@@ -187,6 +188,67 @@ class StereoTraining:
     def network(self) -> PSMNetConfig | LightConfig:
         """Config of the network that is trained."""
         return self.light or self.matcher
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptTraining:
+    """A matcher gets used to the pairs of one rig, without truth (see ``train.adapt``)."""
+
+    start: str = "default"
+    """Weights of the matcher that is adapted (or a whole set)."""
+
+    photometric_weight: float = 1.0
+    """Weight of the difference between a view and the other one looked up by its disparity."""
+
+    smooth_weight: float = 0.02
+    """Weight of changes of disparity where the image does not change."""
+
+    label_weight: float = 0.1
+    """Weight of the error to what the start itself found, where both views agreed."""
+
+    kept_back: int = 5
+    """One pair of so many is not trained on: by these the result is accepted or refused."""
+
+    streets: int = 8
+    """Synthetic streets by which forgetting is measured; 0: it is not."""
+
+    adam: AdamConfig = field(
+        default_factory=lambda: AdamConfig(learning_rate=1e-4, schedule="cosine", warmup_steps=20)
+    )
+    """The optimiser."""
+
+    pairs: PairsConfig = field(
+        default_factory=lambda: PairsConfig(
+            with_cache=True, augment=AugmentConfig(crop_px=(192, 384), jitter=0.0)
+        )
+    )
+    """Pairs of the rig, with calibration; their truth is not used. Views must not be changed
+    apart."""
+
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(steps=200, batch_size=1, save_every_steps=50)
+    )
+    """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse weights and counts that are none, and views that are changed apart."""
+        weights = (self.photometric_weight, self.smooth_weight, self.label_weight)
+        if min(weights) < 0 or max(weights) == 0:
+            raise InputError(
+                "photometric_weight, smooth_weight and label_weight must be 0 or more, and one "
+                f"above 0; got {weights}"
+            )
+        if self.kept_back < 2 or self.streets < 0:
+            raise InputError(
+                f"kept_back must be 2 or more and streets 0 or more, got {self.kept_back} and "
+                f"{self.streets}"
+            )
+        augment = self.pairs.augment
+        if augment.apart is not None or augment.erased_share or augment.misaligned_px:
+            raise InputError(
+                "pairs.augment changes views apart (apart, erased_share or misaligned_px), and "
+                "this training compares them with each other; leave these out"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

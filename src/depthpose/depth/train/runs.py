@@ -1,7 +1,7 @@
 """A config to a trained weights file: the three stages as commands run them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,6 +11,7 @@ from torch import nn
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
+from depthpose.core.files import write_json
 from depthpose.core.loop import (
     LoopConfig,
     Progress,
@@ -21,11 +22,19 @@ from depthpose.core.loop import (
     train,
 )
 from depthpose.core.run import claim_folder, find_shard
-from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
+from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.lite0 import load_lite0
 from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
+from depthpose.depth.train.adapt import (
+    AdaptTask,
+    Guard,
+    adapted_text,
+    label_folders,
+    refuse_worse,
+)
 from depthpose.depth.train.config import (
+    AdaptTraining,
     FinetuneTraining,
     SelectTraining,
     StereoTraining,
@@ -40,6 +49,8 @@ _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_e
 """Settings of the loop that change no weight: a resumed run may have others."""
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
 """Settings that may name weights."""
+_LARGER = 1.5
+"""Times the focal length of the weights at which a matcher is adapted: that of fine matches."""
 _MEASURED = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
@@ -150,6 +161,40 @@ def _make_matcher(config: StereoTraining) -> PSMNet | LightStereo:
     return matcher
 
 
+def train_adapt(config: AdaptTraining, run: Run) -> Path:
+    """Adapt a matcher to a rig by its pairs alone; give its weights file.
+
+    Raises:
+        InputError: no folder of pairs, or the matcher became worse.
+    """
+    torch.manual_seed(config.loop.seed)
+    if not config.pairs.folders:
+        raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
+    start = find_weights(config.start)
+    matcher = read_matcher(start)
+    assert isinstance(matcher, PSMNet | LightStereo), "the kinds of matchers with weights"
+    focal_px = matcher.config.work_focal_px
+    if config.pairs.focal_px is None and focal_px is not None:
+        pairs = replace(config.pairs, focal_px=_LARGER * focal_px)
+        config = replace(config, pairs=pairs)
+    labelled, kept = label_folders(config, run.folder / "labels")
+    pairs = _pairs(labelled, config.loop, needs_truth=True)
+    facts, seconds = _walk(AdaptTask(matcher, config), pairs, config, run)
+    facts = facts | {"truth": "none; what the start itself found holds it in place"}
+    path = run.folder / "matcher.safetensors"
+    if find_shard().rank:
+        return path
+    guard = Guard(
+        kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
+    )
+    verdicts = [guard.measure(network) for network in (read_matcher(start), matcher.eval())]
+    write_json(run.folder / "adapt.json", [asdict(verdict) for verdict in verdicts])
+    refuse_worse(*verdicts)
+    write_depth_weights(path, matcher=matcher, facts=facts)
+    leave_card(path, "depth train adapt", seconds, facts, adapted_text(*verdicts))
+    return path
+
+
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)
@@ -174,6 +219,7 @@ STAGES = {
     "view": (ViewTraining, train_view),
     "select": (SelectTraining, train_select),
     "stereo": (StereoTraining, train_stereo),
+    "adapt": (AdaptTraining, train_adapt),
     "finetune": (FinetuneTraining, train_finetune),
 }
 """Config and function of each stage, by its name on the command line."""

@@ -1,0 +1,245 @@
+"""A matcher gets used to one rig's pairs without truth, and is kept only if it became better.
+
+The loss looks the other view up by the disparity of each view and compares (Godard et al., CVPR
+2017), where the disparities of both views agree: elsewhere one of the two does not see the point.
+What the matcher knew before, where both views agreed at full size, holds it in place.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.errors import InputError
+from depthpose.core.loop import Evidence, Turn, make_adam
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.config import MatcherConfig, PairsConfig, StreetsConfig
+from depthpose.depth.datasets import Dataset, open_dataset
+from depthpose.depth.disparity import left_right_difference_px, warp_right_to_left
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.labels import LabelConfig, label_pairs
+from depthpose.depth.losses import heads_loss, photometric_error, smoothness_loss
+from depthpose.depth.stereo import LightStereo, PSMNet, make_matcher, normalise
+from depthpose.depth.synthetic import Streets
+from depthpose.depth.train.config import AdaptTraining
+from depthpose.depth.types import StereoInput
+
+_AGREE_PX, _AGREE_SHARE = 1.0, 0.03
+"""Disparities of both views agree within so many pixels, or such a share."""
+_BAD_PX, _BAD_SHARE = 3.0, 0.05
+"""A disparity is bad beyond both, as KITTI counts."""
+_FORGOTTEN = 0.005
+"""More bad disparities on synthetic streets than this share are too many."""
+_STREETS_SEED = 977
+
+
+class AdaptTask:
+    """Photometric error of both views, smoothness, and the labels of the start."""
+
+    def __init__(self, matcher: PSMNet | LightStereo, config: AdaptTraining) -> None:
+        self.config, self.matcher = config, matcher
+        _keep_statistics(matcher)
+        self.modules: dict[str, nn.Module] = {"matcher": matcher}
+        parameters = [p for p in matcher.parameters() if p.requires_grad]
+        self.optimizers = {"matcher": (make_adam(parameters, config.adam), config.adam)}
+
+    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+        """One turn: match both ways, look each view up in the other."""
+        views = torch.cat([batch.left, batch.right.flip(-1)])
+        others = torch.cat([batch.right, batch.left.flip(-1)])
+        heads = [head.float() for head in self.matcher(normalise(views), normalise(others))]
+        found_px, count = heads[-1], len(batch.left)
+        error = _photometric_loss(views, others, found_px, count)
+        smooth = smoothness_loss(found_px, views)
+        reach = self.matcher.config.max_disparity_px
+        label = heads_loss([head[:count] for head in heads], batch.left_px, reach)
+        config = self.config
+        loss = config.photometric_weight * error + config.smooth_weight * smooth
+        loss = loss + config.label_weight * label
+        facts = {"photometric": error.detach(), "smooth": smooth.detach(), "label": label.detach()}
+        yield Turn("matcher", loss, facts)
+
+    def validate(self) -> Evidence:
+        """Nothing: what was kept back is looked at once, at the end."""
+        return Evidence()
+
+
+def _keep_statistics(matcher: nn.Module) -> None:
+    """Leave batch norm at the statistics of the training before: one or two pairs have none."""
+    matcher.train()
+    for part in matcher.modules():
+        if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
+            part.eval()
+
+
+def _photometric_loss(
+    views: Float[Tensor, "b 3 h w"],
+    others: Float[Tensor, "b 3 h w"],
+    found_px: Float[Tensor, "b h w"],
+    count: int,
+) -> Float[Tensor, ""]:
+    """Mean difference where both ways agree; the first ``count`` are left views."""
+    looked_up = torch.stack(list(map(warp_right_to_left, others, found_px)))
+    back_px = found_px.roll(count, 0).flip(-1)
+    is_seen = torch.stack(list(map(agreeing, found_px, back_px)))
+    error = photometric_error(views, looked_up.nan_to_num(0.0))
+    return torch.where(is_seen, error, 0.0).sum() / is_seen.sum().clamp(min=1)
+
+
+@torch.no_grad()
+def agreeing(left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Where the disparities of both views say the same of one point, inside both."""
+    limit_px = (_AGREE_SHARE * left_px).clamp(min=_AGREE_PX)
+    return left_right_difference_px(left_px, right_px) <= limit_px
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What a matcher does on pairs that were kept back, and on synthetic streets.
+
+    Attributes:
+        photometric: difference of left views and right ones looked up, where the start's two
+            disparities agreed.
+        disagreeing: share of pixels whose disparities of both views do not agree.
+        street_d1: share of bad disparities on synthetic streets; NaN without any.
+        street_epe_px: mean error there [px].
+    """
+
+    photometric: float
+    disagreeing: float
+    street_d1: float
+    street_epe_px: float
+
+
+class Guard:
+    """Measures a matcher before and after, and refuses what became worse.
+
+    Args:
+        pairs: pairs of the rig that are not trained on.
+        streets: how many synthetic streets.
+        config: how matchers run.
+    """
+
+    def __init__(self, pairs: Sequence[StereoInput], streets: int, config: MatcherConfig) -> None:
+        self.pairs, self.config = pairs, config
+        made = Streets(StreetsConfig(seed=_STREETS_SEED, scale=0.5, frames=max(streets, 1)))
+        self.streets = [made[index] for index in range(streets)]
+        self._seen: list[Bool[Tensor, "h w"]] = []
+
+    @torch.no_grad()
+    def measure(self, matcher: nn.Module) -> Verdict:
+        """Measure a network in eval mode; the first one decides which pixels count."""
+        net = FakestereoNet(make_matcher(matcher, self.config))
+        errors, apart = [], []
+        for number, pair in enumerate(self.pairs):
+            left_px, right_px = match_both_ways(net, pair)
+            agrees = agreeing(left_px, right_px)
+            if len(self._seen) == number:
+                self._seen.append(agrees)
+            assert pair.right is not None
+            looked_up = warp_right_to_left(pair.right, left_px)
+            counts = self._seen[number] & looked_up[0].isfinite()
+            error = photometric_error(pair.left[None], looked_up.nan_to_num(0.0)[None])[0]
+            errors.append(error[counts].mean())
+            apart.append((~agrees).float().mean())
+        bad, off_px = self._on_streets(net)
+        return Verdict(
+            photometric=float(torch.stack(errors).mean()),
+            disagreeing=float(torch.stack(apart).mean()),
+            street_d1=bad,
+            street_epe_px=off_px,
+        )
+
+    def _on_streets(self, net: FakestereoNet) -> tuple[float, float]:
+        bad, off_px = [], []
+        for street in self.streets:
+            truth_px = street.truth.disparity_px
+            assert truth_px is not None
+            found_px = net.estimate_pair(street.input).disparity_px
+            error = (found_px - truth_px).abs()[truth_px > 0]
+            limit_px = (_BAD_SHARE * truth_px[truth_px > 0]).clamp(min=_BAD_PX)
+            bad.append((error > limit_px).float().mean())
+            off_px.append(error.mean())
+        if not bad:
+            return float("nan"), float("nan")
+        return float(torch.stack(bad).mean()), float(torch.stack(off_px).mean())
+
+
+def refuse_worse(before: Verdict, after: Verdict) -> None:
+    """Refuse a matcher that lost more than it gained.
+
+    Raises:
+        InputError: the pairs that were kept back fit no better, or the streets much worse.
+    """
+    said = f"before {asdict(before)}, after {asdict(after)}"
+    advice = "no weights are written; take fewer steps, a lower learning_rate, or more pairs"
+    if after.photometric >= before.photometric and after.disagreeing >= before.disagreeing:
+        raise InputError(f"the pairs that were kept back fit no better: {said}; {advice}.")
+    if after.street_d1 > before.street_d1 + _FORGOTTEN:
+        raise InputError(
+            f"synthetic streets are matched worse by more than {_FORGOTTEN:.1%} bad disparities: "
+            f"{said}; {advice}."
+        )
+
+
+def match_both_ways(
+    net: FakestereoNet, pair: StereoInput
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Give the disparities of the left and of the right view."""
+    assert pair.right is not None
+    mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
+    one, other = net.estimate_pair(pair), net.estimate_pair(mirrored)
+    return one.disparity_px, other.disparity_px.flip(-1)
+
+
+def split_pairs(folder: str, split: str | None, kept_back: int) -> tuple[Dataset, list[int]]:
+    """Open a folder of pairs; give the numbers of those that are kept back, evenly spread.
+
+    Raises:
+        InputError: fewer than two pairs with calibration.
+    """
+    dataset = open_dataset(folder, split)
+    usable = [n for n, frame in enumerate(dataset.frames) if frame.right and frame.calibration]
+    if len(usable) < 2:
+        raise InputError(
+            f"{dataset.name}: {len(usable)} of {len(dataset.frames)} frames have a right view and "
+            "a calibration; two at least are needed, one to train on and one to measure by"
+        )
+    return dataset, usable[:: max(min(kept_back, len(usable)), 2)]
+
+
+def adapted_text(before: Verdict, after: Verdict) -> str:
+    """Show for a card what changed, as Markdown."""
+    rows = [
+        f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |" for name, old in vars(before).items()
+    ]
+    head = ["Pairs that were kept back, and synthetic streets:", "", "| | before | after |"]
+    return "\n".join([*head, "| --- | --- | --- |", *rows])
+
+
+def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[StereoInput]]:
+    """Label all pairs by the start, once, below ``home``; give what to train on, and the rest."""
+    folders: list[str] = []
+    excluded: list[str] = list(config.pairs.exclude)
+    kept: list[StereoInput] = []
+    path = find_weights(config.start)
+    net = FakestereoNet.load(path, matcher=path)
+    limits = LabelConfig()
+    for number, folder in enumerate(config.pairs.folders):
+        split = config.pairs.split if number == 0 else None
+        dataset, back = split_pairs(folder, split, config.kept_back)
+        kept += [dataset.read_input(n) for n in back]
+        excluded += [dataset.frames[n].name for n in back]
+        settings = {"dataset": dataset.name, "weights_sha256": file_sha256(path), **asdict(limits)}
+        place = home / f"{number}-{Path(folder).name}"
+        for _ in label_pairs(net, dataset, limits, place, settings):
+            pass
+        folders.append(str(place))
+    pairs = replace(
+        config.pairs, folders=tuple(folders), exclude=tuple(excluded), truth="disparity", split=None
+    )
+    return pairs, kept
