@@ -8,6 +8,7 @@ What the matcher knew before, where both views agreed at full size, holds it in 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,7 +24,7 @@ from depthpose.depth.disparity import left_right_difference_px, warp_right_to_le
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.labels import LabelConfig, label_pairs
 from depthpose.depth.losses import heads_loss, photometric_error, smoothness_loss
-from depthpose.depth.stereo import LightStereo, PSMNet, make_matcher, normalise
+from depthpose.depth.stereo import make_matcher, normalise
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train.config import AdaptTraining
 from depthpose.depth.types import StereoInput
@@ -34,13 +35,20 @@ _BAD_PX, _BAD_SHARE = 3.0, 0.05
 """A disparity is bad beyond both, as KITTI counts."""
 _FORGOTTEN = 0.005
 """More bad disparities on synthetic streets than this share are too many."""
+_NOTHING = 0.002
+"""A change by this share is none."""
 _STREETS_SEED = 977
 
 
 class AdaptTask:
-    """Photometric error of both views, smoothness, and the labels of the start."""
+    """Photometric error of both views, smoothness, and the labels of the start.
 
-    def __init__(self, matcher: PSMNet | LightStereo, config: AdaptTraining) -> None:
+    Args:
+        matcher: a network that is trained by the stage ``stereo``.
+        config: weights of the losses.
+    """
+
+    def __init__(self, matcher: nn.Module, config: AdaptTraining) -> None:
         self.config, self.matcher = config, matcher
         _keep_statistics(matcher)
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
@@ -55,7 +63,8 @@ class AdaptTask:
         found_px, count = heads[-1], len(batch.left)
         error = _photometric_loss(views, others, found_px, count)
         smooth = smoothness_loss(found_px, views)
-        reach = self.matcher.config.max_disparity_px
+        network: Any = self.matcher.config
+        reach = network.max_disparity_px
         label = heads_loss([head[:count] for head in heads], batch.left_px, reach)
         config = self.config
         loss = config.photometric_weight * error + config.smooth_weight * smooth
@@ -173,11 +182,19 @@ def refuse_worse(before: Verdict, after: Verdict) -> None:
     """Refuse a matcher that lost more than it gained.
 
     Raises:
-        InputError: the pairs that were kept back fit no better, or the streets much worse.
+        InputError: the pairs that were kept back fit no better, by one of both measures worse, or
+            the streets are matched much worse.
     """
     said = f"before {asdict(before)}, after {asdict(after)}"
     advice = "no weights are written; take fewer steps, a lower learning_rate, or more pairs"
-    if after.photometric >= before.photometric and after.disagreeing >= before.disagreeing:
+    changes = [
+        new / max(old, 1e-9) - 1
+        for old, new in (
+            (before.photometric, after.photometric),
+            (before.disagreeing, after.disagreeing),
+        )
+    ]
+    if max(changes) > _NOTHING or min(changes) > -_NOTHING:
         raise InputError(f"the pairs that were kept back fit no better: {said}; {advice}.")
     if after.street_d1 > before.street_d1 + _FORGOTTEN:
         raise InputError(
