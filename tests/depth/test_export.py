@@ -109,6 +109,7 @@ def test_the_gathered_volume_is_the_concatenation_volume(width: int) -> None:
     assert torch.equal(gathered_volume(left, right, 8), concatenation_volume(left, right, 8))
 
 
+@pytest.mark.slow
 def test_the_graph_of_the_light_network_takes_any_size() -> None:
     torch.manual_seed(0)
     config = LightConfig(
@@ -122,9 +123,9 @@ def test_the_graph_of_the_light_network_takes_any_size() -> None:
     answers = session.run(None, {n: v.numpy() for n, v in zip(names, pair, strict=True)})
     with torch.no_grad():
         expected = network(*pair)
+    assert expected[0].std() > 1
     for answer, wanted in zip(answers, expected, strict=True):
         difference = (torch.from_numpy(answer) - wanted).abs()
-        assert wanted.std() > 1e-3
         # Where two scores tie, the last bit decides between candidates.
         assert float((difference > 1e-2).float().mean()) < 0.01
 
