@@ -112,8 +112,8 @@ def as_psmnet(matcher: nn.Module, source: str) -> PSMNet:
     """
     if not isinstance(matcher, PSMNet):
         raise InputError(
-            f"{source}: the matcher is {type(matcher).__name__}, and only PSMNet is trained and "
-            "exported here; give weights of a psmnet."
+            f"{source}: the matcher is {type(matcher).__name__}, and only PSMNet takes part in "
+            "fine-tuning; give weights of a psmnet."
         )
     return matcher
 

@@ -43,8 +43,8 @@ class PairOptions(MatcherOptions):
     """How the matcher of the weights runs on real pairs."""
 
     speed: Speed = "fine"
-    """quick: at the focal length that the weights were trained at; fine: at up to 280,000 pixels,
-    for KITTI in 3 to 4 times the time."""
+    """quick: at the focal length that the weights were trained at; fine: at up to 280,000 pixels
+    (PSMNet) or 500,000 (light), for KITTI in 3 to 4 times the time."""
 
     @property
     def config(self) -> MatcherConfig:

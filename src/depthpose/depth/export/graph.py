@@ -5,14 +5,17 @@ Sizes stay free: the graph computes them from the images that it is given. Netwo
 in operators, because sizes there depend on a focal length, which no exporter follows.
 """
 
+from typing import cast
+
 import numpy as np
 import torch
+from torch import nn
 
 from depthpose.core.errors import InputError
 from depthpose.core.export import Graph, Value, network_model
 from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
 from depthpose.depth.estimator.rig import SKY_M
-from depthpose.depth.export.network import DrawnValues, SizelessPSMNet, drawn
+from depthpose.depth.export.network import DrawnValues, drawn, sizeless
 from depthpose.depth.export.steps import (
     columns,
     focal_size,
@@ -25,9 +28,8 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
-from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
-from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.weights import DepthWeights, as_psmnet
+from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
+from depthpose.depth.weights import DepthWeights
 
 _IMAGES = ("batch", 3, "height", "width")
 _MAPS = ("batch", "height", "width")
@@ -53,7 +55,6 @@ def image_graph(weights: DepthWeights) -> Graph:
             f"{'generator' if generator is None else 'matcher'}; 'depthpose weights pack' makes "
             "one file of both."
         )
-    matcher = None if weights.matcher is None else as_psmnet(weights.matcher, "these weights")
     rig = generator.config
     graph = Graph()
     image = graph.input("image", np.float32, _IMAGES)
@@ -62,7 +63,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     small = focal_size(full, focal_yx(K), rig.virtual_focal_px)
     left = resized_image(image, small)
     seen = drawn(left, generator)
-    found = _answered(left, seen, matcher, rig)
+    found = _answered(left, seen, weights.matcher, rig)
     disparity_px, confidence = (resized_map(values, full) for values in found)
     disparity_px = disparity_px * ratio(full, small)
     focal_m_px = _focal_m_px(K, rig)
@@ -89,21 +90,22 @@ def pair_graph(weights: DepthWeights) -> Graph:
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
-    matcher = as_psmnet(weights.matcher, "these weights")
+    network = sizeless(weights.matcher)
+    config = cast("NetworkConfig", weights.matcher.config)
     graph = Graph()
     left = graph.input("left", np.float32, _IMAGES)
     right = graph.input("right", np.float32, _IMAGES)
     focal_px = None
-    if matcher.config.work_focal_px is not None:
+    if config.work_focal_px is not None:
         focal_px = focal_yx(graph.input("K", np.float64, (3, 3)))
-    _output_maps(graph, None, *_matched(left, right, focal_px, matcher))
+    _output_maps(graph, None, *_matched(left, right, focal_px, network, config))
     return graph
 
 
 def _answered(
     left: Value,
     seen: DrawnValues,
-    matcher: PSMNet | None,
+    matcher: nn.Module | None,
     rig: GeneratorConfig | SelectionConfig,
 ) -> _Maps:
     """Take the generator's own disparity, the matcher's, or both."""
@@ -112,7 +114,8 @@ def _answered(
         return _own(seen)
     assert matcher is not None, "checked before"
     focal_px = np.array([rig.virtual_focal_px] * 2)
-    matched = _matched(left, seen.right, focal_px, matcher)
+    config = cast("NetworkConfig", matcher.config)
+    matched = _matched(left, seen.right, focal_px, sizeless(matcher), config)
     return matched if answer == "matched" else _both(_own(seen), matched)
 
 
@@ -136,14 +139,18 @@ def _between(start: Value, end: Value, share: Value) -> Value:
 
 
 def _matched(
-    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: PSMNet
+    left: Value,
+    right: Value,
+    focal_px: Value | np.ndarray | None,
+    network: nn.Module,
+    config: NetworkConfig,
 ) -> _Maps:
     """Match at the focal length that the weights want, and come back to the images' size."""
     size = work = size_of(left)
-    if matcher.config.work_focal_px is not None:
-        work = focal_size(size, focal_px, matcher.config.work_focal_px)
-    least = matcher.config.min_side_px
-    lacking = ((work + 15) / 16 * 16).op("Max", least) - work
+    if config.work_focal_px is not None:
+        work = focal_size(size, focal_px, config.work_focal_px)
+    least, step = config.min_side_px, config.step_px
+    lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
     above, beside = rows(lacking), columns(lacking)
     widths = pads(left, before=joined(above, 0), after=joined(0, beside))
     mean, deviation = (
@@ -152,9 +159,8 @@ def _matched(
     padded = [
         ((resized_image(view, work) - mean) / deviation).op("Pad", widths) for view in (left, right)
     ]
-    network = SizelessPSMNet(matcher).eval()
-    example = [torch.rand(2, 3, least + 16, least + 32) for _ in range(2)]
-    found = left.graph.call(network_model(network, example, 16), *padded)
+    example = [torch.rand(2, 3, least + step, least + 2 * step) for _ in range(2)]
+    found = left.graph.call(network_model(network, example, step), *padded)
     whole = 1 << 62
     found = [m.slice(joined(above, 0), joined(whole, columns(work)), [1, 2]) for m in found]
     disparity_px, confidence = (resized_map(m, size) for m in found)

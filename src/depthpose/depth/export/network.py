@@ -19,6 +19,7 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
+from depthpose.depth.stereo.light import LightStereo, enlarge, mean_of_best, sureness
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
@@ -59,6 +60,39 @@ class SizelessPSMNet(nn.Module):
         disparity_px = (probability * steps_px).sum(1)
         is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
+
+
+class SizelessLight(nn.Module):
+    """The light network with what its matcher makes of its scores."""
+
+    def __init__(self, network: LightStereo) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+        """Give disparity [px] and confidence of normalised images."""
+        config = self.network.config
+        scores, weights = self.network.scores(left, right, config.max_disparity_px)
+        quarter_px = mean_of_best(scores, config.candidates)
+        return enlarge(quarter_px, weights), enlarge(sureness(scores, quarter_px), weights)
+
+
+def sizeless(matcher: nn.Module) -> nn.Module:
+    """Give a matcher's network, with what is made of its answer, in operations of any size.
+
+    Raises:
+        InputError: a matcher that has no such form.
+    """
+    if isinstance(matcher, PSMNet):
+        return SizelessPSMNet(matcher).eval()
+    if isinstance(matcher, LightStereo):
+        return SizelessLight(matcher).eval()
+    raise InputError(
+        f"the matcher is {type(matcher).__name__}, and only PSMNet and LightStereo are exported; "
+        "give weights of one of these."
+    )
 
 
 class SizelessSelection(nn.Module):

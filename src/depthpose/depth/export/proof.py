@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,10 +15,11 @@ from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
-from depthpose.depth.stereo import make_matcher
+from depthpose.depth.stereo import LightStereo, make_matcher
+from depthpose.depth.stereo.network_matcher import NetworkConfig
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.depth.weights import DepthWeights, as_psmnet
+from depthpose.depth.weights import DepthWeights
 
 _LIMITS = {
     "depth_m": Limit(value=0.01, is_relative=True),
@@ -29,11 +30,13 @@ _LIMITS = {
 }
 _FLIPS = 1e-3
 """Share of pixels that may be sky in one answer alone, with all that follows from it."""
+_FLIPPING_LIMITS = {
+    name: limit if limit.of == "mean" else dataclasses.replace(limit, flips=_FLIPS)
+    for name, limit in _LIMITS.items()
+}
+"""Of the light matcher: where two scores tie, the last bit decides between candidates."""
 _SELECTION_LIMITS = {
-    **{
-        name: limit if limit.of == "mean" else dataclasses.replace(limit, flips=_FLIPS)
-        for name, limit in _LIMITS.items()
-    },
+    **_FLIPPING_LIMITS,
     "is_sky": Limit(value=_FLIPS, of="mean"),
 }
 _PAIR_OUTPUTS = ("disparity_px", "confidence")
@@ -84,7 +87,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     return Export(
         graph=lambda: pair_graph(weights),
         cases=lambda: _pair_cases(weights),
-        limits=_LIMITS,
+        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, LightStereo) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
     )
 
@@ -92,10 +95,11 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     rig = {} if weights.generator is None else _rig_facts(weights)
     selects = isinstance(weights.generator, SelectionGenerator)
+    chooses = isinstance(weights.matcher, LightStereo)
     return Export(
         graph=lambda: image_graph(weights),
         cases=lambda: _image_cases(weights),
-        limits=_SELECTION_LIMITS if selects else _LIMITS,
+        limits=_SELECTION_LIMITS if selects else _FLIPPING_LIMITS if chooses else _LIMITS,
         facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
@@ -136,9 +140,8 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
 
 def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.matcher is not None
-    network = as_psmnet(weights.matcher, "these weights")
-    net = FakestereoNet(make_matcher(network, _QUICK))
-    work_px = network.config.work_focal_px
+    net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
+    work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
     for size in _SIZES:
         left, right = _scenes(*size)
         inputs = {"left": left.numpy(), "right": right.numpy()}

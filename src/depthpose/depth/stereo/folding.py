@@ -2,20 +2,22 @@
 
 from functools import cache
 from itertools import product
-from typing import cast
+from typing import TypeVar, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.depth.stereo.psmnet import ConvNorm, FeatureExtractor
+from depthpose.depth.stereo.psmnet import ConvNorm
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d
 Rows = Float[Tensor, "b _ _ _ _"]
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+_ROWS_PADDING = (0, 1, 1)
 
 
-def folded_weight(layer: ConvNorm) -> tuple[Tensor, Tensor]:
+def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
     """Weight and bias of the one convolution that equals ``layer`` in eval mode, in float64.
 
     ``norm(conv(x)) = gain * (conv(x) - mean) + bias`` with ``gain = weight / sqrt(var + eps)``.
@@ -31,10 +33,10 @@ def folded_weight(layer: ConvNorm) -> tuple[Tensor, Tensor]:
     return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
 
 
-def fold_features(features: FeatureExtractor, like: Tensor) -> FeatureExtractor:
-    """Fold every batch norm of a feature extractor, in place, and bring it to ``like``'s type."""
+def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 2D convolution, in place, and bring all to ``like``'s type."""
     for layer in list(features.modules()):
-        if not isinstance(layer, ConvNorm):
+        if not isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
             continue
         weight, bias = folded_weight(layer)
         conv = cast("nn.Conv2d", layer.conv)
@@ -50,6 +52,36 @@ def fold_features(features: FeatureExtractor, like: Tensor) -> FeatureExtractor:
 
 def _memory_format(x: Tensor) -> torch.memory_format:
     return torch.channels_last if x.ndim == 4 else torch.contiguous_format
+
+
+def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it."""
+    for layer in list(module.modules()):
+        if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
+            layer.conv = VolumeConv(layer, like)
+            layer.norm = nn.Identity()
+    return module
+
+
+class VolumeConv(nn.Module):
+    """A folded 3x3x3 convolution of whole volumes."""
+
+    def __init__(self, layer: ConvNorm, like: Tensor) -> None:
+        super().__init__()
+        self.is_transposed = isinstance(layer.conv, nn.ConvTranspose3d)
+        self.stride = cast("Conv", layer.conv).stride[0]
+        weight, bias = folded_weight(layer)
+        weight = weight.to(like).contiguous(memory_format=torch.channels_last_3d)
+        self.weight = nn.Parameter(weight, requires_grad=False)
+        self.bias = nn.Parameter(bias.to(like), requires_grad=False)
+
+    def forward(self, volume: Rows) -> Rows:
+        """Convolve a volume."""
+        if self.is_transposed:
+            transposed = _onednn_transposed if _has_onednn(volume) else _transposed
+            return transposed(volume, self.weight, self.bias)
+        convolved = _onednn_convolved if _has_onednn(volume) else _convolved
+        return convolved(volume, self.weight, self.bias, self.stride, (1, 1, 1))
 
 
 class RowsConv:
@@ -101,13 +133,25 @@ class CostConv:
         return out[:, 1:-1, 1:-1]
 
 
-def _convolved(rows: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
-    return nn.functional.conv3d(rows, weight, bias, stride, (0, 1, 1))
+def _convolved(
+    rows: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    stride: int,
+    padding: tuple[int, int, int] = _ROWS_PADDING,
+) -> Tensor:
+    return nn.functional.conv3d(rows, weight, bias, stride, padding)
 
 
-def _onednn_convolved(rows: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+def _onednn_convolved(
+    rows: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    stride: int,
+    padding: tuple[int, int, int] = _ROWS_PADDING,
+) -> Tensor:
     strides = (stride,) * 3
-    return torch.mkldnn_convolution(rows, weight, bias, (0, 1, 1), strides, (1, 1, 1), 1)
+    return torch.mkldnn_convolution(rows, weight, bias, padding, strides, (1, 1, 1), 1)
 
 
 def _transposed(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

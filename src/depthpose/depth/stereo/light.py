@@ -20,17 +20,17 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.lite0 import Lite0Encoder
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
-from depthpose.depth.stereo.psmnet import (
-    Shape,
-    conv_norm_2d,
-    conv_norm_3d,
-    deconv_norm_3d,
-)
+from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
+from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
 
 Features = Float[Tensor, "b _ _ _"]
 Volume = Float[Tensor, "b _ _ _ _"]
 Maps = Float[Tensor, "b h w"]
+Scores = Float[Tensor, "b d h4 w4"]
+Quarter = Float[Tensor, "b h4 w4"]
 
+_STEP_PX = 4
+"""Distance of neighbouring disparities that have a score."""
 _STEM = 16
 """Channels at half size."""
 _DEEP = 96
@@ -80,7 +80,9 @@ class LightFeatures(nn.Module):
         quarter = half
         for layer in self.quarter:
             quarter = F.relu(layer(quarter))
-        skips = self.encoder(F.avg_pool2d(image, 2) * self.deviation + self.mean)
+        skips = self.encoder(
+            F.avg_pool2d(image, 2) * self.deviation.to(image) + self.mean.to(image)
+        )
         levels = [F.relu(self.top(skips[3]))]
         seen = (skips[2], skips[1], torch.cat([skips[0], quarter], 1))
         for layer, skip in zip(self.decoder, seen, strict=True):
@@ -97,13 +99,9 @@ def correlation_volume(
     Zero where the right pixel falls outside the image.
     """
     width = left.shape[-1]
-    left, right = _unit(left, groups), _unit(right, groups)
-    planes = [
-        F.pad((left[..., d:] * right[..., : width - d]).sum(2), (d, 0))
-        for d in range(min(bins, width))
-    ]
-    planes += [torch.zeros_like(planes[0])] * (bins - len(planes))
-    return torch.stack(planes, 2)
+    left, right = _unit(left, groups), F.pad(_unit(right, groups), (bins - 1, 0))
+    firsts = (bins - 1 - d for d in range(bins))
+    return torch.stack([(left * right[..., k : k + width]).sum(2) for k in firsts], 2)
 
 
 def _unit(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
@@ -118,7 +116,7 @@ class Aggregation(nn.Module):
 
     def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
         super().__init__()
-        v = config.volume_widths
+        self.config, v = config, config.volume_widths
         self.first = conv_norm_3d(config.groups, v[0])
         steps = list(pairwise(v))
         self.down = nn.ModuleList(conv_norm_3d(a, b, stride=2) for a, b in steps)
@@ -128,21 +126,26 @@ class Aggregation(nn.Module):
         self.guides = nn.ModuleList(
             nn.Conv2d(g, c, 1) for g, c in zip(guide_widths, v, strict=True)
         )
-        self.score = nn.Conv3d(v[0], 1, 3, 1, 1, bias=False)
+        self.score = nn.Conv3d(v[0], 1, 1, bias=False)
 
-    def forward(self, volume: Volume, levels: tuple[Features, ...]) -> Float[Tensor, "b d h w"]:
-        """Score each disparity; more is likelier."""
-        volume = volume.contiguous(memory_format=torch.channels_last_3d)
+    def forward(
+        self, left: Features, right: Features, bins: int, levels: tuple[Features, ...]
+    ) -> Scores:
+        """Score each disparity by the descriptions of both views; more is likelier."""
         guides = [
             torch.sigmoid(guide(level))[:, :, None]
             for guide, level in zip(self.guides, levels, strict=True)
         ]
-        scales = [F.relu(self.first(volume)) * guides[0]]
+        volume = correlation_volume(left, right, bins, self.config.groups)
+        volume = volume.contiguous(memory_format=torch.channels_last_3d)
+        volume = self.first(volume).relu_()
+        scales = [volume * guides[0]]
+        del volume
         for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
-            scales.append(F.relu(same(F.relu(down(scales[-1])))) * guide)
+            scales.append(same(down(scales[-1]).relu_()).relu_() * guide)
         x = scales.pop()
         for up, joined in zip(reversed(self.up), reversed(self.joined), strict=True):
-            x = F.relu(joined(F.relu(up(x) + scales.pop())))
+            x = joined((up(x) + scales.pop()).relu_()).relu_()
         return self.score(x)[:, 0]
 
 
@@ -162,9 +165,7 @@ class Enlargement(nn.Module):
         return self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
 
 
-def enlarge(
-    quarter: Float[Tensor, "b h4 w4"], weights: Float[Tensor, "b 9 4 h2 w2"]
-) -> Float[Tensor, "b h w"]:
+def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
     """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
     h, w = quarter.shape[1:]
     padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
@@ -173,16 +174,30 @@ def enlarge(
     return F.pixel_shuffle((weights * wide[:, :, None]).sum(1), 2)[:, 0]
 
 
-def mean_of_best(scores: Float[Tensor, "b d h w"], candidates: int) -> Float[Tensor, "b h w"]:
-    """Give the expected disparity [bins] over the disparities of the highest scores."""
+def mean_of_best(scores: Scores, candidates: int) -> Quarter:
+    """Give the expected disparity [px] over the disparities of the highest scores."""
     best = scores.topk(candidates, 1)
-    return (best.values.softmax(1) * best.indices).sum(1)
+    return _STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
 
 
-def mean_of_all(scores: Float[Tensor, "b d h w"]) -> Float[Tensor, "b h w"]:
-    """Give the expected disparity [bins] over all disparities."""
+def mean_of_all(scores: Scores) -> Quarter:
+    """Give the expected disparity [px] over all disparities."""
     bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
-    return (scores.softmax(1) * bins[:, None, None]).sum(1)
+    return _STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
+
+
+def sureness(scores: Scores, disparity_px: Quarter) -> Quarter:
+    """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
+
+    As PSMNet's confidence: between the disparities that have a score, scores are interpolated.
+    """
+    bins = scores.shape[1]
+    count = _STEP_PX * (bins - 1) + 1
+    matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
+    probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
+    steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
+    is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
+    return (probability * is_near).sum(1).clamp(0, 1)
 
 
 class LightStereo(nn.Module):
@@ -212,10 +227,10 @@ class LightStereo(nn.Module):
             InputError: the images' size does not suit the network.
         """
         scores, weights = self.scores(left, right, self.config.max_disparity_px)
-        found_px = enlarge(4 * mean_of_best(scores, self.config.candidates), weights)
+        found_px = enlarge(mean_of_best(scores, self.config.candidates), weights)
         if not self.training:
             return (found_px,)
-        coarse_px = 4 * mean_of_all(scores)[:, None]
+        coarse_px = mean_of_all(scores)[:, None]
         return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], found_px
 
     def scores(
@@ -223,20 +238,15 @@ class LightStereo(nn.Module):
         left: Float[Tensor, "b 3 h w"],
         right: Float[Tensor, "b 3 h w"],
         max_disparity_px: int,
-    ) -> tuple[Float[Tensor, "b d h4 w4"], Float[Tensor, "b 9 4 h2 w2"]]:
+    ) -> tuple[Scores, Float[Tensor, "b 9 4 h2 w2"]]:
         """Answer a score for each disparity at 1/4 size, and the weights that enlarge maps.
 
         Scores are float32 at least: 8 bits would round the expectation to whole pixels.
         """
         self._check_size(left)
         near, far = self.features(left), self.features(right).levels[0]
-        volume = correlation_volume(
-            self.describe(near.levels[0]),
-            self.describe(far),
-            max_disparity_px // 4,
-            self.config.groups,
-        )
-        scores = self.aggregation(volume, near.levels)
+        described = self.describe(near.levels[0]), self.describe(far)
+        scores = self.aggregation(*described, max_disparity_px // _STEP_PX, near.levels)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), self.enlargement(near).to(wide)
 

@@ -3,15 +3,17 @@
 import copy
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.stereo.light import LightStereo, enlarge, mean_of_best
+from depthpose.depth.stereo.folding import fold_features, fold_volumes
+from depthpose.depth.stereo.light import LightStereo, enlarge, mean_of_best, sureness
 from depthpose.depth.stereo.network_matcher import NetworkMatcher, Views
-from depthpose.depth.stereo.volume import WINDOW_PX
+from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.types import Match
+
+_ROWS = 16
+"""Rows at quarter size whose confidence is computed at a time: probabilities between the scores are
+the largest of all volumes."""
 
 
 class LightMatcher(NetworkMatcher):
@@ -29,35 +31,28 @@ class LightMatcher(NetworkMatcher):
 
     def __init__(self, network: LightStereo, config: MatcherConfig | None = None) -> None:
         super().__init__(network.config, config)
-        self._network = copy.deepcopy(network).eval().to(self.device, self.dtype)
+        like = torch.empty(0, dtype=self.dtype, device=self.device)
+        folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
+        self._network = fold_features(folded, like)
+        if self.config.with_compile:
+            self._network.features.compile()
 
     def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
-        """Match normalised pairs whose sides suit the network."""
+        """Match normalised pairs whose sides suit the network.
+
+        Raises:
+            InputError: a memory bound that is too small for them.
+        """
+        height, width = left.shape[-2:]
+        footprint = LightFootprint(config=network, height=height, width=width, dtype=self.dtype)
+        footprint.refuse_more_than(self.config.max_memory_bytes)
         scores, weights = self._network.scores(
             left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
         )
-        quarter_px = 4 * mean_of_best(scores, network.candidates)
+        quarter_px = mean_of_best(scores, network.candidates)
         found_px = enlarge(quarter_px, weights)
         if not self.config.with_confidence:
             return [Match(disparity_px=one) for one in found_px]
-        sure = enlarge(confidence(scores, quarter_px), weights)
+        rows = zip(scores.split(_ROWS, 2), quarter_px.split(_ROWS, 1), strict=True)
+        sure = enlarge(torch.cat([sureness(*some) for some in rows], 1), weights)
         return [Match(disparity_px=d, confidence=c) for d, c in zip(found_px, sure, strict=True)]
-
-
-def confidence(
-    scores: Float[Tensor, "b d h w"], disparity_px: Float[Tensor, "b h w"]
-) -> Float[Tensor, "b h w"]:
-    """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
-
-    As PSMNet's: scores are interpolated between the disparities that have one, four pixels apart.
-    """
-    bins = torch.arange(4 * scores.shape[1] - 3, device=scores.device)[:, None, None]
-    wide = F.interpolate(
-        scores.flatten(2)[:, None],
-        (len(bins), scores[0, 0].numel()),
-        mode="bilinear",
-        align_corners=True,
-    )
-    probability = wide[:, 0].softmax(1).unflatten(2, scores.shape[2:])
-    is_near = (bins - disparity_px[:, None]).abs() <= WINDOW_PX
-    return (probability * is_near).sum(1).clamp(0, 1)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.depth.config import PSMNetConfig
+from depthpose.depth.config import LightConfig, PSMNetConfig
 from depthpose.depth.types import Match
 
 MARGIN = 1.1
@@ -122,6 +122,56 @@ class Footprint:
         return (
             2 * cost_bytes + 16 * self.height * self.width + 5 * max(steps.chunk_bytes, row_bytes)
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightFootprint:
+    """The light network at a size of images, as far as memory is concerned.
+
+    It computes whole volumes: a bound can be met or refused, not traded for time.
+
+    Attributes:
+        config: the network.
+        height: rows of the padded image [px].
+        width: columns of the padded image [px].
+        dtype: what the network computes in.
+    """
+
+    config: LightConfig
+    height: int
+    width: int
+    dtype: torch.dtype
+
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+        pixels = self.height * self.width // 16
+        kept = pixels * (4 * 16 + 3 * self.config.width) * self.dtype.itemsize
+        stages = (self._volume_bytes(pixels), self._weights_bytes(pixels))
+        return int(MARGIN * (kept + max(stages))) + OVERHEAD_BYTES
+
+    def _volume_bytes(self, pixels: int) -> int:
+        """Three volumes at quarter size: on the way down, coming up, and their sum."""
+        widest = max(self.config.groups, self.config.volume_widths[0])
+        return 3 * widest * self.config.max_disparity_px // 4 * pixels * self.dtype.itemsize
+
+    def _weights_bytes(self, pixels: int) -> int:
+        """Weights that enlarge maps, thrice, and what they are made of at half size."""
+        joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
+        return pixels * (joined + 3 * 4 * 36 * 4)
+
+    def refuse_more_than(self, max_memory_bytes: int | None) -> None:
+        """Refuse a bound that a match would exceed.
+
+        Raises:
+            InputError: it does; the message says how much it takes.
+        """
+        least = self.estimate_bytes()
+        if max_memory_bytes is not None and least > max_memory_bytes:
+            raise InputError(
+                f"max_memory_bytes={max_memory_bytes} is too small for images of "
+                f"{self.height}x{self.width} (padded): the light matcher takes {least}; allow "
+                f"that, take precision='bf16' or speed='quick', or match tiles (tile_px)"
+            )
 
 
 Image = Float[Tensor, "3 h w"]

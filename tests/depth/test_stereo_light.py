@@ -1,0 +1,291 @@
+"""The light matcher: its parts against oracles, inference against the plain network, learning."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from depthpose.core.camera import Camera
+from depthpose.core.checkpoint import Checkpoint, save_checkpoint
+from depthpose.core.errors import InputError
+from depthpose.core.loop import LoopConfig
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.config import (
+    LightConfig,
+    MatcherConfig,
+    PairsConfig,
+    PSMNetConfig,
+    StreetsConfig,
+)
+from depthpose.depth.lite0 import KIND, Lite0Encoder, load_lite0
+from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
+from depthpose.depth.stereo.light import (
+    correlation_volume,
+    enlarge,
+    mean_of_all,
+    mean_of_best,
+    sureness,
+)
+from depthpose.depth.stereo.matcher import CameraMatcher, TiledMatcher
+from depthpose.depth.stereo.network_matcher import pad_top_right
+from depthpose.depth.stereo.plan import LightFootprint
+from depthpose.depth.train import Run, StereoTask
+from depthpose.depth.train.config import StereoTraining
+from depthpose.depth.train.runs import train_stereo
+from depthpose.depth.weights import read_matcher, write_depth_weights
+
+SMALL = LightConfig(
+    max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.25
+)
+
+
+def random_network(config: LightConfig = SMALL) -> LightStereo:
+    """A network in eval mode whose batch norms do something."""
+    torch.manual_seed(0)
+    network = LightStereo(config)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+            module.weight.data.uniform_(0.5, 1.2)
+            module.bias.data.normal_(0, 0.1)
+    return network.eval()
+
+
+def shifted_pair(height: int, width: int, shift: int) -> tuple[torch.Tensor, torch.Tensor]:
+    wide = torch.rand(3, height, width + shift, generator=torch.Generator().manual_seed(3))
+    return wide[..., :width].contiguous(), wide[..., shift:].contiguous()
+
+
+@pytest.mark.parametrize("width", [3, 8, 20])
+def test_the_volume_holds_the_cosine_of_each_group(width: int) -> None:
+    left, right = torch.randn(2, 2, 6, 4, width).unbind()
+    found = correlation_volume(left, right, 8, 3)
+    assert found.shape == (2, 3, 8, 4, width)
+    for d in range(8):
+        for x in range(width):
+            group = [view.unflatten(1, (3, 2)) for view in (left, right)]
+            expected = torch.zeros(2, 3, 4)
+            if x >= d:
+                expected = torch.cosine_similarity(group[0][..., x], group[1][..., x - d], dim=2)
+            torch.testing.assert_close(found[:, :, d, :, x], expected, atol=2e-3, rtol=0)
+
+
+def test_disparity_is_the_mean_over_the_best() -> None:
+    scores = torch.full((1, 8, 1, 1), -50.0)
+    scores[0, 2], scores[0, 3], scores[0, 7] = 1.0, 1.0, 0.5
+    assert float(mean_of_best(scores, 2)) == pytest.approx(10.0)
+    assert float(mean_of_best(scores, 1)) in (8.0, 12.0)
+    assert float(mean_of_all(scores)) == pytest.approx(float(mean_of_best(scores, 8)))
+
+
+def test_confidence_is_the_probability_near_the_answer() -> None:
+    certain = torch.full((1, 8, 1, 1), -200.0)
+    certain[0, 3] = 0.0
+    at_px = torch.full((1, 1, 1), 12.0)
+    assert float(sureness(certain, at_px)) == pytest.approx(1.0)
+    assert float(sureness(certain, at_px + 9)) == pytest.approx(0.0, abs=1e-6)
+    flat = torch.zeros(1, 8, 1, 1)  # 29 whole disparities from 0 to 28, five of them within 2 px
+    assert float(sureness(flat, at_px)) == pytest.approx(5 / 29)
+
+
+def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:
+    quarter = torch.arange(12.0).view(1, 3, 4)
+    weights = torch.zeros(1, 9, 4, 6, 8)
+    weights[:, 4] = 1.0  # the pixel itself
+    nearest = quarter.repeat_interleave(4, 1).repeat_interleave(4, 2)
+    assert torch.equal(enlarge(quarter, weights), nearest)
+    weights = torch.zeros(1, 9, 4, 6, 8)
+    weights[:, 5, 3] = 1.0  # of the lower right pixel in each 2x2: the neighbour to the right
+    found = enlarge(quarter, weights)
+    assert found[0, 1, 1] == quarter[0, 0, 1]
+    assert found[0, 0, 0] == 0
+
+
+@pytest.mark.parametrize("size", [(32, 64), (70, 101)])
+def test_inference_equals_the_plain_network(size: tuple[int, int]) -> None:
+    network = random_network()
+    left, right = shifted_pair(*size, 5)
+    found = LightMatcher(network).match(left, right)
+    pair = [pad_top_right(normalise(view), network.config)[None] for view in (left, right)]
+    with torch.no_grad():
+        expected = network(*pair)[-1][0, -size[0] :, : size[1]]
+    assert expected.std() > 0.1
+    # Where two scores tie, a last bit decides between candidates.
+    assert float(((found.disparity_px - expected).abs() > 1e-2).float().mean()) < 0.01
+    assert found.confidence is not None
+    assert found.confidence.shape == size
+    assert 0 <= found.confidence.min() <= found.confidence.max() <= 1
+
+
+def test_training_further_does_not_change_a_matcher() -> None:
+    network = random_network()
+    left, right = shifted_pair(32, 64, 5)
+    matcher = LightMatcher(network)
+    before = matcher.match(left, right).disparity_px
+    for parameter in network.parameters():
+        parameter.data.zero_()
+    assert torch.equal(matcher.match(left, right).disparity_px, before)
+
+
+def test_it_is_a_matcher_of_cameras_and_tiles() -> None:
+    network = random_network(dataclasses.replace(SMALL, work_focal_px=80.0))
+    left, right = shifted_pair(64, 128, 5)
+    K = torch.tensor([[160.0, 0, 64], [0, 160, 32], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(width=128, height=64, K=K)
+    quick = make_matcher(network, MatcherConfig(speed="quick"))
+    fine = make_matcher(network, MatcherConfig(tile_px=(32, 64), tile_overlap_px=8))
+    assert isinstance(quick, LightMatcher)
+    assert isinstance(fine, CameraMatcher)
+    assert isinstance(fine, TiledMatcher)
+    assert quick.work_size(camera) == (32, 64)
+    assert fine.work_size(camera) == (64, 128)
+    for matcher in (quick, fine):
+        one, other = matcher.match_many([(left, right), (right, left)], camera)
+        assert one.disparity_px.shape == (64, 128)
+        assert not torch.equal(one.disparity_px, other.disparity_px)
+
+
+def test_batches_say_what_single_pairs_say() -> None:
+    matcher = LightMatcher(random_network())
+    pairs = [shifted_pair(40, 70, 5), shifted_pair(40, 70, 9)]
+    for one, alone in zip(
+        matcher.match_many(pairs), [matcher.match(*pair) for pair in pairs], strict=True
+    ):
+        difference = (one.disparity_px - alone.disparity_px).abs()
+        assert float((difference > 1e-2).float().mean()) < 0.01
+
+
+def test_a_bound_on_memory_is_met_or_refused() -> None:
+    left, right = shifted_pair(64, 96, 5)
+    network = random_network()
+    footprint = LightFootprint(config=SMALL, height=64, width=96, dtype=torch.float32)
+    least = footprint.estimate_bytes()
+    LightMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
+    with pytest.raises(InputError, match=f"too small for images of 64x96.*takes {least}"):
+        LightMatcher(network, MatcherConfig(max_memory_bytes=least - 1)).match(left, right)
+
+
+def test_weights_come_back(tmp_path: Path) -> None:
+    network, path = random_network(), tmp_path / "light.safetensors"
+    write_depth_weights(path, matcher=network, facts={"licence": "MIT", "trained_on": "nothing"})
+    found = read_matcher(path)
+    assert isinstance(found, LightStereo)
+    assert found.config == network.config
+    pair = torch.randn(2, 1, 3, 32, 64).unbind()
+    with torch.no_grad():
+        assert torch.equal(found(*pair)[-1], network(*pair)[-1])
+
+
+@pytest.mark.parametrize(
+    ("knobs", "said"),
+    [
+        ({"max_disparity_px": 48}, "multiple of 32"),
+        ({"width": 10, "groups": 4}, "multiple of groups"),
+        ({"candidates": 0}, "candidates must be from 1 to 48"),
+        ({"volume_widths": (8, 0, 8, 8)}, "volume_widths must be positive"),
+        ({"encoder_width": 0.0}, "encoder_width"),
+        ({"work_focal_px": -1.0}, "work_focal_px must be positive"),
+    ],
+)
+def test_sizes_that_no_network_has_are_refused(knobs: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        LightConfig(**knobs)
+
+
+def test_images_of_another_size_are_refused() -> None:
+    with pytest.raises(InputError, match="multiples of 32, got 32x48"):
+        random_network()(*torch.zeros(2, 1, 3, 32, 48).unbind())
+
+
+def training_batch() -> TrainingPair:
+    """Two pairs whose whole scene lies at one disparity each."""
+    pairs = [shifted_pair(64, 96, shift) for shift in (6, 14)]
+    left, right = (torch.stack(list(views)) for views in zip(*pairs, strict=True))
+    left_px = torch.tensor([6.0, 14.0])[:, None, None].expand(2, 64, 96).clone()
+    return TrainingPair(left, right, left_px, left_px, torch.full((2,), torch.nan))
+
+
+def stereo_task(**knobs: Any) -> StereoTask:  # noqa: ANN401
+    torch.manual_seed(0)
+    return StereoTask(LightStereo(SMALL), StereoTraining(light=SMALL, **knobs), None)
+
+
+def test_it_learns_and_every_part_gets_gradients() -> None:
+    task = stereo_task(with_fixed_start=False, encoder_rate=1.0)
+    network, batch = task.matcher, training_batch()
+    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(25):
+        (turn,) = task.step(batch)
+        optimizer.zero_grad()
+        turn.loss.backward()
+        optimizer.step()
+        losses.append(float(turn.loss.detach()))
+    without = [
+        name
+        for name, parameter in network.named_parameters()
+        if parameter.grad is None or not bool(parameter.grad.isfinite().all())
+    ]
+    assert not without
+    for part in ("features.encoder.stem.conv", "enlargement.weights", "describe"):
+        gradient = network.get_parameter(f"{part}.weight").grad
+        assert gradient is not None
+        assert bool(gradient.any()), part
+    assert sum(losses[-3:]) / 3 < 0.6 * losses[0]
+
+
+def test_a_fixed_start_keeps_what_imagenet_taught() -> None:
+    task = stereo_task()
+    encoder = task.matcher.features.encoder
+    assert isinstance(encoder, Lite0Encoder)
+    before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
+    (turn,) = task.step(training_batch())
+    turn.loss.backward()
+    task.optimizers["matcher"][0].step()
+    after = encoder.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before if "running" in name)
+    assert torch.equal(before["stem.conv.weight"], after["stem.conv.weight"])
+    assert not torch.equal(
+        before["blocks.9.project.conv.weight"], after["blocks.9.project.conv.weight"]
+    )
+
+
+def test_an_encoder_takes_a_file_as_far_as_it_reaches(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    whole, path = Lite0Encoder(), tmp_path / "lite0.safetensors"
+    save_checkpoint(path, Checkpoint(kind=KIND, config={}, state=whole.state_dict(), facts={}))
+    short = Lite0Encoder(levels=4)
+    load_lite0(short, path)
+    image = torch.rand(1, 3, 32, 64)
+    with torch.no_grad():
+        expected, found = whole.eval()(image)[:4], short.eval()(image)
+    assert len(found) == 4
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+    with pytest.raises(InputError, match="this encoder is narrower"):
+        load_lite0(Lite0Encoder(0.5, levels=4), path)
+
+
+def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    pairs = PairsConfig(streets=StreetsConfig(frames=2, scale=0.1))
+    run, loop = Run(folder=tmp_path / "run"), LoopConfig(steps=1)
+    with pytest.raises(InputError, match="give --encoder"):
+        train_stereo(StereoTraining(light=SMALL, pairs=pairs, loop=loop), run)
+    with pytest.raises(InputError, match="give the config a light network"):
+        train_stereo(StereoTraining(encoder="x.safetensors", pairs=pairs, loop=loop), run)
+    other = tmp_path / "psmnet.safetensors"
+    tiny = PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,))
+    facts = {"licence": "MIT", "trained_on": "nothing"}
+    write_depth_weights(other, matcher=PSMNet(tiny), facts=facts)
+    with pytest.raises(InputError, match="weights of PSMNet, but the config trains LightStereo"):
+        train_stereo(StereoTraining(light=SMALL, start=str(other), pairs=pairs, loop=loop), run)
+    two_deep = dataclasses.replace(SMALL, max_disparity_px=64)
+    loop = LoopConfig(steps=1, precision="bf16")
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="max_disparity_px 96, or precision fp32"):
+            train_stereo(StereoTraining(light=two_deep, pairs=pairs, loop=loop), run)
