@@ -18,8 +18,8 @@ from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel
 
 _MIRRORED = 0.02
-"""Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of synthetic views
-that are posed rightly it is at most 0.004, where the mirror image is not nearly the model."""
+"""Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of right answers for
+synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
 
 
 class Posed(NamedTuple):
