@@ -4,9 +4,11 @@
 
 Eight kinds of negatives, ``--number`` of each: another object of the weights (or one of our parts,
 if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.2 (``--number`` each), mirrored ones,
-blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. Views are rendered
-like held-out ones, half of them with up to a half occluded. Also the objects themselves, four
-times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of the diameter.
+blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. The mirror image of
+an object that it deviates from by 3 % of the diameter at most is no negative: "mirror image alike".
+Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
+themselves, four times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of
+the diameter. ``--seed`` draws other views.
 ``--save`` writes all signals as JSON; then nothing is refused for its risk.
 """
 
@@ -24,6 +26,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
 from depthpose.pose.train.held_out import pose_error
@@ -33,6 +36,7 @@ from depthpose.report.tables import markdown_table
 
 SEED = 0x0DD
 ITSELF = "itself"
+ALIKE = "mirror image alike"
 Row = dict[str, Any]
 
 
@@ -46,9 +50,11 @@ def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
     return (objects[k] for k in range(len(models)))
 
 
-def things(weights: PoseWeights, kind: str, number: int) -> tuple[list[ObjectModel], list[int]]:
-    """Give the model in view, and the name of the requested object."""
-    generator = sample_generator(sum(map(ord, kind)), SEED)
+def things(
+    weights: PoseWeights, kind: str, number: int, seed: int
+) -> tuple[list[ObjectModel], list[int]]:
+    """Give the model in view, and the number of the requested object."""
+    generator = sample_generator(sum(map(ord, kind)), seed)
     asked = [k % len(weights.models) for k in range(number)]
     models = [weights.models[k] for k in asked]
     if kind == ITSELF:
@@ -68,20 +74,28 @@ def kinds() -> Iterator[str]:
             yield kind
 
 
-def measure(net: GeoPoseNet, kind: str, number: int) -> list[Row]:
+def measure(net: GeoPoseNet, kind: str, number: int, seed: int) -> list[Row]:
     """Estimate every negative of a kind, or the objects themselves."""
-    models, asked = things(net.weights, kind, number)
+    models, asked = things(net.weights, kind, number, seed)
     rows = []
-    for sample, which in zip(seen(models, SEED), asked, strict=True):
+    for sample, which in zip(seen(models, seed), asked, strict=True):
         found = net.estimate_many([sample.input])[0]
         error = pose_error(found, sample.truth, net.weights.models[which])
         is_right = kind == ITSELF and error < 0.1
+        is_alike = kind == "mirrored" and is_mirror_alike(net.weights.models[which])
         rows.append({
-            "kind": kind, "object": sample.input.object, "status": found.status,
+            "kind": ALIKE if is_alike else kind, "object": sample.input.object,
+            "status": found.status,
             "right": is_right, "risk": found.risk, "signals": found.signals,
             "hidden": 1 - (sample.truth.visible_fraction or 0.0),
         })  # fmt: skip
     return rows
+
+
+def groups(rows: Sequence[Row]) -> list[list[Row]]:
+    """Part the rows of one kind: mirror images that are nearly the object are no negatives."""
+    parts = [[row for row in rows if (row["kind"] == ALIKE) == alike] for alike in (True, False)]
+    return [part for part in parts if part]
 
 
 def summary(rows: Sequence[Row]) -> Row:
@@ -98,6 +112,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--number", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
     words = parser.parse_args()
@@ -110,9 +125,10 @@ def main() -> None:
         began, rows = time.process_time(), []
         for kind in words.kinds or [ITSELF, *kinds()]:
             number = 4 * words.number if kind == ITSELF else words.number
-            rows.append(measure(net, kind, number))
-            print(summary(rows[-1]), flush=True)
-        every = [row for some in rows for row in some if row["kind"] != ITSELF]
+            some = groups(measure(net, kind, number, words.seed))
+            print(*map(summary, some), sep="\n", flush=True)
+            rows += some
+        every = [row for some in rows for row in some if row["kind"] not in (ITSELF, ALIKE)]
         table = [summary(some) for some in rows]
         if every:
             table.append({**summary(every), "kind": "all negatives"})

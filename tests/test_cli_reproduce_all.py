@@ -43,13 +43,17 @@ CONFIGS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def configs(tmp_path: Path) -> Path:
+def write_configs(folder: Path) -> Path:
     for name, content in CONFIGS.items():
-        path = tmp_path / f"configs/{name}.yaml"
+        path = folder / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(yaml.safe_dump(content))
-    return tmp_path / "configs"
+    return folder
+
+
+@pytest.fixture
+def configs(tmp_path: Path) -> Path:
+    return write_configs(tmp_path / "configs")
 
 
 def heads(capsys: pytest.CaptureFixture[str]) -> list[str]:

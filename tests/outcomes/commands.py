@@ -1,21 +1,20 @@
-"""The commands that write, with inputs as small as they can be.
-
-``demo``, ``pose calibrate`` and ``export depth`` have the writers of others here, and take minutes.
-"""
+"""The commands that write, with inputs as small as they can be."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from tests.depth.made_selection import sure_of
+from tests.depth.made_selection import of_all_kinds, sure_of
 from tests.made_street import make_street, write_pairs
 from tests.pose.made_frames import made_models, make_dataset
 from tests.pose.made_object import bracket, cloud_of, pose_at, tiny_weights
 from tests.pose.test_network import published_state
 from tests.raw_pairs import make_raw, write_kalibr
 from tests.test_cli_engine import make_home
+from tests.test_cli_reproduce_all import write_configs
 
+from depthpose.cli import main
 from depthpose.core.camera import write_camera
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.depth.types import StereoSample
@@ -104,13 +103,20 @@ COMMANDS: Sequence[Command] = (
     ),
     Command("weights complete {home}/bare.safetensors --models {home}/parts", "whole.safetensors"),
     Command("weights import fcgf {home}/fcgf.pth --classes 2", "fcgf.safetensors"),
+    Command("pose calibrate {home}/p.safetensors --number 20", "calibrated.safetensors"),
     Command("export pose --weights {home}/p.safetensors", "pose.onnx"),
+    Command("export depth --weights {home}/k.safetensors", "depth.onnx"),
     Command(
         "reproduce 2.2 --kitti {home}/street --split all --weights {home}/m.safetensors "
         "--protocol eigen-raw-camera"
     ),
     Command("reproduce 3.3 --weights {home}/p.safetensors --points 60 --made 1"),
+    Command(
+        "reproduce all --kitti {home}/kitti --configs {home}/configs --split all --device cpu "
+        "--protocol eigen-raw-camera"
+    ),
     Command("figure 3-4 --weights {home}/p.safetensors --number 1"),
+    Command("demo --weights {home}/w.safetensors"),
 )
 
 
@@ -119,6 +125,7 @@ def make_inputs(home: Path) -> Path:
     make_home(home)
     write_pairs(home / "pairs", (0.1, 0.1, 0.1))
     write_depth_weights(home / "s.safetensors", generator=sure_of(1), facts={})
+    write_depth_weights(home / "k.safetensors", generator=of_all_kinds(), facts={})
     for name, text in (("view", VIEW), ("part", PART)):
         (home / f"{name}.yaml").write_text(text)
     make_dataset(home / "bop", frames=2)
@@ -139,6 +146,9 @@ def make_inputs(home: Path) -> Path:
     write_image(home / "raw/left.png", raw.left)
     write_image(home / "raw/right.png", raw.right)
     write_kalibr(home / "camchain.yaml", raw.pair)
+    write_configs(home / "configs")
+    street_words = ["data", "make", "streets", "--number", "2", "--scale", "0.25"]
+    assert main([*street_words, "--out", str(home / "kitti")]) == 0
     return home
 
 

@@ -110,9 +110,47 @@ def test_answers_that_are_all_right_are_all_given() -> None:
     assert all((risk_of(a.signals, config) or 0) <= config.max_risk for a in answers)
 
 
+def test_a_signal_that_was_not_measured_counts_as_usual() -> None:
+    config = RefusalConfig(slopes={"far": 1.0, "size": 2.0}, means={"size": math.log(0.06)})
+    usual = risk_of({"far": 0.2, "size": 0.05}, config)
+    assert risk_of({"far": 0.2}, config) == pytest.approx(usual)
+    assert reason_of({"far": 0.2}, 0.9, config).startswith("20% of the points are nowhere near")
+    with pytest.raises(InputError, match="the refusal weighs 'near', but the signals are misfit"):
+        risk_of({"far": 0.2}, RefusalConfig(slopes={"near": 1.0}))
+
+
+def test_few_negatives_are_answered_on_other_data() -> None:
+    """Right answers and negatives overlap in ``size``; views alone say nothing about it."""
+
+    def drawn(seed: int) -> tuple[list[PoseEstimate], list[PoseEstimate]]:
+        generator = torch.Generator().manual_seed(seed)
+        own, foreign = torch.rand(2, 1000, generator=generator)
+        return ([answer(size=0.3 * float(v)) for v in own],
+                [answer(size=0.2 + 0.3 * float(v)) for v in foreign])  # fmt: skip
+
+    right, negatives = drawn(0)
+    config = calibrate_refusal(right, [True] * 1000, 0.01, negatives)
+    right, negatives = drawn(1)
+
+    def kept(answers: list[PoseEstimate]) -> int:
+        return sum((risk_of(a.signals, config) or 0.0) <= config.max_risk for a in answers)
+
+    assert kept(negatives) <= 25
+    assert 600 < kept(right) < 750
+    # What was refused anyhow counts as a negative too: more of the others may be answered.
+    refused = PoseEstimate(name="a", object="b", status="doubtful", reason="so")
+    more = calibrate_refusal(right, [True] * 1000, 0.01, [*negatives, *[refused] * 9000])
+    assert more.max_risk > config.max_risk
+    # So few allow no mistake.
+    few = calibrate_refusal(right[:50], [True] * 50, 0.01, negatives[:50])
+    assert all((risk_of(a.signals, few) or 0.0) > few.max_risk for a in negatives[:50])
+
+
 def test_what_cannot_be_calibrated_is_an_error() -> None:
     with pytest.raises(InputError, match="2 estimates, 1 verdicts and a share"):
         calibrate_refusal([answer()] * 2, [True])
+    with pytest.raises(InputError, match=r"max_negative_share is 0.0, but a share is between"):
+        calibrate_refusal([answer()], [True], 0.01, [answer()], 0.0)
     refused = PoseEstimate(name="a", object="b", status="doubtful", reason="so")
     with pytest.raises(InputError, match="not one estimate is an answer"):
         calibrate_refusal([refused], [False])

@@ -422,7 +422,8 @@ def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatc
     held_out = HeldOutConfig(number=100, occlusions=(0.0,))
     uncalibrated = score_held_out(weights, _MADE, held_out)["0"]
     assert uncalibrated["wrong"] == pytest.approx(0.4)
-    chosen = calibrated(weights, _MADE, CalibrationConfig(number=200, max_wrong_share=0.02))
+    views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=0)
+    chosen = calibrated(weights, _MADE, views)
     table = score_held_out(chosen, _MADE, held_out)
     assert (table["0"]["wrong"] or 0.0) <= 0.02
     assert (table["0"]["right"] or 0.0) > 0.55
@@ -443,10 +444,33 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
     weights = tiny_weights(*_models())
     assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
-    _ = calibrated(weights, _MADE, CalibrationConfig(number=20))
+    _ = calibrated(weights, _MADE, CalibrationConfig(number=20, negatives=0))
     _ = score_held_out(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
     calibration, held_out = (objects[0].input.points_m for objects in seen)
     assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
+
+
+def test_the_refusal_is_chosen_on_negatives_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negatives of a signal above 0.4, as 1 in 3 of the right answers has it, are refused."""
+    shown: list[tuple[ObjectModel, ...]] = []
+
+    def posed(given: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+        estimates, errors = _as_known(given, objects)
+        shown.append(objects.models)
+        if any(model is not given.models[k % 2] for k, model in enumerate(objects.models)):
+            signals = dict.fromkeys(SIGNALS, 0.0) | {"far": 0.5, "size": 0.5}
+            estimates = [dataclasses.replace(one, signals=signals) for one in estimates]
+        return estimates, errors
+
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
+    weights = tiny_weights(*_models())
+    views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=16)
+    config = calibrated(weights, _MADE, views).refusal
+    assert [len(models) for models in shown] == [2, 2, 32]
+    assert {model.name for model in shown[-1]} == {"bracket", "bottle"}
+    right, negative = dict.fromkeys(SIGNALS, 0.0), {"far": 0.5, "size": 0.5}
+    assert (risk_of(right | {"far": 0.5}, config) or 0.0) <= config.max_risk
+    assert (risk_of(right | negative, config) or 0.0) > config.max_risk
 
 
 def test_a_network_that_is_never_right_is_not_looked_at_for_long(

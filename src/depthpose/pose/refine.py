@@ -142,10 +142,8 @@ def refine_best(
     _refuse_no_points(points_m)
     given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
     starts = _starts(_doubled(given), surface, config.starts)
-    few = take_evenly(points_m.double(), _ROUGH_POINTS)
+    tried = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
-    limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    tried = _slide(few, starts, surface, limits_m, surface.boxes.look_up)
     near, worth = _worth(points_m, tried, surface, end_m)
     best = int(worth.argmax())
     short = replace(config, iterations=(config.iterations + 1) // 2)
@@ -158,6 +156,23 @@ def refine_best(
     away = _distances(tried, _doubled(refined.camera_from_model), surface) > _OTHER
     others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
     return Best(refined, best % len(given.R), float(away.double().mean()), others)
+
+
+def refine_roughly(
+    points_m: Float[Tensor, "n 3"], starts: Rigid, surface: Surface, config: IcpConfig
+) -> Rigid:
+    """Refine a batch of poses with a hundred of the points and a table of what lies near.
+
+    Args:
+        points_m: of the object, in the camera frame.
+        starts: poses in float64, ``camera_from_model``.
+        surface: of the model.
+        config: its last limit.
+    """
+    few = take_evenly(points_m.double(), _ROUGH_POINTS)
+    end_m = config.end_distance_diameters * surface.diameter_m
+    limits_m = [share * end_m for share in _ROUGH_LIMITS]
+    return _slide(few, starts, surface, limits_m, surface.boxes.look_up)
 
 
 def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:

@@ -126,6 +126,10 @@ class CalibrationOptions:
     """of the answers that are given."""
     number: int | None = None
     """views of each object to choose by."""
+    negatives: int | None = None
+    """views of something else in the place of each object to choose by; 0: none."""
+    max_negative_share: float | None = None
+    """of these that may be answered."""
 
     @property
     def chosen(self) -> "PoseTraining":
@@ -135,7 +139,11 @@ class CalibrationOptions:
 
         chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
         limits = changed(
-            chosen.calibration, max_wrong_share=self.max_wrong_share, number=self.number
+            chosen.calibration,
+            max_wrong_share=self.max_wrong_share,
+            number=self.number,
+            negatives=self.negatives,
+            max_negative_share=self.max_negative_share,
         )
         return dataclasses.replace(chosen, calibration=limits)
 
@@ -148,8 +156,9 @@ def calibrate(
 ) -> int:
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
-    A larger share of wrong answers buys more answers. The network stays as it is; the views by
-    which it is then measured are others.
+    And of other things in their place: other objects, copies of another size, mirrored ones, boxes,
+    balls, hands. A larger share of wrong answers buys more answers. The network stays as it is;
+    the views by which it is then measured are others.
 
         depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
 

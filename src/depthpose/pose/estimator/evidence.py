@@ -34,8 +34,13 @@ SIGNALS: dict[str, str] = {
     "front": "the posed surface would occlude {:.0%} of the points that were seen",
     "unseen": "{:.0%} of the posed surface that faces the camera has no point",
     "few": "the cloud fills few voxels: ten are {:.1%} of it",
+    "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
+    "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",
+    "mirror": "the cloud fits the mirror image better (by {:.2g} limits of nearness)",
 }
 """Name of each signal, and what it says to people."""
+LATE = ("size", "grown", "mirror")
+"""Signals that are measured where nothing else refuses the pose; without ICP they are not."""
 
 
 def vote_signals(cloud: Prepared, fit: PoseFit) -> dict[str, float]:

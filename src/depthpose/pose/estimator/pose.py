@@ -1,6 +1,5 @@
 """Directions of one cloud to its pose: vote, drop outliers, fit, refine, check."""
 
-import math
 import time
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -19,15 +18,11 @@ from depthpose.pose.estimator.alternatives import (
     find_candidates,
     share_out,
 )
-from depthpose.pose.estimator.evidence import (
-    observability,
-    vote_signals,
-    without_motions,
-)
-from depthpose.pose.estimator.prepare import Prepared, Refusal
+from depthpose.pose.estimator.doubt import Posed, find_doubt
+from depthpose.pose.estimator.evidence import vote_signals, without_motions
+from depthpose.pose.estimator.prepare import Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
-from depthpose.pose.estimator.refusal import reason_of, risk_of
-from depthpose.pose.estimator.scale import Scale, scale_of
+from depthpose.pose.estimator.refusal import risk_of
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
@@ -98,11 +93,8 @@ def pose_from_directions(
         clock.note("icp")
     free = free_motions(model.symmetries.continuous, found.pose)
     answer = _answer(model, vote, found, free)
-    reason = _doubt(voted.cloud, found, surface, refusal, free)
-    if reason is None and config.with_icp and refusal.max_scale_error < 1:
-        scale = scale_of(voted.cloud.cloud_m, found.pose, surface)
-        answer.signals["scale"] = scale.times
-        reason = _other_size(scale, refusal)
+    posed = Posed(voted.cloud.cloud_m, found.pose, model, surface, free)
+    reason = find_doubt(posed, found.signals, refusal, with_icp=config.with_icp)
     clock.note("check")
     risk = risk_of(found.signals, refusal)
     if reason is not None:
@@ -228,40 +220,6 @@ def _answer(
         inlier_share=float(vote.inlier_share.mean()),
         residual_m=found.residual_m,
         signals=found.signals,
-    )
-
-
-def _doubt(
-    cloud: Prepared,
-    found: _Found,
-    surface: Surface,
-    config: RefusalConfig,
-    free: Float[Tensor, "m 6"],
-) -> Refusal | None:
-    risk = risk_of(found.signals, config)
-    if risk is not None and risk > config.max_risk:
-        return Refusal(status="doubtful", reason=reason_of(found.signals, risk, config))
-    observable, motion = observability(cloud.cloud_m, found.pose, surface, free)
-    if observable >= config.min_hold:
-        return None
-    turn = float(motion[:3].norm())
-    what = "turn" if turn > math.sqrt(0.5) else "shift"
-    return Refusal(
-        status="not observable",
-        reason=f"the seen part of the object may {what} along itself: that moves its surface "
-        f"across itself by {observable:.1%} of the motion alone, and no declared symmetry allows "
-        "it. Declare the symmetry, or look from a side that shows more",
-    )
-
-
-def _other_size(scale: Scale, config: RefusalConfig) -> Refusal | None:
-    if scale.error <= config.max_scale_error:
-        return None
-    return Refusal(
-        status="doubtful",
-        reason=f"the cloud fits the object best at {scale.times:.2f} times its size (standard "
-        f"deviation {scale.sigma:.2f}), and {config.max_scale_error:.0%} are allowed: a copy of "
-        "another size, another object, or a wrong unit or camera",
     )
 
 

@@ -25,32 +25,38 @@ def risk_of(signals: Mapping[str, float], config: RefusalConfig) -> float | None
     """Chance of being wrong, ``1 / (1 + exp(-odds))``; None where no slope is.
 
     The odds are ``bias + sum slope log(0.01 + signal)``: twice as much of a bad sign counts as much
-    from 1 % to 2 % as from 20 % to 40 %.
+    from 1 % to 2 % as from 20 % to 40 %. A signal that was not measured counts as is usual for
+    right answers.
 
     Raises:
         InputError: a slope is of a signal that there is not.
     """
     if not config.slopes:
         return None
-    unknown = sorted(config.slopes.keys() - signals.keys())
+    unknown = sorted(config.slopes.keys() - SIGNALS.keys())
     if unknown:
         raise InputError(
-            f"the refusal weighs {unknown[0]!r}, but the signals are {', '.join(signals)}; the "
+            f"the refusal weighs {unknown[0]!r}, but the signals are {', '.join(SIGNALS)}; the "
             "weights are of another version: calibrate them again by 'depthpose pose calibrate'"
         )
-    odds = config.bias + sum(k * log_signal(signals[name]) for name, k in config.slopes.items())
+    logs = {name: log_signal(value) for name, value in signals.items()}
+    odds = config.bias + sum(
+        k * logs.get(name, _usual(name, config)) for name, k in config.slopes.items()
+    )
     return 1 / (1 + math.exp(-max(-700.0, min(700.0, odds))))
+
+
+def _usual(name: str, config: RefusalConfig) -> float:
+    return config.means.get(name, log_signal(0.0))
 
 
 def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) -> str:
     """Say in a sentence what makes an answer doubtful most, by how far it is above the usual."""
 
     def excess(name: str) -> float:
-        return config.slopes[name] * (
-            log_signal(signals[name]) - config.means.get(name, log_signal(0.0))
-        )
+        return config.slopes[name] * (log_signal(signals[name]) - _usual(name, config))
 
-    worst = max(config.slopes, key=excess)
+    worst = max((name for name in config.slopes if name in signals), key=excess)
     return (
         f"{SIGNALS[worst].format(signals[worst])}: the risk of a wrong pose is {risk:.2g}, above "
         f"the {config.max_risk:.2g} that was settled"
@@ -61,6 +67,8 @@ def calibrate_refusal(
     estimates: Sequence[PoseEstimate],
     is_right: Sequence[bool],
     max_wrong_share: float = 0.01,
+    negatives: Sequence[PoseEstimate] = (),
+    max_negative_share: float = 0.01,
 ) -> RefusalConfig:
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
@@ -68,17 +76,26 @@ def calibrate_refusal(
     negative (more of a bad sign is never better), and a ridge keeps them small. The limit is chosen
     by risks that each fifth of the data got from the other four: the largest at which
     ``(wrong + 1) / (answered + 1)`` is still ``max_wrong_share`` at most; where the data are too
-    few for that, the largest at which nothing is wrong.
+    few for that, the largest at which nothing is wrong. Negatives, clouds of something else, count
+    as wrong where the risk is learnt; of them the limit lets at most ``max_negative_share`` be
+    answered, by the same rule. The risk is then that of as many negatives among the objects.
 
     Args:
         estimates: computed with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for
             its risk; on views that training has not seen, the hard ones too.
         is_right: whether each is right; what was refused anyhow does not count.
         max_wrong_share: of the answers that are given.
+        negatives: estimates, computed as those, for clouds that do not show the requested object.
+        max_negative_share: of all negatives, also of those that were refused anyhow.
 
     Raises:
         InputError: numbers that differ, a share that is none, or no answer at all.
     """
+    if not 0 < max_negative_share < 1:
+        raise InputError(
+            f"calibrate_refusal: max_negative_share is {max_negative_share}, but a share is "
+            "between 0 and 1; take 0.01"
+        )
     if len(estimates) != len(is_right) or not 0 < max_wrong_share < 1:
         raise InputError(
             f"calibrate_refusal: {len(estimates)} estimates, {len(is_right)} verdicts and a share "
@@ -90,8 +107,11 @@ def calibrate_refusal(
             "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
             "longer, or show easier views"
         )
-    x = np.array([[log_signal(e.signals[name]) for name in _LEARNT] for e, _ in answered])
-    wrong = np.array([not ok for _, ok in answered], dtype=float)
+    foreign = [e for e in negatives if e.is_ok]
+    every = [e for e, _ in answered] + foreign
+    names = [name for name in _LEARNT if all(name in e.signals for e in every)]
+    x = np.array([[log_signal(e.signals[name]) for name in names] for e in every])
+    wrong = np.array([not ok for _, ok in answered] + [True] * len(foreign), dtype=float)
     # Views go round the objects: in order, a fold would be an object.
     fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
     risks = np.empty(len(x))
@@ -99,11 +119,15 @@ def calibrate_refusal(
         bias, slopes = _fit(x[fold != k], wrong[fold != k])
         risks[fold == k] = _sigmoid(bias + x[fold == k] @ slopes)
     bias, slopes = _fit(x, wrong)
+    own = len(answered)
+    limits = [_choose_limit(risks[:own], wrong[:own], max_wrong_share)]
+    if foreign:
+        limits.append(_negative_limit(risks[own:], len(negatives), max_negative_share))
     return RefusalConfig(
-        max_risk=_choose_limit(risks, wrong, max_wrong_share),
+        max_risk=min(limits),
         bias=float(bias),
-        slopes=dict(zip(_LEARNT, slopes.tolist(), strict=True)),
-        means=_means(x[wrong == 0]),
+        slopes=dict(zip(names, slopes.tolist(), strict=True)),
+        means=_means(x[wrong == 0], names),
     )
 
 
@@ -145,7 +169,7 @@ def fit_candidate_slopes(
 def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
     """Fit bias and slopes, the latter not negative, by penalised likelihood."""
     if len(x) == 0:
-        return 0.0, np.zeros(len(_LEARNT))
+        return 0.0, np.zeros(x.shape[1])
     middle, spread = x.mean(0), np.maximum(x.std(0), 1e-3)
     z = (x - middle) / spread
 
@@ -163,8 +187,21 @@ def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
     return float(found.x[0] - middle @ slopes), slopes
 
 
-def _means(x: np.ndarray) -> dict[str, float]:
-    return dict(zip(_LEARNT, x.mean(0).tolist(), strict=True)) if len(x) else {}
+def _means(x: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+    return dict(zip(names, x.mean(0).tolist(), strict=True)) if len(x) else {}
+
+
+def _negative_limit(risks: np.ndarray, total: int, share: float) -> float:
+    """Choose the largest risk at which ``(answered + 1) / (total + 1)`` negatives are few enough.
+
+    Where there are too few negatives for that, none is answered.
+    """
+    allowed = max(0, math.floor(share * (total + 1)) - 1)
+    order = np.sort(risks)
+    if allowed >= len(order):
+        return 1.0
+    before = float(order[allowed - 1]) if allowed else 0.0
+    return (before + float(order[allowed])) / 2
 
 
 def _choose_limit(risks: np.ndarray, wrong: np.ndarray, share: float) -> float:

@@ -11,7 +11,8 @@ from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.refine import Nearest
 from depthpose.pose.surface import NEAR, Surface
 
-_POINTS = 400
+POINTS = 400
+"""Of the cloud, evenly taken."""
 _STEPS = 12
 _WIDE = 2.0
 """Times the usual limit of a distance in the first step."""
@@ -50,6 +51,11 @@ class Scale:
         """How far from 1 it surely is; 0 where the model itself fits hardly worse."""
         return max(0.0, abs(self.times - 1) - _SURE * self.sigma) if self.gain > _GAIN else 0.0
 
+    @property
+    def doubt(self) -> float:
+        """How far from 1 it may be: no evidence of the size is no evidence of the right one."""
+        return abs(self.times - 1) + self.sigma
+
 
 def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
@@ -62,7 +68,7 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
         pose: after ICP.
         surface: of the model.
     """
-    local_m = pose.inverse().apply(take_evenly(cloud_m.double(), _POINTS))
+    local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
     few_m = take_evenly(local_m, _ROUGH_POINTS)
     costs = []
@@ -131,7 +137,21 @@ def _distance(
     surface: Surface,
     nearest: Nearest,
 ) -> float:
-    """Root mean square distance to the surface so many times as large, in limits, cut off at 1."""
+    """Distance to the surface so many times as large."""
     own_m = (local_m - middle_m) / times + middle_m
-    gap_m = times * (own_m - surface.points_m[nearest(own_m)]).norm(dim=-1)
-    return float((gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean().sqrt())
+    return float(distance_to(own_m, surface, nearest, times))
+
+
+def distance_to(
+    local_m: Float64[Tensor, "*batch n 3"], surface: Surface, nearest: Nearest, times: float = 1.0
+) -> Float64[Tensor, "*batch"]:
+    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
+
+    Args:
+        local_m: in the model frame, where the surface has its own size.
+        surface: of the model.
+        nearest: finds its points.
+        times: by which all lengths are measured.
+    """
+    gap_m = times * (local_m - surface.points_m[nearest(local_m)]).norm(dim=-1)
+    return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()

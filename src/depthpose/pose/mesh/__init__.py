@@ -1,5 +1,7 @@
 """Known objects: model files, diameter, keypoints, surface points, symmetries, units."""
 
+from depthpose.pose.mesh.mirror import is_mirror_alike as is_mirror_alike
+from depthpose.pose.mesh.mirror import mirror_deviation as mirror_deviation
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import make_model as make_model
 from depthpose.pose.mesh.models import mesh_suffixes as mesh_suffixes

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh.mirror import slid
 from depthpose.pose.mesh.propose import SurfaceDeviation, promising_turns
 from depthpose.pose.mesh.symmetry import symmetry_transforms, turn_about
 from depthpose.pose.types import ObjectModel, Symmetries
@@ -31,9 +31,6 @@ _FINE_STEP = math.pi / 36
 _MOST = 24
 _STARTS = 24
 """Turns that ICP refines."""
-_SLIDES = 20
-_NEAREST = 0.9
-"""Points that count in each step of ICP."""
 _KEPT_MODELS = 64
 
 
@@ -127,7 +124,7 @@ def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float
     found = symmetry_transforms(model.symmetries, _STEP).R.double()[1:]
     exact = found if model.symmetries.is_found else found[:0]
     tried = [Rigid(R, torch.zeros(3).double()) for R in exact]
-    tried += [_slid(surface, R) for R in _starts(surface)]
+    tried += [slid(surface, R) for R in _starts(surface)]
     measured = _deviations(tried, surface)
     good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
@@ -155,18 +152,6 @@ def _starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
         if all(float(geodesic_rad(R, other)) > _SHADOW_RAD for other in [eye, *starts]):
             starts.append(R)
     return starts
-
-
-def _slid(surface: SurfaceDeviation, R: Float[Tensor, "3 3"]) -> Rigid:
-    """Refine the turn of the surface about the middle of its box onto itself (ICP)."""
-    middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
-    turn = Rigid(R, middle - R @ middle)
-    for _ in range(_SLIDES):
-        moved = turn.apply(surface.many)
-        distance, index = surface.nearest(moved)
-        near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST)).double()
-        turn = fit_rigid(surface.many, surface.points[torch.from_numpy(index)], near)
-    return turn
 
 
 def _in_model(turn: Rigid, surface: SurfaceDeviation, model: ObjectModel) -> Rigid:

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import random_rotation, uniform, whole
-from depthpose.pose.mesh import make_model
+from depthpose.pose.mesh import is_mirror_alike, make_model
 from depthpose.pose.synthetic.parts import PARTS, make_part
 from depthpose.pose.types import ObjectModel
 
@@ -21,6 +21,12 @@ SCALES = (0.8, 0.9, 1.1, 1.2)
 """Of a scaled copy."""
 _SIZES = (0.5, 1.1)
 """Of what has no model, in diameters of the object that is searched for."""
+
+
+def negative_kinds(model: ObjectModel) -> tuple[NegativeKind, ...]:
+    """List what is a negative of an object: its mirror image only where it differs from it."""
+    kinds: tuple[NegativeKind, ...] = get_args(NegativeKind)
+    return tuple(k for k in kinds if k != "mirrored" or not is_mirror_alike(model))
 
 
 def negative_of(

@@ -103,16 +103,25 @@ class CalibrationConfig:
     max_wrong_share: float = 0.01
     """Wrong answers among the answers that are given."""
 
+    negatives: int = 200
+    """Of each object: views of something else in its place, copies of another size and mirrored
+    ones among them. 0: the refusal is chosen by views of the objects alone."""
+
+    max_negative_share: float = 0.01
+    """Of these the share that may be answered."""
+
     def __post_init__(self) -> None:
         """Refuse too few views to choose by, and shares that are none."""
         if self.number and self.number < 20:
             raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
                              "views: take 600, or 0 for no refusal")  # fmt: skip
-        if not 0 < self.max_wrong_share < 1:
-            raise InputError(
-                f"max_wrong_share is {self.max_wrong_share}, but a share is between 0 and 1; take "
-                "0.01"
-            )
+        if self.negatives < 0:
+            raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
+        for name in ("max_wrong_share", "max_negative_share"):
+            if not 0 < getattr(self, name) < 1:
+                raise InputError(
+                    f"{name} is {getattr(self, name)}, but a share is between 0 and 1; take 0.01"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share, is_within_diameter
 from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic.negatives import negative_kinds, negative_of
 from depthpose.pose.train.clouds import Cloud, collate_clouds, voxelised_cloud
 from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig
 from depthpose.pose.types import ObjectModel, PoseEstimate, PoseTruth, Vote
@@ -158,7 +159,7 @@ in diameters, None where there is no answer."""
 
 
 def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationConfig) -> PoseWeights:
-    """Choose when answers are withheld, on synthetic views from easy to hard.
+    """Choose when answers are withheld, on synthetic views from easy to hard and on negatives.
 
     Where not one view is answered there is nothing to choose by, and the weights stay as they are.
     Where none of the first 50 of each object is right, no more are looked at.
@@ -185,11 +186,33 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
         if not any(is_right):
             break
     try:
-        refusal = calibrate_refusal(estimates, is_right, config.max_wrong_share)
+        refusal = calibrate_refusal(
+            estimates,
+            is_right,
+            config.max_wrong_share,
+            _negatives(open_weights, views, config.negatives) if any(is_right) else (),
+            config.max_negative_share,
+        )
     except InputError:
         return weights
     refusal = dataclasses.replace(refusal, **kept)
     return dataclasses.replace(weights, refusal=refusal)
+
+
+def _negatives(weights: PoseWeights, made: ObjectsConfig, number: int) -> list[PoseEstimate]:
+    """Estimate views of something else in the place of each object, kinds by turns."""
+    shown: list[ObjectModel] = []
+    for k in range(number):
+        for model in weights.models:
+            kinds = negative_kinds(model)
+            generator = sample_generator(len(shown), _CALIBRATION_SEED)
+            kind = kinds[k % len(kinds)]
+            shown.append(negative_of(model, kind, weights.models, generator))
+    shown = [model for model in shown if model.diameter_m < made.distance_m[0]]
+    if not shown:
+        return []
+    views = dataclasses.replace(made, number=len(shown), seed=made.seed + 1)
+    return _posed(weights, Objects(shown, views, weights.cloud))[0]
 
 
 def score_held_out(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:

@@ -1,0 +1,68 @@
+"""A mirrored copy is not the object, unless the object is its own mirror image."""
+
+import pytest
+import torch
+from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import RefusalConfig
+from depthpose.pose.estimator.mirror import mirror_gain
+from depthpose.pose.mesh import is_mirror_alike, mirror_deviation
+from depthpose.pose.refine import refine_pose
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic.negatives import mirrored, negative_kinds
+from depthpose.pose.synthetic.parts import make_part
+from depthpose.pose.types import ObjectModel, PoseEstimate
+
+TRUTH = pose_at(seed=1)
+
+
+def noisy(cloud_m: torch.Tensor) -> torch.Tensor:
+    noise = torch.randn(cloud_m.shape, generator=torch.Generator().manual_seed(0))
+    return cloud_m.float() + 0.001 * noise
+
+
+@pytest.mark.parametrize(
+    ("model", "is_alike"),
+    [(bracket(), False), (bottle(), True), (make_part("mug"), True), (make_part("bracket"), False)],
+    ids=["bracket", "bottle", "mug", "part"],
+)
+def test_the_mirror_image_of_a_model_is_measured(model: ObjectModel, is_alike: bool) -> None:
+    assert is_mirror_alike(model) == is_alike
+    assert (mirror_deviation(model) < 0.01) == is_alike
+    # However the model lies in its frame.
+    assert mirror_deviation(mirrored(model)) == pytest.approx(mirror_deviation(model), abs=0.01)
+    assert ("mirrored" in negative_kinds(model)) != is_alike
+
+
+def gain(seen: ObjectModel, seed: int) -> float:
+    truth, surface = pose_at(seed=seed), prepare_surface(bracket())
+    cloud_m = noisy(cloud_of(seen, truth)).double()
+    begun = Rigid(truth.R.double(), truth.t_m.double())
+    return mirror_gain(cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_mirror_image_fits_a_mirrored_copy_better_and_the_object_worse(seed: int) -> None:
+    assert gain(bracket(), seed) < 0.005
+    assert gain(mirrored(bracket()), seed) > 0.05
+
+
+def estimated(model: ObjectModel, seen: ObjectModel) -> PoseEstimate:
+    net = Oracle(tiny_weights(model, refusal=RefusalConfig(max_risk=1.0)), [TRUTH])
+    return net.estimate(cloud=noisy(cloud_of(seen, TRUTH)))
+
+
+def test_a_mirrored_copy_is_refused_with_its_reason() -> None:
+    refused = estimated(bracket(), mirrored(bracket()))
+    assert refused.status == "doubtful"
+    assert refused.reason.startswith("the cloud fits the mirror image better (by 0.")
+    assert refused.camera_from_model is None
+    assert refused.signals["mirror"] > 0.05
+    assert estimated(bracket(), bracket()).signals["mirror"] < 0.005
+
+
+def test_an_object_that_is_its_own_mirror_image_is_answered() -> None:
+    found = estimated(bottle(), mirrored(bottle()))
+    assert found.is_ok
+    assert found.signals["mirror"] == 0
