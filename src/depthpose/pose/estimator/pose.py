@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from depthpose.pose.estimator.alternatives import (
 )
 from depthpose.pose.estimator.evidence import (
     observability,
+    surface_signals,
     vote_signals,
     without_motions,
 )
@@ -28,7 +30,7 @@ from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
 from depthpose.pose.estimator.refusal import reason_of, risk_of
 from depthpose.pose.estimator.scale import Scale, scale_of
-from depthpose.pose.refine import refine_best
+from depthpose.pose.refine import Refined, refine_best
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import (
@@ -91,22 +93,67 @@ def pose_from_directions(
     clock.note("voting")
     fits = _fits(vote, model, config, refusal.is_calibrated)
     if isinstance(fits, Refusal):
-        return _withheld(model, fits, clock)
+        return _withheld(model.name, fits, clock)
     clock.note("svd")
     found = _refine(voted, fits, (model, surface, copies), refusal, config)
     if config.with_icp:
         clock.note("icp")
-    free = free_motions(model.symmetries.continuous, found.pose)
-    answer = _answer(model, vote, found, free)
-    reason = _doubt(voted.cloud, found, surface, refusal, free)
-    if reason is None and config.with_icp and refusal.max_scale_error < 1:
-        scale = scale_of(voted.cloud.cloud_m, found.pose, surface)
+    answer = _answer(model, found, vote)
+    if not config.with_icp:
+        refusal = replace(refusal, max_scale_error=1.0)  # only a refined pose tells the scale
+    return _checked(voted.cloud, found, answer, surface, refusal, clock)
+
+
+def pose_from_proposals(
+    cloud: Prepared,
+    proposals: Rigid,
+    known: tuple[ObjectModel, Surface, Copies],
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+) -> PoseEstimate:
+    """Refine the best of proposed poses and check it; no network takes part.
+
+    Args:
+        cloud: of the object.
+        proposals: poses, the likeliest first; one at least.
+        known: the object, its surface and what it may be confused with.
+        refusal: when the answer is withheld; it weighs no signal of votes for keypoints.
+        config: of ICP, which begins at the proposals alone.
+    """
+    model, surface, copies = known
+    clock = _Clock()
+    icp = replace(config.icp, starts=1)
+    best = refine_best(cloud.cloud_m.double(), proposals, surface, icp)
+    if float(best.refined.inlier_share) == 0:
+        reason = "no pose lays the model near the points: another object, or too little of it"
+        return _withheld(model.name, Refusal(status="votes do not meet", reason=reason), clock)
+    first = _candidate(best.refined)
+    candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
+    evidence = [surface_signals(cloud.cloud_m, one.pose, surface) for one in candidates]
+    signals = {"few": 10 / len(cloud.points_m), "scatter": best.scatter}
+    found = _choose(candidates, evidence, signals, copies, refusal)
+    clock.note("icp")
+    return _checked(cloud, found, _answer(model, found), surface, refusal, clock)
+
+
+def _checked(
+    cloud: Prepared,
+    found: _Found,
+    answer: PoseEstimate,
+    surface: Surface,
+    refusal: RefusalConfig,
+    clock: _Clock,
+) -> PoseEstimate:
+    """Withhold an answer that is doubtful."""
+    reason = _doubt(cloud, found, surface, refusal, answer)
+    if reason is None and refusal.max_scale_error < 1:
+        scale = scale_of(cloud.cloud_m, found.pose, surface)
         answer.signals["scale"] = scale.times
         reason = _other_size(scale, refusal)
     clock.note("check")
     risk = risk_of(found.signals, refusal)
     if reason is not None:
-        return _withheld(model, reason, clock, answer, risk)
+        return _withheld(answer.object, reason, clock, answer, risk)
     return _with_certainty(replace(answer, risk=risk, seconds=clock.seconds), found)
 
 
@@ -179,23 +226,33 @@ def _refine(
         if float(best.refined.inlier_share) > 0:
             fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
             others = best.others
-    source = fit if refined is None else refined
-    given = source.camera_from_model
-    pose = Rigid(given.R.double(), given.t_m.double())
-    first = Candidate(pose, source.covariance, float(source.residual_m))
+    first = _candidate(fit if refined is None else refined)
     icp = None if refined is None else config.icp
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     evidence = [evidence_of(voted, one.pose, model, copies, surface) for one in candidates]
+    signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
+    return _choose(candidates, evidence, signals, copies, refusal)
+
+
+def _candidate(source: PoseFit | Refined) -> Candidate:
+    given = source.camera_from_model
+    pose = Rigid(given.R.double(), given.t_m.double())
+    return Candidate(pose, source.covariance, float(source.residual_m))
+
+
+def _choose(
+    candidates: Sequence[Candidate],
+    evidence: Sequence[dict[str, float]],
+    signals: dict[str, float],
+    copies: Copies,
+    refusal: RefusalConfig,
+) -> _Found:
+    """Choose among the poses that fit by what speaks against each."""
     shares = share_out(evidence, refusal.candidate_slopes)
     number = int(shares.argsort(descending=True, stable=True)[0])
-    chosen = candidates[number]
-    signals = {
-        **vote_signals(voted.cloud, fit),
-        "scatter": scatter,
-        **evidence[number],
-    }
     alternatives = alternatives_among(candidates, evidence, shares, copies)
-    return _Found(*chosen, signals, float(shares[number]), alternatives)
+    every = {**signals, **evidence[number]}
+    return _Found(*candidates[number], every, float(shares[number]), alternatives)
 
 
 def _none_of(pose: Rigid) -> Rigid:
@@ -213,19 +270,18 @@ def _row(fits: PoseFit, number: int) -> PoseFit:
     )
 
 
-def _answer(
-    model: ObjectModel, vote: Vote, found: _Found, free: Float[Tensor, "m 6"]
-) -> PoseEstimate:
+def _answer(model: ObjectModel, found: _Found, vote: Vote | None = None) -> PoseEstimate:
+    free = free_motions(model.symmetries.continuous, found.pose)
     # Worked out in float64, given as points and models come: in float32.
     return PoseEstimate(
         name="",
         object=model.name,
         status="ok",
         camera_from_model=Rigid(found.pose.R.float(), found.pose.t_m.float()),
-        keypoints_m=vote.keypoints_m.float(),
+        keypoints_m=None if vote is None else vote.keypoints_m.float(),
         covariance=without_motions(found.covariance, free).float(),
         free_motions=free.float(),
-        inlier_share=float(vote.inlier_share.mean()),
+        inlier_share=None if vote is None else float(vote.inlier_share.mean()),
         residual_m=found.residual_m,
         signals=found.signals,
     )
@@ -236,11 +292,13 @@ def _doubt(
     found: _Found,
     surface: Surface,
     config: RefusalConfig,
-    free: Float[Tensor, "m 6"],
+    answer: PoseEstimate,
 ) -> Refusal | None:
     risk = risk_of(found.signals, config)
     if risk is not None and risk > config.max_risk:
         return Refusal(status="doubtful", reason=reason_of(found.signals, risk, config))
+    assert answer.free_motions is not None
+    free = answer.free_motions.double()
     observable, motion = observability(cloud.cloud_m, found.pose, surface, free)
     if observable >= config.min_hold:
         return None
@@ -266,7 +324,7 @@ def _other_size(scale: Scale, config: RefusalConfig) -> Refusal | None:
 
 
 def _withheld(
-    model: ObjectModel,
+    object: str,
     refusal: Refusal,
     clock: _Clock,
     answer: PoseEstimate | None = None,
@@ -276,7 +334,7 @@ def _withheld(
     known = answer is not None
     return PoseEstimate(
         name="",
-        object=model.name,
+        object=object,
         status=refusal.status,
         reason=refusal.reason,
         keypoints_m=answer.keypoints_m if known else None,
