@@ -74,7 +74,7 @@ def test_a_data_set_brings_its_models(tmp_path: Path) -> None:
         ("--method register --cloud scan.ply", "give --cad part.stl --unit mm, or --bop"),
         ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
         ("--cad connector.stl --unit mm --cloud scan.ply", "add --method register"),
-        ("--method register --cad connector.stl --bop lm", "leave --cad away"),
+        ("--method register --cad connector.stl --bop .", "leave --cad away"),
         ("--method register --cad connector.stl --unit mm --cloud scan.ply --engine ray",
          "leave --engine away"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),

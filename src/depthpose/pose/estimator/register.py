@@ -9,12 +9,24 @@ import torch
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, Unit
+from depthpose.pose.estimator.alternatives import Copies, find_candidates
+from depthpose.pose.estimator.answer import (
+    Clock,
+    answer_of,
+    candidate_of,
+    checked,
+    choose,
+    withheld,
+)
 from depthpose.pose.estimator.base import PoseEstimator, refused
-from depthpose.pose.estimator.pose import pose_from_proposals
-from depthpose.pose.estimator.prepare import AnyInput, Refusal, prepare_cloud
+from depthpose.pose.estimator.evidence import surface_signals
+from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, with_found_symmetries
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses, thin
 
@@ -22,7 +34,14 @@ CANDIDATE_SLOPES = {
     name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
 }
 """As of :class:`RefusalConfig`; no network disagrees."""
-_REFUSAL = RefusalConfig(candidate_slopes=CANDIDATE_SLOPES)
+_REFUSAL = RefusalConfig(
+    max_risk=0.0688,
+    bias=9.715,
+    slopes={"scatter": 0.719, "tilt": 2.94, "far": 0.525, "unseen": 0.496, "few": 0.651},
+    means={"scatter": -3.12, "tilt": -2.18, "far": -3.63, "unseen": -1.49, "few": -3.17},
+    candidate_slopes=CANDIDATE_SLOPES,
+)
+"""As ``bench/calibrate_register.py`` printed it for 30 random parts."""
 _VOXEL = 0.05
 """Of the diameter."""
 _LEAST = 500
@@ -133,6 +152,38 @@ class Registration(PoseEstimator):
         if number not in self._tables:
             self._tables[number] = prepare_pairs(self._surface(number))
         return self._tables[number]
+
+
+def pose_from_proposals(
+    cloud: Prepared,
+    proposals: Rigid,
+    known: tuple[ObjectModel, Surface, Copies],
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+) -> PoseEstimate:
+    """Refine the best of proposed poses and check it; no network takes part.
+
+    Args:
+        cloud: of the object.
+        proposals: poses, the likeliest first; one at least.
+        known: the object, its surface and what it may be confused with.
+        refusal: when the answer is withheld; it weighs no signal of votes for keypoints.
+        config: of ICP, which begins at the proposals alone.
+    """
+    model, surface, copies = known
+    clock = Clock()
+    icp = replace(config.icp, starts=1)
+    best = refine_best(cloud.cloud_m.double(), proposals, surface, icp)
+    if float(best.refined.inlier_share) == 0:
+        reason = "no pose lays the model near the points: another object, or too little of it"
+        return withheld(model.name, Refusal(status="votes do not meet", reason=reason), clock)
+    first = candidate_of(best.refined)
+    candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
+    evidence = [surface_signals(cloud.cloud_m, one.pose, surface) for one in candidates]
+    signals = {"few": 10 / len(cloud.points_m), "scatter": best.scatter}
+    found = choose(candidates, evidence, signals, copies, refusal)
+    clock.note("icp")
+    return checked(cloud, found, answer_of(model, found), surface, refusal, clock)
 
 
 def _refuse_no_surface(models: Sequence[ObjectModel]) -> None:
