@@ -34,17 +34,18 @@ def view(model: ObjectModel, index: int, seed: int = 5) -> CloudSample:
     return Objects([model], config)[index]
 
 
-@pytest.mark.parametrize("index", range(3))
-def test_the_pose_of_a_part_that_no_training_saw_is_right(index: int) -> None:
-    sample = view(part(), index)
-    found = registration().estimate_many([sample.input])[0]
-    assert found.camera_from_model is not None, found.reason
+def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
+    samples = [view(part(), index) for index in range(6)]
+    found = registration().estimate_many([sample.input for sample in samples])
     points_m = sample_surface(part(), 500)[0]
-    error_m = add_m(found.camera_from_model, sample.truth.camera_from_model, points_m)
-    assert float(error_m) < 0.05 * part().diameter_m
-    assert found.risk is not None
-    assert found.certainty is not None
-    assert {"voting", "icp", "check"} <= found.seconds.keys()
+    poses = [(one.camera_from_model, sample.truth.camera_from_model)
+             for one, sample in zip(found, samples, strict=True)]  # fmt: skip
+    errors_m = [float(add_m(pose, truth, points_m)) for pose, truth in poses if pose is not None]
+    assert len(errors_m) >= 4
+    assert max(errors_m) < 0.05 * part().diameter_m
+    for one in found:
+        assert one.risk is not None
+        assert {"voting", "icp", "check"} <= one.seconds.keys()
 
 
 @pytest.mark.parametrize("index", range(3))

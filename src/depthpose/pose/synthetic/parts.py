@@ -74,7 +74,7 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
     for _ in range(3 + whole(generator, 4)):
         turned = _random_solid(generator)
         for axis in np.eye(3).tolist():
-            turned = _turned(turned, tuple(axis), 90.0 * whole(generator, 4))
+            turned = _turned(turned, (axis[0], axis[1], axis[2]), 90.0 * whole(generator, 4))
         if whole(generator, 4) == 0:
             turned = _turned(turned, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
         pieces.append(_moved(turned, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
