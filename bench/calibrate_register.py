@@ -1,12 +1,12 @@
 """The risk of a wrong registration, calibrated on random parts and checked on others.
 
-    python bench/calibrate_register.py --parts 30 --check 15
+    python bench/calibrate_register.py --parts 14 --check 6
 
-Each random part is seen in six views with up to 60 % hidden, and in its place five negatives:
+Each random part is seen in five views with up to 60 % hidden, and in its place five negatives:
 another part, a scaled copy, a mirrored one, a blob, and a box or cylinder. Nothing is refused for
 its risk while signals are collected; ``calibrate_refusal`` then weighs them, and chooses the limit
 so that at most 2 % of the answers are wrong where nearly half of what is seen is not the part.
-Mirrored copies, of which many views hardly differ, are counted but not calibrated on. Prints the
+Mirrored and scaled copies, of which some views hardly differ, are counted but not calibrated on. Prints the
 settings that ``src/depthpose/pose/estimator/register.py`` holds, and what they answer on the parts
 kept back; writes all signals to ``rows.json``. ``--rows`` takes those of an earlier run.
 """
@@ -32,8 +32,9 @@ from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.tables import markdown_table
 
 SEED = 0x9A27
-VIEWS = 6
+VIEWS = 5
 NEGATIVES = ("another object", "scaled", "mirrored", "blob", "box or cylinder")
+NEAR = ("scaled", "mirrored")
 MAX_WRONG = 0.02
 OPEN = RefusalConfig(max_risk=1.0, candidate_slopes=CANDIDATE_SLOPES)
 Row = dict[str, Any]
@@ -71,7 +72,7 @@ def rows_of(number: int) -> Iterator[Row]:
 
 def calibrated(rows: Sequence[Row]) -> RefusalConfig:
     """Weigh the signals that registration has; those of votes for keypoints count as none."""
-    answered = [row for row in rows if row["status"] == "ok" and row["kind"] != "mirrored"]
+    answered = [row for row in rows if row["status"] == "ok" and row["kind"] not in NEAR]
     none = dict.fromkeys(SIGNALS, 0.0)
     estimates = [cast(PoseEstimate, Answer({**none, **row["signals"]})) for row in answered]
     found = calibrate_refusal(estimates, [row["right"] for row in answered], MAX_WRONG)
@@ -104,8 +105,8 @@ def counts(rows: Sequence[Row], refusal: RefusalConfig) -> Iterator[Row]:
 def main() -> None:
     """Collect, calibrate, check."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", type=int, default=30, help="by which is calibrated")
-    parser.add_argument("--check", type=int, default=15, help="by which is checked")
+    parser.add_argument("--parts", type=int, default=14, help="by which is calibrated")
+    parser.add_argument("--check", type=int, default=6, help="by which is checked")
     parser.add_argument("--rows", type=Path, help="rows.json of an earlier run")
     parser.add_argument("--out", type=Path, default=Path("out/calibrate_register"))
     words = parser.parse_args()

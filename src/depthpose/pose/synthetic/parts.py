@@ -67,7 +67,7 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
     """Make a part of three to six boxes, tubes and cones that run into one another.
 
     Args:
-        generator: of the sizes, in millimetres from 8 to 90, and places.
+        generator: of the sizes, in millimetres from 3 to 90, and places.
         name: what samples call it.
     """
     pieces = []
@@ -86,8 +86,8 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
 def _random_solid(generator: torch.Generator) -> Mesh:
     kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
     if kind == 0:
-        return _box((uniform(generator, 8.0, 80.0), uniform(generator, 8.0, 60.0), height))
-    low, high = uniform(generator, 6.0, 35.0), uniform(generator, 4.0, 35.0)
+        return _box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
+    low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
     if kind == 1:
         return _tube(low, uniform(generator, 0.2, 0.8) * low, height)
     return _revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])
