@@ -3,6 +3,9 @@
     python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
         --ours pose.safetensors --pointnet pointnet.safetensors \
         --depth-image depth-image.safetensors --open3d 100
+    python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
+        --parts bracket connector mug --number 25 --register 25 --open3d 25 --sweep 0 \
+        --occlusions 0 0.35
 
 Every view is rendered separately, by a seed that no training has. A method is given one view at
 a time, on one thread; of several weights each is used for its own objects. Success is ADD
@@ -27,10 +30,10 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.pose.baselines import FpfhEstimator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
 from depthpose.pose.datasets.models import models_folder, read_bop_models, read_models_info
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m, risk_coverage
-from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.tables import markdown_table, write_table
@@ -100,6 +103,16 @@ def _of(name: str, nets: Sequence[Any], number: int) -> Iterator[Method]:
             frozenset(by_object),
             number,
         )
+
+
+def zero_shot(models: Sequence[ObjectModel], number: int) -> Iterator[Method]:
+    """Give our registration without training, where it is asked for; models are prepared once."""
+    nets = [Registration([model]) for model in models] if number else []
+    for net in nets:
+        began = time.process_time()
+        net.prepare()
+        print(f"{net.objects[0]}: prepared in {time.process_time() - began:.1f} s of one core")
+    yield from _of("ours, without training", nets, number)
 
 
 def registration(models: Sequence[ObjectModel], number: int) -> Iterator[Method]:
@@ -176,7 +189,7 @@ def shares(rows: Sequence[Row]) -> Row:
 
 def conditions(words: argparse.Namespace) -> Iterator[tuple[Condition, int]]:
     """List the conditions, each once."""
-    for occlusion in OCCLUSIONS:
+    for occlusion in words.occlusions:
         yield Condition(occlusion=occlusion), words.number
     if words.sweep:
         yield from ((Condition(noise=n), words.sweep) for n in NOISES if n != 1)
@@ -229,6 +242,9 @@ def main() -> None:
     parser.add_argument("--ours", nargs="*", default=[])
     parser.add_argument("--pointnet", nargs="*", default=[])
     parser.add_argument("--depth-image", nargs="*", default=[])
+    parser.add_argument("--parts", nargs="*", default=[], choices=PARTS, help="models too")
+    parser.add_argument("--register", type=int, default=0, help="views of each object; 0: not run")
+    parser.add_argument("--occlusions", type=float, nargs="*", default=OCCLUSIONS)
     parser.add_argument("--open3d", type=int, default=0, help="views of each object; 0: not run")
     parser.add_argument("--number", type=int, default=250, help="views of each object")
     parser.add_argument("--sweep", type=int, default=50, help="views at each noise and resolution")
@@ -244,12 +260,14 @@ def main() -> None:
     torch.set_num_threads(1)
     numbers = words.objects or sorted(read_models_info(models_folder(words.bop)))
     models = list(read_bop_models(words.bop, numbers).values())
+    models += [make_part(name, 100 + k) for k, name in enumerate(words.parts)]
     methods = [
         *loaded("Geo-PoseNet", words.ours, words.number, GeoPoseNet),
         *without_refusal(OPEN, words.ours, words.number),
         *loaded("PointNet", words.pointnet, words.number, GeoPoseNet),
         *without_refusal("PointNet + ICP, nothing refused", words.pointnet, words.number),
         *loaded("depth image", words.depth_image, words.number, DepthImageRegressor),
+        *zero_shot(models, words.register),
         *registration(models, words.open3d),
     ]
     rows, views = ([*earlier(words.also, name)] for name in ("rows", "views"))

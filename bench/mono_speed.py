@@ -74,6 +74,7 @@ def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
     """Count operations of the plain matcher at this size, without computing anything."""
     assert isinstance(net.matcher, PSMNetMatcher)
     config = net.matcher.network_config
+    assert isinstance(config, PSMNetConfig)
     rows, columns = (max(config.min_side_px, -(-side // 16) * 16) for side in (height, width))
     with torch.device("meta"):
         shadow = PSMNet(config).eval()

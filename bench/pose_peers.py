@@ -25,7 +25,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import FpfhConfig, FpfhRegistration
 from depthpose.pose.config import EstimateConfig, VotingConfig
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.evaluate import nearest_copy
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, auc
@@ -36,6 +36,8 @@ from depthpose.report.tables import markdown_table, write_table
 POINTS = 2000
 Row = dict[str, Any]
 Method = Callable[[CloudInput], PoseEstimate]
+_PREPARED: dict[str, Registration] = {}
+"""By object: the model is prepared once, whatever the seed."""
 
 
 def measure(case: RealCase, estimate: PoseEstimate) -> Row:
@@ -72,6 +74,16 @@ def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Metho
     """Open3D's registration for one model."""
     config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
     return FpfhRegistration(case.model, config).estimate
+
+
+def zero_shot_method(case: RealCase, seed: int) -> Method:
+    """Our registration without training; the seed draws points of the cloud."""
+    if case.model.name not in _PREPARED:
+        _PREPARED[case.model.name] = Registration([case.model])
+        _PREPARED[case.model.name].prepare()
+    net = _PREPARED[case.model.name]
+    net.config = EstimateConfig(voting=VotingConfig(seed=seed))
+    return lambda given: net.estimate_many([given])[0]
 
 
 def our_method(weights: Sequence[str], case: RealCase, seed: int, with_icp: bool) -> Method:
@@ -166,6 +178,7 @@ def main() -> None:
     parser.add_argument("--voxel", type=float, default=FpfhConfig.voxel_diameters)
     parser.add_argument("--weights", nargs="*", default=[], help="of ours")
     parser.add_argument("--no-peer", action="store_true", help="ours alone")
+    parser.add_argument("--register", action="store_true", help="ours without training too")
     parser.add_argument("--out", type=Path, default=Path("out/pose_peers"))
     words = parser.parse_args()
     torch.set_num_threads(1)
@@ -179,6 +192,8 @@ def main() -> None:
     for name, with_icp in (("Geo-PoseNet", False), ("Geo-PoseNet + ICP", True)):
         make = partial(our_method, words.weights, with_icp=with_icp)
         rows += run_method(name, known, make, words.seeds)
+    if words.register:
+        rows += run_method("ours, without training", cases, zero_shot_method, words.seeds)
     write_table(words.out, rows)
     print(markdown_table(summary(rows)))
     print(markdown_table(verdicts(rows)))

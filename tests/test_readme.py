@@ -34,7 +34,7 @@ def test_the_commands_that_need_no_data_run(demo_folder: Path) -> None:
 
 def test_the_commands_that_pose_run(demo_folder: Path) -> None:
     lines = [line for line in commands() if " pose " in line and " out/demo" in line]
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert [run(line) for line in lines] == [0] * len(lines)
     assert (demo_folder / "out/measured/report.html").is_file()
 

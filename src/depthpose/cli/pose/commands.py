@@ -13,6 +13,8 @@ from depthpose.cli.pose.options import (
     Estimates,
     OneObject,
     OneObjectOptions,
+    Register,
+    RegisterOptions,
     refuse_mixture,
 )
 from depthpose.core.errors import InputError
@@ -25,6 +27,7 @@ def predict(
     inputs: OneObject = OneObjectOptions(),  # noqa: B008  frozen
     dataset: DataSet = DataSetOptions(),  # noqa: B008
     estimates: Estimates = EstimateOptions(),  # noqa: B008
+    register: Register = RegisterOptions(),  # noqa: B008
     view: str | None = None,
     engine: Engine = EngineOptions(),  # noqa: B008
 ) -> int:
@@ -44,6 +47,7 @@ def predict(
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
         depthpose pose predict --depth d.png --camera cam.json --out out
         depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
+        depthpose pose predict --method register --cad p.stl --unit mm --cloud p.ply --out out
 
     Args:
         out: folder for the results.
@@ -52,13 +56,14 @@ def predict(
     """
     from depthpose.cli.pose.finding import find_all
     from depthpose.cli.pose.inputs import object_named
-    from depthpose.cli.pose.methods import pose_methods
 
     refuse_mixture(inputs, dataset.bop)
     config = estimates.config
+    if engine.is_ray and register.method == "register":
+        raise InputError("--method register runs in this process alone; leave --engine away")
     if engine.is_ray:
         return _predict_on_ray(inputs, dataset, weights, config, estimates.batch, out, engine)
-    (method,) = pose_methods([weights], config)
+    method = _method_of(weights, register, inputs, dataset, config)
     if dataset.bop is not None:
         return _predict_bop(method, dataset, Path(out), estimates.batch, config.device, view)
     if inputs.cloud is not None and not method.takes_clouds:
@@ -72,6 +77,32 @@ def predict(
         place = Path(inputs.depth)
         return find_all(method, place, inputs.camera, wanted, inputs.unit, Path(out))
     return _predict_here(method, inputs, Path(out), estimates.batch, view)
+
+
+def _method_of(
+    weights: str,
+    register: RegisterOptions,
+    given: OneObjectOptions,
+    dataset: DataSetOptions,
+    config: EstimateConfig,
+) -> Any:  # noqa: ANN401  a type of this would load torch for --help
+    """Build the estimator: of weights, or of models alone."""
+    from depthpose.cli.pose.methods import REGISTER, pose_methods, registration_of
+    from depthpose.pose.datasets import open_bop
+
+    if register.method == "network" and register.cad:
+        raise InputError(
+            "--cad: weights know their own objects; add --method register, or train weights of "
+            "this part by 'depthpose pose train --cad'"
+        )
+    if register.method == "network":
+        return pose_methods([weights], config)[0]
+    if register.cad and dataset.bop is not None:
+        raise InputError("--cad: the models of --bop are taken; leave --cad away")
+    if register.cad:
+        return registration_of(register.cad, register.cad_unit or given.unit, config)
+    models = () if dataset.bop is None else open_bop(dataset.bop, dataset.split).objects.values()
+    return pose_methods([REGISTER], config, tuple(models))[0]
 
 
 def _predict_here(
@@ -141,8 +172,8 @@ def evaluate(
         bop: folder of the data set.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
-        weights: files or names, of the method or of a baseline; the word open3d is registration by
-            Open3D (an extra), which has none.
+        weights: files or names, of the method or of a baseline; the words register, registration
+            without training, and open3d, that of Open3D (an extra), have none.
         csv: BOP results of any method.
         predictions: folders with poses.json.
         objects: keep these alone, by name or number.

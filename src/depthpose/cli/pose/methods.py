@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
-from depthpose.pose.config import EstimateConfig
+from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.datasets import BopDataset
-from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import (
     predict,
@@ -27,6 +28,8 @@ from depthpose.pose.weights import read_pose_weights
 
 REGISTRATION = "open3d"
 """The name of Open3D's features, RANSAC and ICP, where weights are named."""
+REGISTER = "register"
+"""The name of our own registration, which needs no training."""
 _SAME_DIAMETER = 0.05
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
@@ -59,7 +62,7 @@ def pose_methods(
     Files of one name are distinguished by their folders.
 
     Args:
-        names: of weights, or paths; ``open3d`` is registration, which has no weights.
+        names: of weights, or paths; ``register`` and ``open3d`` have none: they take models.
         config: of the estimators that have weights.
         models: what registration looks for.
 
@@ -67,15 +70,18 @@ def pose_methods(
         InputError: there are no such weights, they pose nothing, or are given twice.
         MissingExtraError: registration is wanted, and Open3D is not installed.
     """
-    paths = [None if name == REGISTRATION else find_weights(name) for name in names]
-    names = distinct_names([(p.parent, p.stem) if p else (None, REGISTRATION) for p in paths])
+    takers = {REGISTRATION: _open3d, REGISTER: _register}
+    paths = [None if name in takers else find_weights(name) for name in names]
+    labels = distinct_names(
+        [(p.parent, p.stem) if p else (None, n) for p, n in zip(paths, names, strict=True)]
+    )
     return [
-        _method(path, name, config) if path else _registration(name, models)
-        for path, name in zip(paths, names, strict=True)
+        _method(path, label, config) if path else takers[name](label, models, config)
+        for path, name, label in zip(paths, names, labels, strict=True)
     ]
 
 
-def _registration(name: str, models: Sequence[ObjectModel]) -> PoseMethod:
+def _open3d(name: str, models: Sequence[ObjectModel], _: EstimateConfig) -> PoseMethod:
     if not models:
         raise InputError(
             f"{REGISTRATION}: it looks for the models of a data set; give --bop to 'pose evaluate'"
@@ -87,6 +93,47 @@ def _registration(name: str, models: Sequence[ObjectModel]) -> PoseMethod:
         models=models,
         settings={"kind": "registration", "fpfh": config_to_dict(FpfhConfig())},
     )
+
+
+def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) -> PoseMethod:
+    if not models:
+        raise InputError(
+            "--method register looks for CAD files: give --cad part.stl --unit mm, or --bop, whose "
+            "models it takes"
+        )
+    net = Registration(models, config)
+    known = {model.name: _digest(model) for model in models}
+    return PoseMethod(
+        name=name,
+        estimate_many=net.estimate_many,
+        takes_clouds=True,
+        models=models,
+        settings={"kind": REGISTER, "models": known, "estimate": config_to_dict(config)},
+        find=net.find_in,
+        track=net.track_in,
+    )
+
+
+def _digest(model: ObjectModel) -> str:
+    """Name a shape by its bytes."""
+    digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
+    digest.update(model.faces.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def registration_of(cad: Sequence[str], unit: Unit | None, config: EstimateConfig) -> PoseMethod:
+    """Build the registration of CAD files.
+
+    Raises:
+        InputError: no unit, or a file that cannot be read or has no surface.
+    """
+    if unit is None:
+        raise InputError(
+            "--cad without a unit: no file says its unit; give --unit mm, of CAD and clouds, or "
+            "--cad-unit mm"
+        )
+    models = Registration.load(*cad, unit=unit).models
+    return _register(REGISTER, models, config)
 
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -30,7 +30,7 @@ class OneObjectOptions:
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
     object: str | None = None
-    """which of the objects that the weights know."""
+    """which of the objects that are known."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
 
@@ -79,8 +79,23 @@ class EstimateOptions:
         )
 
 
+@group
+@dataclass(frozen=True, kw_only=True)
+class RegisterOptions:
+    """Poses by a CAD file alone, without training."""
+
+    method: Literal["network", "register"] = "network"
+    """network: trained weights. register: the CAD file alone, after a few seconds for each part."""
+    cad: tuple[str, ...] = ()
+    """of register: STL, PLY, OBJ or GLB files; an object is called as its file. A data set has its
+    own models."""
+    cad_unit: Unit | None = None
+    """of the CAD files; as --unit by default."""
+
+
 OneObject = Annotated[OneObjectOptions, tyro.conf.OmitArgPrefixes]
 DataSet = Annotated[DataSetOptions, tyro.conf.OmitArgPrefixes]
+Register = Annotated[RegisterOptions, tyro.conf.OmitArgPrefixes]
 Estimates = Annotated[EstimateOptions, tyro.conf.OmitArgPrefixes]
 
 

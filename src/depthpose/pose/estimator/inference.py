@@ -12,14 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.devices import usable_device
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.alternatives import Copies, find_copies
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.estimator.base import PoseEstimator, refused
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
-from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.types import PoseEstimate, SeenPoints
+from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints
 from depthpose.pose.weights import DirectionNet, PoseWeights
 
 
@@ -77,7 +76,7 @@ def _in_camera(
     return torch.cat([directions, outputs[..., 3:]], -1)
 
 
-class PoseInference:
+class PoseInference(PoseEstimator):
     """A network of directions ready to run, with what is kept of each object.
 
     Args:
@@ -89,7 +88,7 @@ class PoseInference:
     """
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        self.config = EstimateConfig() if config is None else config
+        super().__init__(weights.models, config)
         self.weights = weights
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
@@ -97,14 +96,16 @@ class PoseInference:
                 "DepthImageRegressor"
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
-        self._numbers = {model.name: k for k, model in enumerate(weights.models)}
-        self._surfaces: dict[int, Surface] = {}
-        self._copies: dict[int, Copies] = {}
 
     @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of the objects that the weights know."""
-        return tuple(self._numbers)
+    def models(self) -> Sequence[ObjectModel]:
+        """The objects that the weights know."""
+        return self.weights.models
+
+    @property
+    def refusal(self) -> RefusalConfig:
+        """When an answer is withheld: calibrated with the weights."""
+        return self.weights.refusal
 
     @torch.inference_mode()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
@@ -142,7 +143,7 @@ class PoseInference:
             prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
             spent_s = time.perf_counter() - start
             if isinstance(prepared, Refusal):
-                yield k, _refused(given, prepared, {"cloud": spent_s}), None
+                yield k, refused(given, prepared, {"cloud": spent_s}), None
             else:
                 ready.append((k, prepared, spent_s))
         for some in batches(ready, self.config.batch_voxels):
@@ -167,39 +168,12 @@ class PoseInference:
     def _pose(
         self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
     ) -> PoseEstimate:
-        model = self.weights.models[number]
-        if number not in self._copies:
-            up_to_symmetry = self.config.up_to_symmetry
-            self._copies[number] = find_copies(model, up_to_symmetry=up_to_symmetry)
         found = pose_from_directions(
             voted,
-            model,
+            self.weights.models[number],
             self._surface(number),
-            self._copies[number],
+            self._copies_of(number),
             self.weights.refusal,
             self.config,
         )
         return replace(found, name=given.name, seconds={**seconds, **found.seconds})
-
-    def _surface(self, number: int) -> Surface:
-        if number not in self._surfaces:
-            model = self.weights.models[number]
-            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
-        return self._surfaces[number]
-
-    def _number(self, name: str) -> int:
-        if name not in self._numbers:
-            raise InputError(
-                f"object {name!r}: the weights do not know it; {nearest_name(name, self.objects)}"
-            )
-        return self._numbers[name]
-
-
-def _refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
-    return PoseEstimate(
-        name=given.name,
-        object=given.object,
-        status=refusal.status,
-        reason=refusal.reason,
-        seconds=seconds,
-    )

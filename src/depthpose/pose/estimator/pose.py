@@ -1,65 +1,30 @@
 """Directions of one cloud to its pose: vote, drop outliers, fit, refine, check."""
 
-import time
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
-
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
-from depthpose.pose.estimator.alternatives import (
-    Candidate,
-    Copies,
-    alternatives_among,
-    evidence_of,
-    find_candidates,
-    share_out,
+from depthpose.pose.estimator.alternatives import Copies, evidence_of, find_candidates
+from depthpose.pose.estimator.answer import (
+    Clock,
+    Found,
+    answer_of,
+    candidate_of,
+    checked,
+    choose,
+    withheld,
 )
-from depthpose.pose.estimator.doubt import Posed, find_doubt
-from depthpose.pose.estimator.evidence import vote_signals, without_motions
+from depthpose.pose.estimator.doubt import Posed
+from depthpose.pose.estimator.evidence import vote_signals
 from depthpose.pose.estimator.prepare import Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
-from depthpose.pose.estimator.refusal import risk_of
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
-from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
-from depthpose.pose.voting import (
-    consistent_keypoints,
-    fit_pose,
-    free_motions,
-    meet_lines,
-    vote_ransac,
-)
+from depthpose.pose.types import ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.voting import consistent_keypoints, fit_pose, meet_lines, vote_ransac
 
 _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
-
-
-@dataclass
-class _Clock:
-    """Seconds of each stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    last: float = field(default_factory=time.perf_counter)
-
-    def note(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = now - self.last
-        self.last = now
-
-
-class _Found(NamedTuple):
-    """A pose, its covariance and residual, what speaks against it, and which others fit."""
-
-    pose: Rigid
-    covariance: Float[Tensor, "6 6"]
-    residual_m: float
-    signals: dict[str, float]
-    share: float
-    alternatives: tuple[Alternative, ...]
 
 
 def pose_from_directions(
@@ -81,34 +46,21 @@ def pose_from_directions(
         refusal: when the answer is withheld.
         config: voting and ICP.
     """
-    clock = _Clock()
+    clock = Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")
     fits = _fits(vote, model, config, refusal.is_calibrated)
     if isinstance(fits, Refusal):
-        return _withheld(model, fits, clock)
+        return withheld(model.name, fits, clock)
     clock.note("svd")
     found = _refine(voted, fits, (model, surface, copies), refusal, config)
     if config.with_icp:
         clock.note("icp")
-    free = free_motions(model.symmetries.continuous, found.pose)
-    answer = _answer(model, vote, found, free)
+    answer = answer_of(model, found, vote)
+    assert answer.free_motions is not None
+    free = answer.free_motions.double()
     posed = Posed(voted.cloud.cloud_m, found.pose, model, surface, free)
-    reason = find_doubt(posed, found.signals, refusal, with_icp=config.with_icp)
-    clock.note("check")
-    risk = risk_of(found.signals, refusal)
-    if reason is not None:
-        return _withheld(model, reason, clock, answer, risk)
-    return _with_certainty(replace(answer, risk=risk, seconds=clock.seconds), found)
-
-
-def _with_certainty(answer: PoseEstimate, found: _Found) -> PoseEstimate:
-    """Share what the risk leaves among the pose and its alternatives."""
-    if answer.risk is None and not found.alternatives:
-        return answer
-    known = 1.0 if answer.risk is None else 1 - answer.risk
-    others = tuple(replace(a, probability=known * a.probability) for a in found.alternatives)
-    return replace(answer, certainty=known * found.share, alternatives=others)
+    return checked(posed, found, answer, refusal, clock, with_icp=config.with_icp)
 
 
 def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
@@ -160,7 +112,7 @@ def _refine(
     known: tuple[ObjectModel, Surface, Copies],
     refusal: RefusalConfig,
     config: EstimateConfig,
-) -> _Found:
+) -> Found:
     model, surface, copies = known
     cloud_m = voted.cloud.cloud_m
     fit, scatter, refined = _row(fits, 0), 0.0, None
@@ -171,23 +123,12 @@ def _refine(
         if float(best.refined.inlier_share) > 0:
             fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
             others = best.others
-    source = fit if refined is None else refined
-    given = source.camera_from_model
-    pose = Rigid(given.R.double(), given.t_m.double())
-    first = Candidate(pose, source.covariance, float(source.residual_m))
+    first = candidate_of(fit if refined is None else refined)
     icp = None if refined is None else config.icp
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     evidence = [evidence_of(voted, one.pose, model, copies, surface) for one in candidates]
-    shares = share_out(evidence, refusal.candidate_slopes)
-    number = int(shares.argsort(descending=True, stable=True)[0])
-    chosen = candidates[number]
-    signals = {
-        **vote_signals(voted.cloud, fit),
-        "scatter": scatter,
-        **evidence[number],
-    }
-    alternatives = alternatives_among(candidates, evidence, shares, copies)
-    return _Found(*chosen, signals, float(shares[number]), alternatives)
+    signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
+    return choose(candidates, evidence, signals, copies, refusal)
 
 
 def _none_of(pose: Rigid) -> Rigid:
@@ -202,45 +143,4 @@ def _row(fits: PoseFit, number: int) -> PoseFit:
         residual_m=fits.residual_m[number],
         misfit=fits.misfit[number],
         is_used=fits.is_used[number],
-    )
-
-
-def _answer(
-    model: ObjectModel, vote: Vote, found: _Found, free: Float[Tensor, "m 6"]
-) -> PoseEstimate:
-    # Worked out in float64, given as points and models come: in float32.
-    return PoseEstimate(
-        name="",
-        object=model.name,
-        status="ok",
-        camera_from_model=Rigid(found.pose.R.float(), found.pose.t_m.float()),
-        keypoints_m=vote.keypoints_m.float(),
-        covariance=without_motions(found.covariance, free).float(),
-        free_motions=free.float(),
-        inlier_share=float(vote.inlier_share.mean()),
-        residual_m=found.residual_m,
-        signals=found.signals,
-    )
-
-
-def _withheld(
-    model: ObjectModel,
-    refusal: Refusal,
-    clock: _Clock,
-    answer: PoseEstimate | None = None,
-    risk: float | None = None,
-) -> PoseEstimate:
-    """Keep what was found out but the pose: a refusal cannot be taken for an answer."""
-    known = answer is not None
-    return PoseEstimate(
-        name="",
-        object=model.name,
-        status=refusal.status,
-        reason=refusal.reason,
-        keypoints_m=answer.keypoints_m if known else None,
-        inlier_share=answer.inlier_share if known else None,
-        residual_m=answer.residual_m if known else None,
-        risk=risk,
-        signals=answer.signals if known else {},
-        seconds=clock.seconds,
     )

@@ -14,6 +14,7 @@ import torch
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.rigid import Rigid
+from depthpose.pose.augment import uniform, whole
 from depthpose.pose.config import MeshConfig, metres_of
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
@@ -60,6 +61,36 @@ def write_part(name: str, folder: Path) -> Path:
     path = folder / f"{name}.stl"
     write_bytes(path, data)
     return path
+
+
+def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
+    """Make a part of three to six boxes, tubes and cones that run into one another.
+
+    Args:
+        generator: of the sizes, in millimetres from 3 to 90, and places.
+        name: what samples call it.
+    """
+    pieces = []
+    for _ in range(3 + whole(generator, 4)):
+        turned = _random_solid(generator)
+        for axis in np.eye(3).tolist():
+            turned = _turned(turned, (axis[0], axis[1], axis[2]), 90.0 * whole(generator, 4))
+        if whole(generator, 4) == 0:
+            turned = _turned(turned, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
+        pieces.append(_moved(turned, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
+    vertices, faces = _joined(*pieces)
+    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
+                      name=name)  # fmt: skip
+
+
+def _random_solid(generator: torch.Generator) -> Mesh:
+    kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
+    if kind == 0:
+        return _box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
+    low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
+    if kind == 1:
+        return _tube(low, uniform(generator, 0.2, 0.8) * low, height)
+    return _revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])
 
 
 def _bracket() -> Mesh:

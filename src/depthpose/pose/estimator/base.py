@@ -1,0 +1,282 @@
+"""What every estimator of poses offers: one object, several, whole depth images, sequences."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from depthpose.core.camera import AnyCamera, choose_lens
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import EstimateConfig, RefusalConfig, Unit
+from depthpose.pose.estimator.alternatives import Copies, find_copies
+from depthpose.pose.estimator.find import Known, find_objects, nothing_found, which_object
+from depthpose.pose.estimator.given import (
+    AnyArray,
+    AnyMask,
+    cloud_input,
+    split_instances,
+    view_input,
+)
+from depthpose.pose.estimator.prepare import AnyInput, Refusal
+from depthpose.pose.estimator.track import Followed, track
+from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+
+_NAME = "input"
+"""What an input is called that came without a name."""
+
+
+class PoseEstimator(ABC):
+    """Known objects, what is kept of each, and every form of input.
+
+    Args:
+        models: the objects.
+        config: ICP, limits, device.
+    """
+
+    _holder = "the weights"
+    """What knows the objects, in errors."""
+
+    def __init__(self, models: Sequence[ObjectModel], config: EstimateConfig | None) -> None:
+        self.config = EstimateConfig() if config is None else config
+        self._numbers = {model.name: k for k, model in enumerate(models)}
+        self._surfaces: dict[int, Surface] = {}
+        self._copies: dict[int, Copies] = {}
+
+    @property
+    @abstractmethod
+    def models(self) -> Sequence[ObjectModel]:
+        """The objects."""
+
+    @property
+    @abstractmethod
+    def refusal(self) -> RefusalConfig:
+        """When an answer is withheld."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects."""
+        return tuple(self._numbers)
+
+    @abstractmethod
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate many at once, of any objects.
+
+        Raises:
+            InputError: an unknown object, or a mask that does not fit its depth image.
+        """
+
+    def estimate(  # noqa: PLR0913  one input in several forms
+        self,
+        *,
+        cloud: AnyArray | None = None,
+        unit: Unit | None = None,
+        depth: AnyArray | None = None,
+        mask: AnyMask | None = None,
+        camera: AnyCamera | None = None,
+        focal_px: float | None = None,
+        object: str | None = None,
+    ) -> PoseEstimate:
+        """Estimate one pose, from a cloud or from a depth image with a mask.
+
+        Args:
+            cloud: points of the object alone, in the camera frame (x right, y down, z forward).
+            unit: of the cloud, metres by default; of a depth image, where its camera says none.
+            depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
+            mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths.
+            camera: of the depth image, its file of any format that is read, a dict of what such a
+                file has, or the 3x3 matrix K.
+            focal_px: the focal length alone [px], in place of a camera.
+            object: which one; None: whichever of those that are known it is, if any.
+
+        Raises:
+            InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
+                the data themselves lack is no error but a refusal.
+        """
+        which = self.objects[0] if object is None else self._object(object)
+        names = self.objects if object is None else (which,)
+        if cloud is not None and depth is None and mask is None:
+            return self._which(cloud_input(cloud, unit or "m", which, _NAME), names)
+        lens = choose_lens(camera, focal_px)
+        if cloud is not None or depth is None or mask is None or lens is None:
+            raise InputError("estimate: give cloud=, or depth=, mask= and camera= together")
+        return self._which(view_input(depth, mask, lens, which, _NAME, unit), names)
+
+    def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
+        """Estimate one input as each of several objects, and take the one that it shows."""
+        estimates = self.estimate_many([replace(given, object=name) for name in names])
+        return estimates[0] if len(estimates) == 1 else which_object(estimates, self.refusal)
+
+    def estimate_instances(
+        self,
+        *,
+        depth: AnyArray,
+        mask: AnyMask,
+        camera: AnyCamera | None = None,
+        focal_px: float | None = None,
+        object: str | None = None,
+        unit: Unit | None = None,
+    ) -> list[PoseEstimate]:
+        """Estimate every instance of one object in one mask, the largest piece first.
+
+        The mask is split into connected pieces; instances that touch in the image stay one piece.
+
+        Args:
+            depth: as for :meth:`estimate`.
+            mask: of all instances.
+            camera: of the depth image, as for :meth:`estimate`.
+            focal_px: the focal length alone [px], in place of a camera.
+            object: which one; None where one alone is known.
+            unit: of the depth, where its camera says none.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        view = view_input(
+            depth, mask, choose_lens(camera, focal_px), self._object(object), _NAME, unit
+        )
+        pieces = split_instances(view.mask) or [view.mask]
+        views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
+        return self.estimate_many(views)
+
+    def find(
+        self,
+        depth: AnyArray,
+        camera: AnyCamera,
+        objects: Sequence[str] | None = None,
+        unit: Unit | None = None,
+    ) -> list[PoseEstimate]:
+        """Find and pose known objects in a depth image without masks, the best answer first.
+
+        Dominant planes are taken away, the rest is parted where its depth jumps, and every region
+        is tried for every object of its size. What nothing fits, or what is refused, is left out.
+
+        Args:
+            depth: as for :meth:`estimate`.
+            camera: of the depth image.
+            objects: which may be there; None: all that are known.
+            unit: of the depth, where its camera says none.
+
+        Returns:
+            Estimates that are ok; none where nothing was found.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        names = self.objects if objects is None else [self._object(name) for name in objects]
+        view = view_input(depth, None, camera, names[0], _NAME, unit)
+        return self.find_in(view, names)
+
+    def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        """Do as :meth:`find` does for a view; its mask limits where is looked."""
+        known = Known(
+            models={name: self.models[self._number(name)] for name in objects},
+            surface_of=lambda name: self._surface(self._number(name)),
+            refusal=self.refusal,
+            estimate_many=self.estimate_many,
+        )
+        return find_objects(view, known)
+
+    def track(
+        self,
+        frames: Iterable[AnyArray],
+        camera: AnyCamera | None = None,
+        object: str | None = None,
+        first: Rigid | None = None,
+        unit: Unit | None = None,
+    ) -> Iterator[PoseEstimate]:
+        """Follow one object through a sequence, each frame from the pose of the one before by ICP.
+
+        Where the camera saw through the posed surface, or little of it, or what is seen fixes no
+        pose, the object is looked for anew in the frame; where it is not found either it is lost,
+        and looked for in the next.
+
+        Args:
+            frames: depth images as for :meth:`estimate`, in their order; without a camera clouds in
+                the camera frame, of the object alone or of what is about it too. They are taken one
+                by one, as their estimates are taken.
+            camera: of the depth images.
+            object: which one; None where one alone is known.
+            first: the pose in the first frame, as far as it is known; None: it is looked for.
+            unit: as for :meth:`estimate`.
+
+        Yields:
+            An estimate for each frame, whose ``tracking`` is ``tracked``, ``found`` or ``lost``.
+
+        Raises:
+            InputError: as for :meth:`estimate`.
+        """
+        which = self._object(object)
+
+        def given(frame: AnyArray, number: int) -> AnyInput:
+            name = f"{_NAME}_{number}"
+            if camera is None:
+                return cloud_input(frame, unit or "m", which, name)
+            return view_input(frame, None, camera, which, name, unit)
+
+        inputs = (given(frame, number) for number, frame in enumerate(frames))
+        return self.track_in(inputs, which, first)
+
+    def track_in(
+        self, frames: Iterable[AnyInput], object: str, first: Rigid | None = None
+    ) -> Iterator[PoseEstimate]:
+        """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked."""
+        number = self._number(object)
+        followed = Followed(
+            model=self.models[number],
+            surface=self._surface(number),
+            refusal=self.refusal,
+            icp=self.config.icp,
+            look=lambda given: self._look(given, object),
+        )
+        return track(frames, followed, first)
+
+    def _look(self, given: AnyInput, object: str) -> PoseEstimate:
+        """Find the object in a frame of which nothing else is known."""
+        if isinstance(given, CloudInput):
+            return self.estimate_many([given])[0]
+        began = time.perf_counter()
+        found = self.find_in(given, [object])
+        if found:
+            return found[0]
+        return nothing_found(given.name, object, time.perf_counter() - began)
+
+    def _object(self, name: str | None) -> str:
+        if name is None and len(self._numbers) == 1:
+            return self.objects[0]
+        if name is None:
+            raise InputError(
+                f"estimate: {self._holder} know {', '.join(self.objects)}; say which by object="
+            )
+        self._number(name)
+        return name
+
+    def _surface(self, number: int) -> Surface:
+        if number not in self._surfaces:
+            model = self.models[number]
+            self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
+        return self._surfaces[number]
+
+    def _copies_of(self, number: int) -> Copies:
+        if number not in self._copies:
+            up_to_symmetry = self.config.up_to_symmetry
+            self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)
+        return self._copies[number]
+
+    def _number(self, name: str) -> int:
+        if name not in self._numbers:
+            nearest = nearest_name(name, self.objects)
+            raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
+        return self._numbers[name]
+
+
+def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+    """Give the estimate of an input that cannot be posed."""
+    return PoseEstimate(
+        name=given.name,
+        object=given.object,
+        status=refusal.status,
+        reason=refusal.reason,
+        seconds=seconds,
+    )

@@ -1,0 +1,225 @@
+"""Registration: poses of objects by their models alone, without training."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import local_planes
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, Unit
+from depthpose.pose.estimator.alternatives import Copies, find_candidates
+from depthpose.pose.estimator.answer import (
+    Clock,
+    answer_of,
+    candidate_of,
+    checked,
+    choose,
+    withheld,
+)
+from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.doubt import Posed
+from depthpose.pose.estimator.evidence import surface_signals
+from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.mesh import read_model, with_found_symmetries
+from depthpose.pose.refine import refine_best
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.voting.point_pairs import PairTable, prepare_pairs, propose_poses, thin
+
+CANDIDATE_SLOPES = {
+    name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
+}
+"""As of :class:`RefusalConfig`; no network disagrees."""
+_REFUSAL = RefusalConfig(
+    max_risk=0.3572,
+    bias=8.627,
+    slopes={"scatter": 0.693, "tilt": 0.966, "far": 0.78, "unseen": 0.042, "few": 0.738},
+    means={"scatter": -3.45, "tilt": -4.13, "far": -3.68, "unseen": -1.59, "few": -3.24},
+    candidate_slopes=CANDIDATE_SLOPES,
+)
+"""As ``bench/calibrate_register.py`` printed it for 14 random parts."""
+_VOXEL = 0.05
+"""Of the diameter."""
+_LEAST = 500
+"""Points of a model without faces."""
+_PROPOSALS = 40
+_SMOOTHED = 1500
+"""Of so many points 20 neighbours lay the plane that gives a normal."""
+
+
+class Registration(PoseEstimator):
+    """Poses of objects whose models are seen for the first time.
+
+    Pairs of points of the cloud propose poses, ICP refines them, and what speaks against the best
+    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`; the risk was
+    calibrated on other parts (``bench/calibrate_register.py``).
+
+    Example::
+
+        parts = Registration.load("part.stl", unit="mm")
+        found = parts.estimate(cloud="scan.ply", unit="mm")
+
+    Args:
+        models: the objects.
+        config: ICP, limits; the seed is that of voting.
+        refusal: when an answer is withheld; None: as calibrated.
+
+    Raises:
+        InputError: no model, two of one name, or one of few points without faces.
+    """
+
+    _holder = "the models"
+
+    def __init__(
+        self,
+        models: Sequence[ObjectModel],
+        config: EstimateConfig | None = None,
+        refusal: RefusalConfig | None = None,
+    ) -> None:
+        _refuse_no_surface(models)
+        super().__init__(models, config)
+        self._models, self._refusal = tuple(models), refusal or _REFUSAL
+        self._tables: dict[int, PairTable] = {}
+
+    @classmethod
+    def load(
+        cls, *cad: str | Path, unit: Unit, config: EstimateConfig | None = None
+    ) -> "Registration":
+        """Read CAD files; symmetries that are found in a part make its copies one answer.
+
+        Args:
+            cad: PLY, STL, OBJ, GLB; an object is called as its file.
+            unit: of the numbers in the files.
+            config: as above.
+
+        Raises:
+            InputError: no file, two of one name, one that cannot be read, or without a surface.
+        """
+        models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
+
+    @property
+    def models(self) -> Sequence[ObjectModel]:
+        """The objects."""
+        return self._models
+
+    @property
+    def refusal(self) -> RefusalConfig:
+        """When an answer is withheld."""
+        return self._refusal
+
+    def prepare(self) -> None:
+        """Prepare every model now, a few seconds each; else it is done when first asked for."""
+        for number in range(len(self.models)):
+            self._copies_of(number)
+            self._table(number)
+
+    @torch.inference_mode()
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate one after the other; a model is prepared when it is first asked for.
+
+        Raises:
+            InputError: an unknown object, or a mask that does not fit its depth image.
+        """
+        return [self._estimate(given) for given in inputs]
+
+    def _estimate(self, given: AnyInput) -> PoseEstimate:
+        number = self._number(given.object)
+        model, surface = self.models[number], self._surface(number)
+        copies, table = self._copies_of(number), self._table(number)
+        began = time.perf_counter()
+        cloud = CloudConfig(voxel_m=min(0.9, _VOXEL * model.diameter_m), max_points=None)
+        prepared = prepare_cloud(given, model, cloud, self.config)
+        seconds = {"cloud": time.perf_counter() - began}
+        if isinstance(prepared, Refusal):
+            return refused(given, prepared, seconds)
+        began = time.perf_counter()
+        generator = torch.Generator().manual_seed(self.config.voting.seed)
+        dense_m = take_evenly(prepared.cloud_m.double(), _SMOOTHED)
+        some_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), _VOXEL * model.diameter_m)]
+        normals, _ = local_planes(dense_m, some_m)
+        proposals = propose_poses(some_m, normals, table, surface, _PROPOSALS, generator)
+        seconds["voting"] = time.perf_counter() - began
+        known = (model, surface, copies)
+        found = pose_from_proposals(prepared, proposals, known, self.refusal, self.config)
+        return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+
+    def _table(self, number: int) -> PairTable:
+        if number not in self._tables:
+            self._tables[number] = prepare_pairs(self._surface(number))
+        return self._tables[number]
+
+
+def pose_from_proposals(
+    cloud: Prepared,
+    proposals: Rigid,
+    known: tuple[ObjectModel, Surface, Copies],
+    refusal: RefusalConfig,
+    config: EstimateConfig,
+) -> PoseEstimate:
+    """Refine the best of proposed poses and check it; no network takes part.
+
+    Args:
+        cloud: of the object.
+        proposals: poses, the likeliest first; one at least.
+        known: the object, its surface and what it may be confused with.
+        refusal: when the answer is withheld; it weighs no signal of votes for keypoints.
+        config: of ICP, which begins at the proposals alone.
+    """
+    model, surface, copies = known
+    clock = Clock()
+    icp = replace(config.icp, starts=1)
+    best = refine_best(cloud.cloud_m.double(), proposals, surface, icp)
+    if float(best.refined.inlier_share) == 0:
+        reason = "no pose lays the model near the points: another object, or too little of it"
+        return withheld(model.name, Refusal(status="votes do not meet", reason=reason), clock)
+    first = candidate_of(best.refined)
+    candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
+    evidence = [_evidence_of(cloud.cloud_m, one.pose, surface) for one in candidates]
+    signals = {"few": 10 / len(cloud.points_m), "scatter": best.scatter}
+    found = choose(candidates, evidence, signals, copies, refusal)
+    clock.note("icp")
+    answer = answer_of(model, found)
+    assert answer.free_motions is not None
+    free = answer.free_motions.double()
+    posed = Posed(cloud.cloud_m, found.pose, model, surface, free)
+    return checked(posed, found, answer, refusal, clock)
+
+
+def _evidence_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> dict[str, float]:
+    """Give the signals of a pose; of the tilt what its own surface does not cause.
+
+    The plane through neighbours is tilted where a part has edges and thin features too, whatever
+    the pose: so it is on the cloud moved onto the posed surface, which is subtracted.
+    """
+    signals = surface_signals(cloud_m, pose, surface)
+    local_m = pose.inverse().apply(cloud_m.double())
+    ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
+    own = surface_signals(ideal_m, pose, surface)["tilt"]
+    return {**signals, "tilt": max(0.0, signals["tilt"] - own)}
+
+
+def _refuse_no_surface(models: Sequence[ObjectModel]) -> None:
+    names = [model.name for model in models]
+    if not names:
+        raise InputError(
+            "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
+        )
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"two models are called {twice[0]!r}, and an object is known by its name; rename one"
+        )
+    for model in models:
+        if len(model.faces) == 0 and len(model.vertices_m) < _LEAST:
+            raise InputError(
+                f"{model.name}: {len(model.vertices_m)} points without faces are no surface; "
+                f"export the part as a mesh with triangles, such as STL, or give {_LEAST} points"
+            )

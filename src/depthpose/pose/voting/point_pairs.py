@@ -1,0 +1,269 @@
+"""Point pair features: candidate poses of a known surface in a cloud, without a network.
+
+Drost et al., Model Globally, Match Locally, CVPR 2010; which model points are kept, neighbouring
+bins and the check of every candidate follow Vidal et al., Sensors 2018.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.mesh.sampling import fibonacci_directions
+from depthpose.pose.surface import Surface, look_along_rays
+
+_STEP = 0.05
+"""Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
+_ANGLES = 15
+"""Bins of an angle from 0 to 180 degrees."""
+_DISTANCES = 21
+_TURNS = 30
+"""Bins of the turn about the normal of a reference point."""
+_MOST_ALIKE = 40
+"""Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
+and say little."""
+_MODEL, _COARSER = 800, 1.1
+"""At most so many points of the model; where there are more, their distance grows by this."""
+_SCENE, _REFERENCES = 400, 50
+"""At most so many points of the cloud, and those of them that vote with each of the others."""
+_PEAKS = 6
+"""Poses that each reference point proposes."""
+_VIEWS = 30
+"""Directions from which the model is looked at, to find which side of its surface is seen."""
+_FACING = 0.2
+"""Cosine from which a surface is seen."""
+_CELLS = 40
+"""Cells along the diameter in which points hide those behind them."""
+_CHECKED = 100
+"""Points of the cloud that compare the proposed poses."""
+_FAR = 0.1
+"""Of the diameter: points within this distance of a proposed pose, which is rough, are near it."""
+_EVERY = 16
+"""Of the points of the surface, each so manyth shows what a pose would occlude."""
+_UNSEEN = 0.3
+"""What a surface that should be seen and is not counts against a pose."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairTable:
+    """Pairs of points of a model, sorted by their features.
+
+    Attributes:
+        points_m: of the surface as it is seen from outside, some 0.05 diameters apart.
+        frames: of each point its normal, toward who sees it, and two tangents, as columns.
+        keys: features that there are, ascending.
+        bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``keys[k]``.
+        first: number of the first point of each pair.
+        turn_rad: angle of the second point about the normal of the first, from its first tangent.
+        diameter_m: of the object.
+    """
+
+    points_m: Float64[Tensor, "m 3"]
+    frames: Float64[Tensor, "m 3 3"]
+    keys: Int64[Tensor, " k"]
+    bounds: Int64[Tensor, " k+1"]
+    first: Int64[Tensor, " pairs"]
+    turn_rad: Float64[Tensor, " pairs"]
+    diameter_m: float
+
+
+def prepare_pairs(surface: Surface) -> PairTable:
+    """Hash the pairs of a surface once for many clouds.
+
+    Args:
+        surface: of the model; normals may point to either side.
+    """
+    points_m, normals = _seen_from_outside(surface)
+    step_m = _STEP * surface.diameter_m
+    while len(kept := thin(points_m, normals, step_m)) > _MODEL:
+        step_m *= _COARSER
+    points_m, frames = points_m[kept], _frames(normals[kept])
+    count = len(points_m)
+    first, second = (~torch.eye(count, dtype=torch.bool)).nonzero(as_tuple=True)
+    feature, turn_rad = _features(points_m, frames, first, second, surface.diameter_m)
+    # Within a feature in an order of chance, so that the first ones are a sample of all.
+    chance = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
+    feature = _key(feature.floor().long())[chance]
+    feature, order = feature.sort(stable=True)
+    order = chance[order]
+    keys, sizes = feature.unique_consecutive(return_counts=True)
+    bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
+    return PairTable(
+        points_m=points_m,
+        frames=frames,
+        keys=keys,
+        bounds=bounds,
+        first=first[order],
+        turn_rad=turn_rad[order],
+        diameter_m=surface.diameter_m,
+    )
+
+
+def propose_poses(
+    points_m: Float64[Tensor, "n 3"],
+    normals: Float64[Tensor, "n 3"],
+    table: PairTable,
+    surface: Surface,
+    count: int,
+    generator: torch.Generator,
+) -> Rigid:
+    """Propose poses, the best first: each reference point votes with every other point.
+
+    Args:
+        points_m: of the cloud, about 0.05 diameters apart, in the camera frame.
+        normals: theirs, toward the camera.
+        table: pairs of the model.
+        surface: of the same model.
+        count: how many poses at most.
+        generator: chooses the reference points.
+    """
+    chosen = torch.randperm(len(points_m), generator=generator)
+    points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
+    poses = _vote(points_m, _frames(normals), table)
+    worth = _worth(points_m, normals, poses, surface)
+    best = worth.argsort(descending=True, stable=True)[:count]
+    return Rigid(poses.R[best], poses.t_m[best])
+
+
+def thin(
+    points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
+) -> Int64[Tensor, " m"]:
+    """Choose one point of each cell of a grid and of each octant of normals in it."""
+    cells = ((points_m - points_m.amin(0)) / step_m).long()
+    cells = torch.cat([cells, (normals > 0).long()], 1)
+    _, place = torch.unique(cells, dim=0, return_inverse=True)
+    first = torch.full((int(place.max()) + 1,), len(points_m))
+    return first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin").sort().values
+
+
+def _seen_from_outside(
+    surface: Surface,
+) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
+    """Give the points that a camera can see, with normals toward it; thin sheets have both."""
+    half = fibonacci_directions(_VIEWS // 2).double()
+    directions = torch.cat([half, -half])
+    seen = torch.stack([_is_seen(surface, toward) for toward in directions])
+    cosine = directions @ surface.normals.T
+    front, back = ((seen & (sign * cosine > _FACING)).any(0) for sign in (1, -1))
+    points_m = torch.cat([surface.points_m[front], surface.points_m[back]])
+    return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
+
+
+def _is_seen(surface: Surface, toward: Float64[Tensor, "3"]) -> Bool[Tensor, " m"]:
+    """Mark the points that nothing hides from a camera far off in a direction."""
+    across = torch.linalg.svd(toward[None]).Vh[1:]
+    cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
+    column, row = (cells - cells.amin(0) + 1).unbind(-1)
+    width = int(row.max()) + 2
+    place, depth_m = column * width + row, surface.points_m @ toward
+    nearest_m = torch.full(((int(column.max()) + 2) * width,), -torch.inf, dtype=torch.float64)
+    nearest_m.scatter_reduce_(0, place, depth_m, "amax")
+    return depth_m > nearest_m[place] - surface.diameter_m / _CELLS
+
+
+def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
+    """Give each normal and two tangents, as columns."""
+    least = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(-1)]
+    first = normalize(torch.linalg.cross(normals, least), dim=-1)
+    return torch.stack([normals, first, torch.linalg.cross(normals, first)], -1)
+
+
+def _features(
+    points_m: Float64[Tensor, "n 3"],
+    frames: Float64[Tensor, "n 3 3"],
+    first: Int64[Tensor, " p"],
+    second: Int64[Tensor, " p"],
+    diameter_m: float,
+) -> tuple[Float64[Tensor, "p 4"], Float64[Tensor, " p"]]:
+    """Give the features of pairs in bins, and the turn of the second about the first's normal."""
+    way_m = points_m[second] - points_m[first]
+    local_m = (way_m[:, None] @ frames[first]).squeeze(1)
+    distance_m = way_m.norm(dim=-1)
+    safe_m = distance_m.clamp(min=1e-12)
+    n, m = frames[first, :, 0], frames[second, :, 0]
+    cosines = torch.stack(
+        [local_m[:, 0] / safe_m, (m * way_m).sum(-1) / safe_m, (n * m).sum(-1)], -1
+    )
+    angles = cosines.clamp(-1, 1).arccos() * (_ANGLES / math.pi)
+    bins = torch.cat([(distance_m / (_STEP * diameter_m))[:, None], angles], 1)
+    return bins, torch.atan2(local_m[:, 2], local_m[:, 1])
+
+
+def _key(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
+    """Number a feature; what lies beyond the bins is in the last one."""
+    d, a, b, c = bins.clamp(min=0).unbind(-1)
+    a, b, c = (angle.clamp(max=_ANGLES - 1) for angle in (a, b, c))
+    return ((d.clamp(max=_DISTANCES) * _ANGLES + a) * _ANGLES + b) * _ANGLES + c
+
+
+def _neighbours(feature: Float64[Tensor, "p 4"]) -> Int64[Tensor, "p 5"]:
+    """Number the bin of each feature, and of each of its four values the next bin beside it."""
+    own = feature.floor().long()
+    aside = torch.where(feature - own < 0.5, -1, 1)
+    moved = own[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
+    return torch.cat([_key(own)[:, None], _key(moved)], 1)
+
+
+def _vote(
+    points_m: Float64[Tensor, "n 3"], frames: Float64[Tensor, "n 3 3"], table: PairTable
+) -> Rigid:
+    """Let every pair of a reference point vote for a model point and a turn about its normal."""
+    count, models = min(_REFERENCES, len(points_m)), len(table.points_m)
+    far_m = torch.cdist(points_m[:count], points_m)
+    used = (far_m > _STEP * table.diameter_m) & (far_m < 1.05 * table.diameter_m)
+    first, second = used.nonzero(as_tuple=True)
+    feature, turn_rad = _features(points_m, frames, first, second, table.diameter_m)
+    keys = _neighbours(feature)
+    row = torch.searchsorted(table.keys, keys).clamp(max=len(table.keys) - 1)
+    size = (table.bounds[row + 1] - table.bounds[row]).clamp(max=_MOST_ALIKE)
+    size = torch.where(table.keys[row] == keys, size, 0).flatten()
+    asked = torch.repeat_interleave(torch.arange(len(size)), size)
+    offset = torch.arange(len(asked)) - (size.cumsum(0) - size)[asked]
+    pair = table.bounds[row.flatten()[asked]] + offset
+    scene = asked // keys.shape[1]
+    turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
+    bin_ = (turn * _TURNS).long().clamp(max=_TURNS - 1)
+    cell = (first[scene] * models + table.first[pair]) * _TURNS + bin_
+    votes = torch.bincount(cell, minlength=count * models * _TURNS).reshape(count, models, _TURNS)
+    votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
+    best = votes.flatten(1).topk(_PEAKS)
+    reference = torch.arange(count).repeat_interleave(_PEAKS)
+    number, bin_ = best.indices.flatten() // _TURNS, best.indices.flatten() % _TURNS
+    angle = (bin_ + 0.5) * (2 * math.pi / _TURNS)
+    return _poses(points_m, frames, table, (reference, number, angle.double()))
+
+
+def _poses(
+    points_m: Float64[Tensor, "n 3"],
+    frames: Float64[Tensor, "n 3 3"],
+    table: PairTable,
+    match: tuple[Int64[Tensor, " b"], Int64[Tensor, " b"], Float64[Tensor, " b"]],
+) -> Rigid:
+    """Lay model points and their normals on reference points, and turn about the normals."""
+    reference, number, angle = match
+    one, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
+    turn = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
+    R = frames[reference] @ turn @ table.frames[number].mT
+    return Rigid(R, points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1))
+
+
+def _worth(
+    points_m: Float64[Tensor, "n 3"],
+    normals: Float64[Tensor, "n 3"],
+    poses: Rigid,
+    surface: Surface,
+) -> Float64[Tensor, " b"]:
+    """Share of points near each posed surface, whose normals fit, less what contradicts it."""
+    some_m, some = points_m[:_CHECKED], normals[:_CHECKED]
+    inverse = poses.inverse()
+    local_m = some_m @ inverse.R.mT + inverse.t_m[:, None]
+    index = surface.boxes.look_up(local_m)
+    limit_m = _FAR * surface.diameter_m
+    near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
+    cosine = ((some @ inverse.R.mT) * surface.normals[index]).sum(-1).abs()
+    front, unseen = look_along_rays(points_m, poses, surface, every=_EVERY)
+    return (near * cosine).mean(-1) - front - _UNSEEN * unseen

@@ -1,0 +1,112 @@
+"""Poses without training: point pairs of a CAD file and of a cloud, ICP, refusal."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from depthpose import Registration
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
+from depthpose.pose.mesh import make_model, sample_surface
+from depthpose.pose.metrics import add_m
+from depthpose.pose.surface import prepare_surface
+from depthpose.pose.synthetic import Objects, make_part, random_part, write_part
+from depthpose.pose.types import CloudSample, ObjectModel
+from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
+
+
+@cache
+def part() -> ObjectModel:
+    return make_part("connector")
+
+
+@cache
+def registration() -> Registration:
+    return Registration([part()])
+
+
+def view(model: ObjectModel, index: int, seed: int = 5) -> CloudSample:
+    config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=seed)
+    return Objects([model], config)[index]
+
+
+def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
+    samples = [view(part(), index) for index in range(6)]
+    found = registration().estimate_many([sample.input for sample in samples])
+    points_m = sample_surface(part(), 500)[0]
+    poses = [(one.camera_from_model, sample.truth.camera_from_model)
+             for one, sample in zip(found, samples, strict=True)]  # fmt: skip
+    errors_m = [float(add_m(pose, truth, points_m)) for pose, truth in poses if pose is not None]
+    assert len(errors_m) >= 4
+    assert max(errors_m) < 0.05 * part().diameter_m
+    for one in found:
+        assert one.risk is not None
+        assert {"voting", "icp", "check"} <= one.seconds.keys()
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_a_foreign_part_is_refused(index: int) -> None:
+    foreign = make_part("mug") if index == 0 else random_part(torch.Generator().manual_seed(index))
+    given = replace(view(foreign, index).input, object="connector")
+    assert not registration().estimate_many([given])[0].is_ok
+
+
+def test_one_seed_gives_one_answer() -> None:
+    given = view(part(), 7).input
+    first, again = (registration().estimate_many([given])[0] for _ in range(2))
+    other = Registration([part()], EstimateConfig(voting=VotingConfig(seed=0)))
+    apart = other.estimate_many([given])[0]
+    assert first.signals == again.signals == apart.signals
+    assert first.camera_from_model is not None
+    assert apart.camera_from_model is not None
+    assert torch.equal(first.camera_from_model.R, apart.camera_from_model.R)
+
+
+def test_pairs_find_the_pose_whatever_side_the_faces_look_at() -> None:
+    """Some CAD programs write faces inside out, and scans have them mixed."""
+    inside_out = replace(part(), faces=part().faces.flip(-1))
+    points_m, normals = (x.double() for x in sample_surface(part(), 600))
+    truth = Rigid(torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1))
+                                  .double()).Q, torch.tensor([0.0, 0.0, 0.8]).double())  # fmt: skip
+    truth = replace(truth, R=truth.R * truth.R.det())
+    seen_m, towards = truth.apply(points_m), normals @ truth.R.mT
+    faces_us = (towards * seen_m).sum(-1) < 0
+    for model in (part(), inside_out):
+        surface = prepare_surface(model)
+        found = propose_poses(
+            seen_m[faces_us], towards[faces_us], prepare_pairs(surface), surface, 5,
+            torch.Generator().manual_seed(0),
+        )  # fmt: skip
+        off = geodesic_rad(found.R, truth.R.expand_as(found.R))
+        assert float(off.min()) < 0.3
+
+
+def test_copies_of_a_symmetric_part_are_one_answer() -> None:
+    flange = make_part("flange")
+    sample = view(flange, 1)
+    found = Registration([flange]).estimate_many([sample.input])[0]
+    assert found.is_ok, found.reason
+    assert all("degrees about" in other.difference for other in found.alternatives)
+    assert not any(other.probability > 0.4 for other in found.alternatives)
+
+
+def test_cad_files_are_read_and_their_symmetries_found(tmp_path: Path) -> None:
+    net = Registration.load(write_part("flange", tmp_path), unit="mm")
+    assert net.objects == ("flange",)
+    assert not net.models[0].symmetries.is_none
+
+
+def test_models_that_cannot_be_looked_for_are_named() -> None:
+    with pytest.raises(InputError, match=r"none is given; name one: STL"):
+        Registration([])
+    with pytest.raises(InputError, match=r"two models are called 'connector'.*rename one"):
+        Registration([part(), part()])
+    corners = make_model(part().vertices_m[:60], torch.zeros(0, 3).long(), name="dots")
+    with pytest.raises(InputError, match=r"dots: 60 points without faces.*triangles, such as STL"):
+        Registration([corners])
+    with pytest.raises(InputError, match=r"'mug': the models do not know it"):
+        registration().estimate(cloud=torch.ones(30, 3), object="mug")

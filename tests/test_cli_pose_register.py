@@ -1,0 +1,93 @@
+"""``pose predict --method register``: a CAD file alone to the poses of clouds and depth images."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.pose.made_frames import make_dataset
+
+from depthpose.cli import main
+from depthpose.core.camera import Camera, write_camera
+from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.synthetic import Objects, make_part, write_part
+
+
+@pytest.fixture
+def cad(tmp_path: Path) -> Path:
+    """A part, a cloud of it in millimetres, and a depth image with its mask and camera."""
+    write_part("connector", tmp_path)
+    made = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
+    views = Objects([make_part("connector")], made)
+    write_cloud(tmp_path / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
+    window = views.view(0).input
+    centre_px = torch.tensor(made.centre_px)
+    left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
+    width, height = made.image_px
+    height_px, width_px = window.mask.shape
+    depth_m, mask = torch.full((height, width), torch.nan), torch.zeros(3, height, width)
+    place = (slice(top, top + height_px), slice(left, left + width_px))
+    depth_m[place], mask[:, *place] = window.depth_m.float(), window.mask.float()
+    K = window.K.double() + torch.tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
+    camera = Camera(width=width, height=height, K=K, depth_unit_m=0.0001)
+    write_camera(tmp_path / "camera.json", camera)
+    write_depth_png(tmp_path / "depth.png", depth_m, 0.0001)
+    write_image(tmp_path / "mask.png", mask)
+    return tmp_path / "connector.stl"
+
+
+def predict(*words: str | Path) -> int:
+    return main(["pose", "predict", "--method", "register", *map(str, words)])
+
+
+def rows(out: Path) -> list[dict]:
+    return json.loads((out / "poses.json").read_text())
+
+
+def test_a_cad_file_and_a_cloud_give_a_pose(cad: Path, tmp_path: Path) -> None:
+    words = ["--cad", cad, "--unit", "mm", "--cloud", tmp_path / "scan.ply"]
+    assert predict(*words, "--out", tmp_path / "out") == 0
+    (row,) = rows(tmp_path / "out")
+    assert (row["object"], row["status"]) == ("connector", "ok")
+    assert (tmp_path / "out/scan.pose.ply").is_file()
+    assert (tmp_path / "out/report.html").is_file()
+
+
+def test_a_depth_image_has_a_unit_of_its_own(cad: Path, tmp_path: Path) -> None:
+    files = [word for name in ("depth.png", "mask.png", "camera.json")
+             for word in (f"--{name.split('.')[0]}", tmp_path / name)]  # fmt: skip
+    words = ["--cad", cad, "--cad-unit", "mm", *files, "--out", tmp_path / "out"]
+    assert predict(*words) == 0
+    assert rows(tmp_path / "out")[0]["status"] == "ok"
+
+
+def test_a_data_set_brings_its_models(tmp_path: Path) -> None:
+    data = make_dataset(tmp_path / "made", frames=1)
+    assert predict("--bop", data.folder, "--out", tmp_path / "out") == 0
+    assert len(rows(tmp_path / "out")) == len(data)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--method register --cloud scan.ply", "give --cad part.stl --unit mm, or --bop"),
+        ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
+        ("--cad connector.stl --unit mm --cloud scan.ply", "add --method register"),
+        ("--method register --cad connector.stl --bop .", "leave --cad away"),
+        ("--method register --cad connector.stl --unit mm --cloud scan.ply --engine ray",
+         "leave --engine away"),
+        ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_said(
+    cad: Path,
+    words: str,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(cad.parent)
+    Path("scan.txt").write_text("".join(f"{k} {k * k} {k % 7}\n" for k in range(20)))
+    assert main(["pose", "predict", *words.split(), "--out", "out"]) == 2
+    assert said in capsys.readouterr().err
