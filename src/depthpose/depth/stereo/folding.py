@@ -55,25 +55,31 @@ def _memory_format(x: Tensor) -> torch.memory_format:
 
 
 def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
-    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it."""
+    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it.
+
+    So it is in 3D convolutions without a norm.
+    """
     for layer in list(module.modules()):
         if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
-            layer.conv = VolumeConv(layer, like)
+            layer.conv = VolumeConv(layer.conv, *folded_weight(layer), like)
             layer.norm = nn.Identity()
+        for name, conv in list(layer.named_children()):
+            if isinstance(conv, nn.Conv3d):
+                bias = torch.zeros(conv.out_channels) if conv.bias is None else conv.bias
+                setattr(layer, name, VolumeConv(conv, conv.weight, bias, like))
     return module
 
 
 class VolumeConv(nn.Module):
     """A folded 3x3x3 convolution of whole volumes."""
 
-    def __init__(self, layer: ConvNorm, like: Tensor) -> None:
+    def __init__(self, conv: nn.Module, weight: Tensor, bias: Tensor, like: Tensor) -> None:
         super().__init__()
-        self.is_transposed = isinstance(layer.conv, nn.ConvTranspose3d)
-        self.stride = cast("Conv", layer.conv).stride[0]
-        weight, bias = folded_weight(layer)
-        weight = weight.to(like).contiguous(memory_format=torch.channels_last_3d)
+        self.is_transposed = isinstance(conv, nn.ConvTranspose3d)
+        self.stride = cast("Conv", conv).stride[0]
+        weight = weight.detach().to(like).contiguous(memory_format=torch.channels_last_3d)
         self.weight = nn.Parameter(weight, requires_grad=False)
-        self.bias = nn.Parameter(bias.to(like), requires_grad=False)
+        self.bias = nn.Parameter(bias.detach().to(like), requires_grad=False)
 
     def forward(self, volume: Rows) -> Rows:
         """Convolve a volume."""

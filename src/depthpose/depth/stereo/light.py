@@ -126,7 +126,7 @@ class Aggregation(nn.Module):
         self.guides = nn.ModuleList(
             nn.Conv2d(g, c, 1) for g, c in zip(guide_widths, v, strict=True)
         )
-        self.score = nn.Conv3d(v[0], 1, 1, bias=False)
+        self.score = nn.Conv3d(v[0], 1, 3, 1, 1, bias=False)
 
     def forward(
         self, left: Features, right: Features, bins: int, levels: tuple[Features, ...]
