@@ -7,8 +7,8 @@ another part, a scaled copy, a mirrored one, a blob, and a box or cylinder. Noth
 its risk while signals are collected; ``calibrate_refusal`` then weighs them, and chooses the limit
 so that at most 2 % of the answers are wrong where nearly half of what is seen is not the part.
 Mirrored and scaled copies, of which some views hardly differ, are counted but not calibrated on.
-Prints the settings that ``src/depthpose/pose/estimator/register.py`` holds, and what they answer on the parts
-kept back; writes all signals to ``rows.json``. ``--rows`` takes those of an earlier run.
+Prints the settings that ``src/depthpose/pose/estimator/register.py`` holds, and what they answer on
+the parts kept back; writes all signals to ``rows.json``. ``--rows`` takes those of an earlier run.
 """
 
 import argparse

@@ -21,7 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.depth.config import GeneratorConfig, MatcherConfig
+from depthpose.depth.config import GeneratorConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher
