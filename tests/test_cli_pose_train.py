@@ -60,7 +60,9 @@ def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
     cloud = dataclasses.replace(weights.cloud, min_points=10**6, max_points=None)
     write_pose_weights(blind, dataclasses.replace(weights, cloud=cloud))
     config = tmp_path / "tiny.yaml"
-    config.write_text("held_out: {number: 1, occlusions: [0.0]}\ncalibration: {number: 20}\n")
+    config.write_text(
+        "held_out: {number: 1, occlusions: [0.0]}\ncalibration: {number: 20, negatives: 2}\n"
+    )
     other = str(tmp_path / "other.safetensors")
     for words, said in (
         ([own, "--out", str(own)], "is there already; delete it, or give another name"),
@@ -84,7 +86,9 @@ def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
 ) -> None:
     """A bolder share of wrong answers gives more answers."""
     config = tmp_path / "tiny.yaml"
-    config.write_text("held_out: {number: 4, occlusions: [0.0]}\ncalibration: {number: 20}\n")
+    config.write_text(
+        "held_out: {number: 4, occlusions: [0.0]}\ncalibration: {number: 20, negatives: 2}\n"
+    )
     limits = []
     for share in ("0.01", "0.5"):
         out = tmp_path / f"bold{share}.safetensors"

@@ -103,7 +103,9 @@ COMMANDS: Sequence[Command] = (
     ),
     Command("weights complete {home}/bare.safetensors --models {home}/parts", "whole.safetensors"),
     Command("weights import fcgf {home}/fcgf.pth --classes 2", "fcgf.safetensors"),
-    Command("pose calibrate {home}/p.safetensors --number 20", "calibrated.safetensors"),
+    Command(
+        "pose calibrate {home}/p.safetensors --number 20 --negatives 2", "calibrated.safetensors"
+    ),
     Command("export pose --weights {home}/p.safetensors", "pose.onnx"),
     Command("export depth --weights {home}/k.safetensors", "depth.onnx"),
     Command(
