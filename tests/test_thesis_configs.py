@@ -42,9 +42,10 @@ NO_WEIGHT_FOLLOWS = frozenset({
     # How fast, and what is looked at meanwhile.
     "pairs.with_cache", "loop.steps", "loop.workers", "loop.device", "loop.save_every_steps",
     "loop.validate_every_steps", "loop.log_every_steps", "held_out",
-    "calibration.occlusion", "calibration.max_wrong_share",
+    "calibration.occlusion", "calibration.max_wrong_share", "calibration.negatives",
+    "calibration.max_negative_share",
     # Without a meaning beside what is written.
-    "confidence_weight", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
+    "confidence_weight", "encoder", "encoder_rate", "with_fixed_start", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
     # These follow from the models.
     "network.classes", "network.keypoints", "network.inputs", "network.descriptor",
 })  # fmt: skip

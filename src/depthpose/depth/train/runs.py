@@ -3,10 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
-from torch import nn
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
 from depthpose.core.config import config_to_dict, write_config
@@ -33,6 +32,7 @@ from depthpose.depth.train.adapt import (
     label_folders,
     refuse_worse,
 )
+from depthpose.depth.train.begin import make_matcher_network, refuse_fixed_chance, start_from
 from depthpose.depth.train.config import (
     AdaptTraining,
     FinetuneTraining,
@@ -96,14 +96,14 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     held_out = _held_out(config.held_out, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
-        _start_from(generator, read_generator(find_weights(config.start)), config.start)
+        start_from(generator, read_generator(find_weights(config.start)), config.start)
     facts, seconds = _walk(ViewTask(generator, config, held_out), pairs, config, run)
     return _leave(run, "view", facts, seconds, generator=generator)
 
 
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
-    _refuse_fixed_chance(config)
+    refuse_fixed_chance(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
@@ -125,7 +125,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     if config.encoder is not None:
         load_lite0(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
-        _start_from(generator, read_generator(find_weights(config.start)), config.start)
+        start_from(generator, read_generator(find_weights(config.start)), config.start)
     held_out = _held_out(config.held_out, needs_truth=True)
     facts, seconds = _walk(SelectTask(generator, config, held_out), samples, config, run)
     return _leave(run, "select", facts, seconds, generator=generator)
@@ -137,28 +137,9 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     pairs = _pairs(config.pairs, config.loop, needs_truth=True)
     held_out = _held_out(config.held_out, needs_truth=True)
-    matcher = _make_matcher(config)
+    matcher = make_matcher_network(config)
     facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
-
-
-def _make_matcher(config: StereoTraining) -> PSMNet | LightStereo:
-    """Make the network that a config trains, with the weights that it begins with."""
-    if config.light is None and config.encoder is not None:
-        raise InputError(
-            f"--encoder {config.encoder}: PSMNet has no encoder of its own kind; give the config "
-            "a light network (light: {}), or leave it out."
-        )
-    if config.light is None:
-        matcher = PSMNet(config.matcher)
-    else:
-        _refuse_fixed_chance(config)
-        matcher = LightStereo(config.light)
-        if config.encoder is not None:
-            load_lite0(matcher.features.encoder, find_weights(config.encoder))
-    if config.start is not None:
-        _start_from(matcher, read_matcher(find_weights(config.start)), config.start)
-    return matcher
 
 
 def train_adapt(config: AdaptTraining, run: Run) -> Path:
@@ -337,42 +318,6 @@ def _refuse_wrong_gradients(config: StereoTraining) -> None:
             "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
             f"max_disparity_px {3 * step_px}, or precision fp32."
         )
-
-
-_FREE_OF_WEIGHTS = ("max_disparity_px",)
-"""Settings that no weight depends on: a matcher searches any disparities in the same way."""
-
-
-def _refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
-    """Refuse to keep the first layers of an encoder that begins at random."""
-    if config.with_fixed_start and config.encoder is None and config.start is None:
-        raise InputError(
-            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
-            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
-            "--start, or with_fixed_start: false with encoder_rate: 1.0."
-        )
-
-
-def _start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
-    """Copy weights whose config is the network's own, but for the range of disparities.
-
-    Raises:
-        InputError: another kind of network, or a setting differs, so the weights would mean
-            something else.
-    """
-    if type(found) is not type(network):
-        raise InputError(
-            f"{source}: holds weights of {type(found).__name__}, but the config trains "
-            f"{type(network).__name__}. Give weights of that network."
-        )
-    wanted, given = config_to_dict(network.config), config_to_dict(cast("Any", found).config)
-    for setting, value in wanted.items():
-        if given[setting] != value and setting not in _FREE_OF_WEIGHTS:
-            raise InputError(
-                f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
-                f"{value!r}. Give the config the weights' own."
-            )
-    network.load_state_dict(found.state_dict())
 
 
 def _pairs(

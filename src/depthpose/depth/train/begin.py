@@ -1,0 +1,68 @@
+"""Networks at the begin of a training: their config's, with the weights that it names."""
+
+from typing import Any, cast
+
+from torch import nn
+
+from depthpose.core.checkpoint import find_weights
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.depth.lite0 import load_lite0
+from depthpose.depth.stereo import LightStereo, PSMNet
+from depthpose.depth.synthesis import Generator
+from depthpose.depth.train.config import SelectTraining, StereoTraining
+from depthpose.depth.weights import read_matcher
+
+_FREE_OF_WEIGHTS = ("max_disparity_px",)
+"""Settings that no weight depends on: a matcher searches any disparities in the same way."""
+
+
+def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
+    """Refuse to keep the first layers of an encoder that begins at random."""
+    if config.with_fixed_start and config.encoder is None and config.start is None:
+        raise InputError(
+            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
+            "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
+            "--start, or with_fixed_start: false with encoder_rate: 1.0."
+        )
+
+
+def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
+    """Copy weights whose config is the network's own, but for the range of disparities.
+
+    Raises:
+        InputError: another kind of network, or a setting differs, so the weights would mean
+            something else.
+    """
+    if type(found) is not type(network):
+        raise InputError(
+            f"{source}: holds weights of {type(found).__name__}, but the config trains "
+            f"{type(network).__name__}. Give weights of that network."
+        )
+    wanted, given = config_to_dict(network.config), config_to_dict(cast("Any", found).config)
+    for setting, value in wanted.items():
+        if given[setting] != value and setting not in _FREE_OF_WEIGHTS:
+            raise InputError(
+                f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
+    network.load_state_dict(found.state_dict())
+
+
+def make_matcher_network(config: StereoTraining) -> PSMNet | LightStereo:
+    """Make the network that a config trains, with the weights that it begins with."""
+    if config.light is None and config.encoder is not None:
+        raise InputError(
+            f"--encoder {config.encoder}: PSMNet has no encoder of its own kind; give the config "
+            "a light network (light: {}), or leave it out."
+        )
+    if config.light is None:
+        matcher = PSMNet(config.matcher)
+    else:
+        refuse_fixed_chance(config)
+        matcher = LightStereo(config.light)
+        if config.encoder is not None:
+            load_lite0(matcher.features.encoder, find_weights(config.encoder))
+    if config.start is not None:
+        start_from(matcher, read_matcher(find_weights(config.start)), config.start)
+    return matcher
