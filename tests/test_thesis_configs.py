@@ -45,7 +45,8 @@ NO_WEIGHT_FOLLOWS = frozenset({
     "calibration.occlusion", "calibration.max_wrong_share", "calibration.negatives",
     "calibration.max_negative_share",
     # Without a meaning beside what is written.
-    "confidence_weight", "encoder", "encoder_rate", "with_fixed_start", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
+    "encoder", "encoder_rate", "with_fixed_start",
+    "confidence_weight", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
     # These follow from the models.
     "network.classes", "network.keypoints", "network.inputs", "network.descriptor",
 })  # fmt: skip
