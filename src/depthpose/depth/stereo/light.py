@@ -220,7 +220,7 @@ class LightStereo(nn.Module):
         """Match the pair.
 
         Returns:
-            Disparity of the left view [px]: while training that of all scores, enlarged without
+            Disparity of the left view [px], while training that of all scores, enlarged without
             the image, then the answer; in eval mode the answer alone.
 
         Raises:
