@@ -17,14 +17,14 @@ from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import AugmentConfig, DegradeConfig, MatcherConfig, PairsConfig
 from depthpose.depth.config import PSMNetConfig as Config
+from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.losses import photometric_error, smoothness_loss
 from depthpose.depth.stereo import CallableMatcher, PSMNet
 from depthpose.depth.train import Run, train_adapt
 from depthpose.depth.train.adapt import (
+    AdaptMetrics,
     AdaptTask,
     Guard,
-    Verdict,
-    agreeing,
     refuse_worse,
     split_pairs,
 )
@@ -33,7 +33,7 @@ from depthpose.depth.weights import read_psmnet, write_depth_weights
 
 TRUE_PX = 6.0
 SIZE = (48, 96)
-SAME = Verdict(photometric=0.1, disagreeing=0.2, street_d1=0.05, street_epe_px=1.0)
+SAME = AdaptMetrics(photometric=0.1, disagreeing=0.2, street_d1=0.05, street_epe_px=1.0)
 
 
 class OneDisparity(nn.Module):
@@ -106,10 +106,11 @@ def test_labels_hold_disparity_where_views_say_nothing() -> None:
 
 
 def test_views_agree_where_both_see_a_point() -> None:
-    left_px = torch.full((4, 40), 10.0)
-    assert bool(agreeing(left_px, left_px)[:, 10:].all())
-    assert not bool(agreeing(left_px, left_px)[:, :10].any()), "outside the right view"
-    assert not bool(agreeing(left_px, left_px + 3).any())
+    left_px, limits = torch.full((4, 40), 10.0), LabelConfig()
+    agrees = is_consistent(left_px, left_px, limits)
+    assert bool(agrees[:, 10:].all())
+    assert not bool(agrees[:, :10].any()), "outside the right view"
+    assert not bool(is_consistent(left_px, left_px + 3, limits).any())
 
 
 def test_batch_norm_keeps_its_statistics() -> None:
@@ -126,6 +127,8 @@ def test_one_pair_of_five_is_kept_back(tmp_path: Path) -> None:
     folder = write_pairs(tmp_path / "pairs", (0.15,) * 6)
     assert split_pairs(str(folder), None, 5)[1] == [0, 5]
     assert split_pairs(str(folder), None, 100)[1] == [0], "one at least is trained on"
+    first = split_pairs(str(folder), None, 5)[0].frames[0].name
+    assert split_pairs(str(folder), None, 5, [first])[1] == [1], "what is left out is not kept back"
     lone = write_pairs(tmp_path / "lone", (0.15,))
     with pytest.raises(InputError, match="two at least are needed"):
         split_pairs(str(lone), None, 5)
@@ -137,6 +140,7 @@ def test_one_pair_of_five_is_kept_back(tmp_path: Path) -> None:
         ({}, "fit no better"),
         ({"photometric": 0.0999, "disagreeing": 0.1999}, "fit no better"),
         ({"photometric": 0.09, "disagreeing": 0.21}, "fit no better"),
+        ({"photometric": torch.nan, "disagreeing": 0.1}, "fit no better"),
         ({"photometric": 0.11, "disagreeing": 0.2}, "fit no better"),
         ({"photometric": 0.05, "street_d1": 0.056}, "synthetic streets are matched worse"),
     ],
@@ -213,7 +217,7 @@ def test_a_matcher_that_changes_nothing_is_not_written(tmp_path: Path, start: Pa
 def test_an_adapted_matcher_carries_its_card(
     tmp_path: Path, start: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[Verdict] = []
+    seen: list[AdaptMetrics] = []
     monkeypatch.setattr("depthpose.depth.train.runs.refuse_worse", lambda *both: seen.extend(both))
     path = train_adapt(config_of(tmp_path, start, 1e-3), Run(folder=tmp_path / "out"))
     assert seen[0] != seen[1]

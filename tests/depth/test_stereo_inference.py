@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import nn
+from tests.depth.made_matchers import with_lively_norms
 
 from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
@@ -33,16 +33,7 @@ SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4
 def random_network(config: PSMNetConfig, seed: int = 0) -> PSMNet:
     """A network in eval mode whose batch norms do something."""
     torch.manual_seed(seed)
-    network = PSMNet(config)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
-            assert module.running_mean is not None
-            assert module.running_var is not None
-            module.running_mean.normal_(0, 0.1)
-            module.running_var.uniform_(0.5, 1.5)
-            module.weight.data.uniform_(0.5, 1.2)
-            module.bias.data.normal_(0, 0.1)
-    return network.eval()
+    return with_lively_norms(PSMNet(config))
 
 
 def plain(network: PSMNet, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import nn
+from tests.depth.made_matchers import with_lively_norms
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
@@ -23,11 +23,11 @@ from depthpose.depth.config import (
 from depthpose.depth.lite0 import KIND, Lite0Encoder, load_lite0
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
 from depthpose.depth.stereo.light import (
+    confidence_near,
     correlation_volume,
     enlarge,
     mean_of_all,
     mean_of_best,
-    sureness,
 )
 from depthpose.depth.stereo.matcher import CameraMatcher, TiledMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
@@ -45,16 +45,7 @@ SMALL = LightConfig(
 def random_network(config: LightConfig = SMALL) -> LightStereo:
     """A network in eval mode whose batch norms do something."""
     torch.manual_seed(0)
-    network = LightStereo(config)
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
-            assert module.running_mean is not None
-            assert module.running_var is not None
-            module.running_mean.normal_(0, 0.1)
-            module.running_var.uniform_(0.5, 1.5)
-            module.weight.data.uniform_(0.5, 1.2)
-            module.bias.data.normal_(0, 0.1)
-    return network.eval()
+    return with_lively_norms(LightStereo(config))
 
 
 def shifted_pair(height: int, width: int, shift: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,10 +80,10 @@ def test_confidence_is_the_probability_near_the_answer() -> None:
     certain = torch.full((1, 8, 1, 1), -200.0)
     certain[0, 3] = 0.0
     at_px = torch.full((1, 1, 1), 12.0)
-    assert float(sureness(certain, at_px)) == pytest.approx(1.0)
-    assert float(sureness(certain, at_px + 9)) == pytest.approx(0.0, abs=1e-6)
+    assert float(confidence_near(certain, at_px)) == pytest.approx(1.0)
+    assert float(confidence_near(certain, at_px + 9)) == pytest.approx(0.0, abs=1e-6)
     flat = torch.zeros(1, 8, 1, 1)  # 29 whole disparities from 0 to 28, five of them within 2 px
-    assert float(sureness(flat, at_px)) == pytest.approx(5 / 29)
+    assert float(confidence_near(flat, at_px)) == pytest.approx(5 / 29)
 
 
 def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
@@ -15,7 +15,7 @@ from depthpose.core.run import claim_folder
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,16 +88,30 @@ def label_pairs(
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Float[Tensor, "h w"]:
     """Match a pair both ways; NaN where the two disagree, or the matcher is not sure [px]."""
+    one, right_px = match_both_ways(net, pair)
+    is_known = is_consistent(one.disparity_px, right_px, config)
+    if one.confidence is not None:
+        is_known &= one.confidence >= config.least_confidence
+    return torch.where(is_known, one.disparity_px, torch.nan)
+
+
+def match_both_ways(
+    net: FakestereoNet, pair: StereoInput
+) -> tuple[DepthEstimate, Float[Tensor, "h w"]]:
+    """Match a pair from the left view, and give the disparity of the right view [px] too."""
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
     one, other = net.estimate_pair(pair), net.estimate_pair(mirrored)
-    left_px, right_px = one.disparity_px, other.disparity_px.flip(-1)
-    difference_px = left_right_difference_px(left_px, right_px)
+    return one, other.disparity_px.flip(-1)
+
+
+@torch.no_grad()
+def is_consistent(
+    left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"], config: LabelConfig
+) -> Bool[Tensor, "h w"]:
+    """Mark left pixels where the disparities of both views agree; not where a point leaves one."""
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
-    is_known = difference_px <= limit_px
-    if one.confidence is not None:
-        is_known &= one.confidence >= config.least_confidence
-    return torch.where(is_known, left_px, torch.nan)
+    return left_right_difference_px(left_px, right_px) <= limit_px
 
 
 def _write_calibration(path: Path, dataset: Dataset, usable: list[int]) -> None:

@@ -19,7 +19,7 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
-from depthpose.depth.stereo.light import LightStereo, enlarge, mean_of_best, sureness
+from depthpose.depth.stereo.light import LightStereo, confidence_near, enlarge, mean_of_best
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
@@ -76,7 +76,7 @@ class SizelessLight(nn.Module):
         config = self.network.config
         scores, weights = self.network.scores(left, right, config.max_disparity_px)
         quarter_px = mean_of_best(scores, config.candidates)
-        return enlarge(quarter_px, weights), enlarge(sureness(scores, quarter_px), weights)
+        return enlarge(quarter_px, weights), enlarge(confidence_near(scores, quarter_px), weights)
 
 
 def sizeless(matcher: nn.Module) -> nn.Module:

@@ -186,7 +186,7 @@ def mean_of_all(scores: Scores) -> Quarter:
     return _STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
 
 
-def sureness(scores: Scores, disparity_px: Quarter) -> Quarter:
+def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
     """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
 
     As PSMNet's confidence: between the disparities that have a score, scores are interpolated.

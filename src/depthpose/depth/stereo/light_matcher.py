@@ -6,7 +6,7 @@ import torch
 
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.stereo.folding import fold_features, fold_volumes
-from depthpose.depth.stereo.light import LightStereo, enlarge, mean_of_best, sureness
+from depthpose.depth.stereo.light import LightStereo, confidence_near, enlarge, mean_of_best
 from depthpose.depth.stereo.network_matcher import NetworkMatcher, Views
 from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.types import Match
@@ -54,5 +54,5 @@ class LightMatcher(NetworkMatcher):
         if not self.config.with_confidence:
             return [Match(disparity_px=one) for one in found_px]
         rows = zip(scores.split(_ROWS, 2), quarter_px.split(_ROWS, 1), strict=True)
-        sure = enlarge(torch.cat([sureness(*some) for some in rows], 1), weights)
+        sure = enlarge(torch.cat([confidence_near(*some) for some in rows], 1), weights)
         return [Match(disparity_px=d, confidence=c) for d, c in zip(found_px, sure, strict=True)]

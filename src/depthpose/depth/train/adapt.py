@@ -20,19 +20,18 @@ from depthpose.core.loop import Evidence, Turn, make_adam
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import MatcherConfig, PairsConfig, StreetsConfig
 from depthpose.depth.datasets import Dataset, open_dataset
-from depthpose.depth.disparity import left_right_difference_px, warp_right_to_left
+from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.labels import LabelConfig, label_pairs
+from depthpose.depth.labels import LabelConfig, is_consistent, label_pairs, match_both_ways
 from depthpose.depth.losses import heads_loss, photometric_error, smoothness_loss
+from depthpose.depth.metrics import disparity_errors
 from depthpose.depth.stereo import make_matcher, normalise
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train.config import AdaptTraining
 from depthpose.depth.types import StereoInput
 
-_AGREE_PX, _AGREE_SHARE = 1.0, 0.03
-"""Disparities of both views agree within so many pixels, or such a share."""
-_BAD_PX, _BAD_SHARE = 3.0, 0.05
-"""A disparity is bad beyond both, as KITTI counts."""
+_LIMITS = LabelConfig()
+"""When the disparities of both views agree."""
 _FORGOTTEN = 0.005
 """More bad disparities on synthetic streets than this share are too many."""
 _NOTHING = 0.002
@@ -94,20 +93,15 @@ def _photometric_loss(
     """Mean difference where both ways agree; the first ``count`` are left views."""
     looked_up = torch.stack(list(map(warp_right_to_left, others, found_px)))
     back_px = found_px.roll(count, 0).flip(-1)
-    is_seen = torch.stack(list(map(agreeing, found_px, back_px)))
+    is_seen = torch.stack(
+        [is_consistent(*both, _LIMITS) for both in zip(found_px, back_px, strict=True)]
+    )
     error = photometric_error(views, looked_up.nan_to_num(0.0))
     return torch.where(is_seen, error, 0.0).sum() / is_seen.sum().clamp(min=1)
 
 
-@torch.no_grad()
-def agreeing(left_px: Float[Tensor, "h w"], right_px: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Where the disparities of both views say the same of one point, inside both."""
-    limit_px = (_AGREE_SHARE * left_px).clamp(min=_AGREE_PX)
-    return left_right_difference_px(left_px, right_px) <= limit_px
-
-
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class AdaptMetrics:
     """What a matcher does on pairs that were kept back, and on synthetic streets.
 
     Attributes:
@@ -140,13 +134,14 @@ class Guard:
         self._seen: list[Bool[Tensor, "h w"]] = []
 
     @torch.no_grad()
-    def measure(self, matcher: nn.Module) -> Verdict:
+    def measure(self, matcher: nn.Module) -> AdaptMetrics:
         """Measure a network in eval mode; the first one decides which pixels count."""
         net = FakestereoNet(make_matcher(matcher, self.config))
         errors, apart = [], []
         for number, pair in enumerate(self.pairs):
-            left_px, right_px = match_both_ways(net, pair)
-            agrees = agreeing(left_px, right_px)
+            found, right_px = match_both_ways(net, pair)
+            left_px = found.disparity_px
+            agrees = is_consistent(left_px, right_px, _LIMITS)
             if len(self._seen) == number:
                 self._seen.append(agrees)
             assert pair.right is not None
@@ -156,7 +151,7 @@ class Guard:
             errors.append(error[counts].mean())
             apart.append((~agrees).float().mean())
         bad, off_px = self._on_streets(net)
-        return Verdict(
+        return AdaptMetrics(
             photometric=float(torch.stack(errors).mean()),
             disagreeing=float(torch.stack(apart).mean()),
             street_d1=bad,
@@ -169,16 +164,16 @@ class Guard:
             truth_px = street.truth.disparity_px
             assert truth_px is not None
             found_px = net.estimate_pair(street.input).disparity_px
-            error = (found_px - truth_px).abs()[truth_px > 0]
-            limit_px = (_BAD_SHARE * truth_px[truth_px > 0]).clamp(min=_BAD_PX)
-            bad.append((error > limit_px).float().mean())
-            off_px.append(error.mean())
+            counts = truth_px > 0
+            errors = disparity_errors(found_px[counts], truth_px[counts])
+            bad.append(errors.d1_all)
+            off_px.append(errors.epe_px)
         if not bad:
             return float("nan"), float("nan")
-        return float(torch.stack(bad).mean()), float(torch.stack(off_px).mean())
+        return sum(bad) / len(bad), sum(off_px) / len(off_px)
 
 
-def refuse_worse(before: Verdict, after: Verdict) -> None:
+def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
     """Refuse a matcher that lost more than it gained.
 
     Raises:
@@ -194,7 +189,8 @@ def refuse_worse(before: Verdict, after: Verdict) -> None:
             (before.disagreeing, after.disagreeing),
         )
     ]
-    if max(changes) > _NOTHING or min(changes) > -_NOTHING:
+    # NaN, where no pixel could be compared, is no gain either.
+    if not (all(c <= _NOTHING for c in changes) and any(c <= -_NOTHING for c in changes)):
         raise InputError(f"the pairs that were kept back fit no better: {said}; {advice}.")
     if after.street_d1 > before.street_d1 + _FORGOTTEN:
         raise InputError(
@@ -203,24 +199,22 @@ def refuse_worse(before: Verdict, after: Verdict) -> None:
         )
 
 
-def match_both_ways(
-    net: FakestereoNet, pair: StereoInput
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Give the disparities of the left and of the right view."""
-    assert pair.right is not None
-    mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    one, other = net.estimate_pair(pair), net.estimate_pair(mirrored)
-    return one.disparity_px, other.disparity_px.flip(-1)
-
-
-def split_pairs(folder: str, split: str | None, kept_back: int) -> tuple[Dataset, list[int]]:
+def split_pairs(
+    folder: str, split: str | None, kept_back: int, exclude: Sequence[str] = ()
+) -> tuple[Dataset, list[int]]:
     """Open a folder of pairs; give the numbers of those that are kept back, evenly spread.
+
+    Frames that ``exclude`` names are neither trained on nor kept back.
 
     Raises:
         InputError: fewer than two pairs with calibration.
     """
     dataset = open_dataset(folder, split)
-    usable = [n for n, frame in enumerate(dataset.frames) if frame.right and frame.calibration]
+    usable = [
+        n
+        for n, frame in enumerate(dataset.frames)
+        if frame.right and frame.calibration and frame.name not in exclude
+    ]
     if len(usable) < 2:
         raise InputError(
             f"{dataset.name}: {len(usable)} of {len(dataset.frames)} frames have a right view and "
@@ -229,7 +223,7 @@ def split_pairs(folder: str, split: str | None, kept_back: int) -> tuple[Dataset
     return dataset, usable[:: max(min(kept_back, len(usable)), 2)]
 
 
-def adapted_text(before: Verdict, after: Verdict) -> str:
+def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
     """Show for a card what changed, as Markdown."""
     rows = [
         f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |" for name, old in vars(before).items()
@@ -245,15 +239,14 @@ def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[
     kept: list[StereoInput] = []
     path = find_weights(config.start)
     net = FakestereoNet.load(path, matcher=path)
-    limits = LabelConfig()
     for number, folder in enumerate(config.pairs.folders):
         split = config.pairs.split if number == 0 else None
-        dataset, back = split_pairs(folder, split, config.kept_back)
+        dataset, back = split_pairs(folder, split, config.kept_back, config.pairs.exclude)
         kept += [dataset.read_input(n) for n in back]
         excluded += [dataset.frames[n].name for n in back]
-        settings = {"dataset": dataset.name, "weights_sha256": file_sha256(path), **asdict(limits)}
+        settings = {"dataset": dataset.name, "weights_sha256": file_sha256(path), **asdict(_LIMITS)}
         place = home / f"{number}-{Path(folder).name}"
-        for _ in label_pairs(net, dataset, limits, place, settings):
+        for _ in label_pairs(net, dataset, _LIMITS, place, settings):
             pass
         folders.append(str(place))
     pairs = replace(

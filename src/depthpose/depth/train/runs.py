@@ -168,11 +168,11 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     guard = Guard(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
     )
-    verdicts = [guard.measure(network) for network in (read_matcher(start), matcher.eval())]
-    write_json(run.folder / "adapt.json", [asdict(verdict) for verdict in verdicts])
-    refuse_worse(*verdicts)
+    found = [guard.measure(network) for network in (read_matcher(start), matcher.eval())]
+    write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
+    refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
-    leave_card(path, "depth train adapt", seconds, facts, adapted_text(*verdicts))
+    leave_card(path, "depth train adapt", seconds, facts, adapted_text(*found))
     return path
 
 

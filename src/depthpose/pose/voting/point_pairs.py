@@ -43,9 +43,9 @@ _CHECKED = 100
 _FAR = 0.1
 """Of the diameter: points within this distance of a proposed pose, which is rough, are near it."""
 _EVERY = 16
-"""Of the points of the surface, each so manyth shows what a pose would occlude."""
+"""One point of the surface of so many shows what a pose would occlude."""
 _UNSEEN = 0.3
-"""What a surface that should be seen and is not counts against a pose."""
+"""Weight of the share of the surface that should be seen and is not."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,8 +124,8 @@ def propose_poses(
     chosen = torch.randperm(len(points_m), generator=generator)
     points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
     poses = _vote(points_m, _frames(normals), table)
-    worth = _worth(points_m, normals, poses, surface)
-    best = worth.argsort(descending=True, stable=True)[:count]
+    scores = _scores(points_m, normals, poses, surface)
+    best = scores.argsort(descending=True, stable=True)[:count]
     return Rigid(poses.R[best], poses.t_m[best])
 
 
@@ -251,7 +251,7 @@ def _poses(
     return Rigid(R, points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1))
 
 
-def _worth(
+def _scores(
     points_m: Float64[Tensor, "n 3"],
     normals: Float64[Tensor, "n 3"],
     poses: Rigid,
