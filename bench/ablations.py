@@ -35,7 +35,7 @@ from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthetic import draw_street
 from depthpose.depth.train import STAGES, Run
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.depth.weights import read_generator, read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 from depthpose.report.tables import markdown_table, write_table
 
 FOCAL_PX = 186.0
@@ -178,7 +178,7 @@ class Bench:
             assert isinstance(network, UNetGenerator)
             network.config = replace(network.config, test_mode=mode)
             both = home / f"apart-{mode}.safetensors"
-            matcher = read_psmnet(self.matcher())
+            matcher = read_matcher(self.matcher())
             facts = bound_facts({}, [generator, self.matcher()])
             write_depth_weights(both, generator=network, matcher=matcher, facts=facts)
             rows.append(self.measure(arm, f"apart, {mode}" if mode == "batch" else "apart", both))

@@ -24,10 +24,10 @@ from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.evaluate import evaluate
 from depthpose.depth.predictions import predict
-from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthesis.synthesiser import Drawn, draw_right, pad_to_multiple
-from depthpose.depth.weights import read_depth_weights, read_psmnet
+from depthpose.depth.weights import read_depth_weights, read_matcher
 from depthpose.report.tables import markdown_table
 
 Draw = Callable[[UNetGenerator, Tensor], Tensor]
@@ -124,9 +124,8 @@ def main() -> None:
     parser.add_argument("--without", nargs="*", default=(), help="names of frames to leave out")
     options = parser.parse_args()
     generator = read_depth_weights(find_weights(options.weights)).generator
-    network = read_psmnet(find_weights(options.matcher))
+    network = read_matcher(find_weights(options.matcher))
     assert isinstance(generator, UNetGenerator)
-    assert network is not None
     dataset = join_datasets([open_dataset(options.data)], options.without)
     rows, columns = options.crop
     multiple = generator.config.side_multiple_px
@@ -140,7 +139,7 @@ def main() -> None:
         f"rows resized to {more}": of_rows(more),
         f"crops of {rows}x{columns}": of_crops(rows, columns),
     }
-    matcher = PSMNetMatcher(network, MatcherConfig())
+    matcher = make_matcher(network, MatcherConfig())
     found = []
     for name, draw in ways.items():
         net = FakestereoNet(matcher, Drawer(generator.eval(), draw))

@@ -21,10 +21,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.depth.config import GeneratorConfig, MatcherConfig, PSMNetConfig
+from depthpose.depth.config import GeneratorConfig, MatcherConfig
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import PSMNet, PSMNetMatcher
+from depthpose.depth.stereo import MATCHERS, NetworkMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
 from depthpose.report.tables import markdown_table
@@ -72,12 +72,13 @@ def count_flops(run: Callable[[], object]) -> int:
 
 def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
     """Count operations of the plain matcher at this size, without computing anything."""
-    assert isinstance(net.matcher, PSMNetMatcher)
+    assert isinstance(net.matcher, NetworkMatcher)
     config = net.matcher.network_config
-    assert isinstance(config, PSMNetConfig)
-    rows, columns = (max(config.min_side_px, -(-side // 16) * 16) for side in (height, width))
+    kind = next(kind for kind in MATCHERS.values() if isinstance(config, kind.config))
+    step = config.step_px
+    rows, columns = (max(config.min_side_px, -(-side // step) * step) for side in (height, width))
     with torch.device("meta"):
-        shadow = PSMNet(config).eval()
+        shadow = kind.network(config).eval()
         views = torch.empty(2, 1, 3, rows, columns)
         return count_flops(lambda: shadow(views[0], views[1]))
 

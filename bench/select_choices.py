@@ -29,18 +29,19 @@ from depthpose.depth.config import (
     AugmentConfig,
     DegradeConfig,
     GeneratorConfig,
+    MatcherConfig,
     PairsConfig,
     SelectionConfig,
 )
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import Drawn, SelectionGenerator
 from depthpose.depth.synthesis.selection import mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
 from depthpose.depth.train import STAGES, Run
 from depthpose.depth.train.config import SelectTraining, ViewTraining
-from depthpose.depth.weights import read_generator, read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 from depthpose.report.tables import markdown_table, write_table
 
 FOCAL_PX = 186.0
@@ -189,7 +190,7 @@ class Bench:
             generator.config = replace(generator.config, answer=answer)
         path = folder / f"{answer}.safetensors"
         facts = bound_facts({}, [weights])
-        matcher = read_psmnet(self.options.matcher)
+        matcher = read_matcher(self.options.matcher)
         write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
         return path
 
@@ -217,7 +218,7 @@ class Bench:
         generator = read_generator(weights)
         assert isinstance(generator, SelectionGenerator)
         generator.config = replace(generator.config, answer="matched")
-        matcher = PSMNetMatcher(read_psmnet(self.options.matcher))
+        matcher = make_matcher(read_matcher(self.options.matcher), MatcherConfig())
         mixing = FakestereoNet(matcher, MixingSynthesiser(generator))
         predictions = folder / "mixture"
         predict(mixing, self.options.evaluate, predictions)

@@ -29,7 +29,7 @@ from depthpose.depth.stereo import (
     psmnet_from_published,
 )
 from depthpose.depth.stereo.network_matcher import pad_top_right
-from depthpose.depth.weights import read_psmnet
+from depthpose.depth.weights import read_matcher
 
 Pair = tuple[Tensor, Tensor]
 
@@ -53,7 +53,9 @@ def network_for(weights: Path | None) -> PSMNet:
         torch.manual_seed(0)
         return PSMNet().eval()
     if weights.suffix == ".safetensors":
-        return read_psmnet(weights)
+        network = read_matcher(weights)
+        assert isinstance(network, PSMNet), f"{weights}: this measures PSMNet"
+        return network
     return psmnet_from_published(read_torch_file(weights)["state_dict"], align_corners=True)
 
 

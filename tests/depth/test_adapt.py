@@ -29,7 +29,7 @@ from depthpose.depth.train.adapt import (
     split_pairs,
 )
 from depthpose.depth.train.config import AdaptTraining
-from depthpose.depth.weights import read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_matcher, write_depth_weights
 
 TRUE_PX = 6.0
 SIZE = (48, 96)
@@ -221,7 +221,7 @@ def test_an_adapted_matcher_carries_its_card(
     monkeypatch.setattr("depthpose.depth.train.runs.refuse_worse", lambda *both: seen.extend(both))
     path = train_adapt(config_of(tmp_path, start, 1e-3), Run(folder=tmp_path / "out"))
     assert seen[0] != seen[1]
-    one, other = (read_psmnet(file).state_dict() for file in (start, path))
+    one, other = (read_matcher(file).state_dict() for file in (start, path))
     assert any(not torch.equal(one[name], other[name]) for name in one)
     card = path.with_suffix(".md").read_text()
     assert f"| photometric | {seen[0].photometric:.4g} | {seen[1].photometric:.4g} |" in card

@@ -16,12 +16,13 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     AugmentConfig,
     GeneratorConfig,
+    LightConfig,
     PairsConfig,
     PSMNetConfig,
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.stereo import PSMNet
+from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import (
     FinetuneTask,
@@ -34,9 +35,12 @@ from depthpose.depth.train import (
     train_view,
 )
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.depth.weights import read_depth_weights, read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
 GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
+LIGHT = LightConfig(
+    max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.25
+)
 MATCHER = PSMNetConfig(width=4, max_disparity_px=32, blocks=(1, 1, 1, 1), pools=(4, 2))
 LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
 
@@ -50,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def pairs(folder: Path) -> PairsConfig:
     return PairsConfig(
-        folders=(str(folder),), focal_px=130.0, augment=AugmentConfig(crop_px=(48, 96))
+        folders=(str(folder),), focal_px=130.0, augment=AugmentConfig(crop_px=(64, 96))
     )
 
 
@@ -103,10 +107,16 @@ def test_l1_alone_has_no_judge(pairs: PairsConfig) -> None:
     assert list(task.modules) == ["generator"]
 
 
-def test_fine_tuning_moves_the_generator_alone(pairs: PairsConfig) -> None:
-    """Neither the matcher's weights move nor its batch norm statistics."""
+def any_matcher(kind: str) -> PSMNet | LightStereo:
     torch.manual_seed(0)
-    generator, matcher = UNetGenerator(GENERATOR), PSMNet(MATCHER)
+    return PSMNet(MATCHER) if kind == "psmnet" else LightStereo(LIGHT)
+
+
+@pytest.mark.parametrize("kind", ["psmnet", "light"])
+def test_fine_tuning_moves_the_generator_alone(pairs: PairsConfig, kind: str) -> None:
+    """Neither the matcher's weights move nor its batch norm statistics."""
+    matcher = any_matcher(kind)
+    generator = UNetGenerator(GENERATOR)
     task = FinetuneTask(generator, matcher, FinetuneTraining(), None)
     before, matcher_before = snapshot(generator), snapshot(matcher)
     for _ in range(3):
@@ -117,9 +127,12 @@ def test_fine_tuning_moves_the_generator_alone(pairs: PairsConfig) -> None:
     assert moved == {name for name, _ in generator.named_parameters()}
 
 
-def test_gradients_reach_the_whole_generator_through_the_matcher(pairs: PairsConfig) -> None:
-    torch.manual_seed(0)
-    generator, matcher = UNetGenerator(GENERATOR), PSMNet(MATCHER)
+@pytest.mark.parametrize("kind", ["psmnet", "light"])
+def test_gradients_reach_the_whole_generator_through_the_matcher(
+    pairs: PairsConfig, kind: str
+) -> None:
+    matcher = any_matcher(kind)
+    generator = UNetGenerator(GENERATOR)
     (turn,) = FinetuneTask(generator, matcher, FinetuneTraining(), None).step(batch(pairs))
     turn.loss.backward()
     assert all(p.grad is not None and float(p.grad.abs().sum()) > 0 for p in generator.parameters())
@@ -266,7 +279,7 @@ def test_a_matcher_may_start_from_one_of_another_range(pairs: PairsConfig, tmp_p
     first = train_stereo(config, Run(folder=tmp_path / "first"))
     farther = dataclasses.replace(MATCHER, max_disparity_px=MATCHER.max_disparity_px + 16)
     other = dataclasses.replace(config, matcher=farther, start=str(first))
-    second = read_psmnet(train_stereo(other, Run(folder=tmp_path / "second")))
+    second = read_matcher(train_stereo(other, Run(folder=tmp_path / "second")))
     assert second.config == farther
 
 

@@ -12,7 +12,7 @@ from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
-from depthpose.depth.stereo import MATCHERS, PSMNet
+from depthpose.depth.stereo import MATCHERS
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"
@@ -92,29 +92,6 @@ def read_matcher(path: Path) -> nn.Module:
     matcher = read_depth_weights(path).matcher
     if matcher is None:
         raise InputError(f"{path}: holds no matcher, only a generator; give a matcher's weights.")
-    return matcher
-
-
-def read_psmnet(path: Path) -> PSMNet:
-    """Read the matcher of a weights file, which must be PSMNet.
-
-    Raises:
-        InputError: the file holds none, or another network.
-    """
-    return as_psmnet(read_matcher(path), str(path))
-
-
-def as_psmnet(matcher: nn.Module, source: str) -> PSMNet:
-    """Give a matcher's network where it is PSMNet, for what no other kind can do.
-
-    Raises:
-        InputError: it is another network.
-    """
-    if not isinstance(matcher, PSMNet):
-        raise InputError(
-            f"{source}: the matcher is {type(matcher).__name__}, and only PSMNet takes part in "
-            "fine-tuning; give weights of a psmnet."
-        )
     return matcher
 
 

@@ -49,6 +49,21 @@ def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, sour
     network.load_state_dict(found.state_dict())
 
 
+def read_network(name: str) -> PSMNet | LightStereo:
+    """Read a matcher of weights, to train it or to train a generator through it.
+
+    Raises:
+        InputError: the weights hold none, or one of a kind that is not trained here.
+    """
+    network = read_matcher(find_weights(name))
+    if not isinstance(network, PSMNet | LightStereo):
+        raise InputError(
+            f"{name}: the matcher is {type(network).__name__}, and only PSMNet and LightStereo "
+            "take part in a training; give weights of one of these."
+        )
+    return network
+
+
 def make_matcher_network(config: StereoTraining) -> PSMNet | LightStereo:
     """Make the network that a config trains, with the weights that it begins with."""
     if config.light is None and config.encoder is not None:

@@ -32,7 +32,12 @@ from depthpose.depth.train.adapt import (
     label_folders,
     refuse_worse,
 )
-from depthpose.depth.train.begin import make_matcher_network, refuse_fixed_chance, start_from
+from depthpose.depth.train.begin import (
+    make_matcher_network,
+    read_network,
+    refuse_fixed_chance,
+    start_from,
+)
 from depthpose.depth.train.config import (
     AdaptTraining,
     FinetuneTraining,
@@ -43,7 +48,7 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-from depthpose.depth.weights import read_generator, read_matcher, read_psmnet, write_depth_weights
+from depthpose.depth.weights import read_generator, write_depth_weights
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Settings of the loop that change no weight: a resumed run may have others."""
@@ -151,9 +156,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     if not config.pairs.folders:
         raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
-    start = find_weights(config.start)
-    matcher = read_matcher(start)
-    assert isinstance(matcher, PSMNet | LightStereo), "the kinds of matchers with weights"
+    matcher = read_network(config.start)
     focal_px = matcher.config.work_focal_px
     if config.pairs.focal_px is None and focal_px is not None:
         pairs = replace(config.pairs, focal_px=_LARGER * focal_px)
@@ -168,7 +171,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     guard = Guard(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
     )
-    found = [guard.measure(network) for network in (read_matcher(start), matcher.eval())]
+    found = [guard.measure(network) for network in (read_network(config.start), matcher.eval())]
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
@@ -186,7 +189,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
                 "'depth train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
-    matcher = read_psmnet(find_weights(config.matcher))
+    matcher = read_network(config.matcher)
     config = replace(config, pairs=_at_virtual_focal(config.pairs, generator.config))
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)

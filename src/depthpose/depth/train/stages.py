@@ -193,7 +193,7 @@ class FinetuneTask:
     def __init__(
         self,
         generator: Generator,
-        matcher: PSMNet,
+        matcher: PSMNet | LightStereo,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
     ) -> None:
