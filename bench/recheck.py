@@ -97,7 +97,7 @@ TABLES = (
             "--protocol eigen-raw-camera --matcher sgbm --baseline rows nearest "
             f"{_TRAIN} "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
-            "--out OUT/mono",
+            "fine:psmnet-compact quick:psmnet-compact --out OUT/mono",
         ),
         files=("mono/rows.json",),
         numbers={**_DEPTH, **_DELTAS},
@@ -107,8 +107,8 @@ TABLES = (
             "one image (default)": {"weights": "default", "sees": "left view"},
             "one image (kitti-nc)": {"weights": "kitti-nc", "sees": "left view"},
             **{
-                f"real stereo, our matcher ({name}), {speed}": {"weights": name, "speed": speed}
-                for name in ("default", "kitti-nc")
+                f"real stereo, {name}, {speed}": {"weights": name, "speed": speed}
+                for name in ("default", "kitti-nc", "psmnet-compact")
                 for speed in ("fine", "quick")
             },
             "real stereo, SGBM, holes filled": {"method": "sgbm (holes filled)"},
@@ -137,7 +137,7 @@ TABLES = (
         commands=(
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
-            "--matcher sgbm --out OUT/disparity",
+            "fine:psmnet-compact quick:psmnet-compact --matcher sgbm --out OUT/disparity",
         ),
         files=("disparity/rows.json",),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
@@ -146,7 +146,7 @@ TABLES = (
             "one image, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
             **{
                 f"both views, {name}, {speed}": {"weights": name, "speed": speed}
-                for name in ("default", "kitti-nc")
+                for name in ("default", "kitti-nc", "psmnet-compact")
                 for speed in ("fine", "quick")
             },
             **_SGBM,

@@ -207,14 +207,13 @@ def test_a_pair_is_matched_by_the_default_weights_where_none_are_named(
 def test_another_matcher_looks_at_the_drawn_view(home: Path, tmp_path: Path) -> None:
     """Weights are named by --matcher here as in a training."""
     words = (str(home / "images/0.png"), "--camera", str(home / "cam.json"))
-    for matcher in ("default", str(home / "w.safetensors"), "psmnet"):
+    for matcher in ("default", str(home / "w.safetensors")):
         out = tmp_path / Path(matcher).stem
         assert predict(home, out, *words, "--matcher", matcher) == 0
+    assert predict(home, tmp_path / "own", *words) == 0
     said = json.loads((tmp_path / "default/run.json").read_text())["settings"]
     assert said["matcher"] == "fakestereo with default"
-    own, other, same = (
-        read_map(tmp_path / f"{n}/0.depth_m.npy") for n in ("psmnet", "default", "w")
-    )
+    own, other, same = (read_map(tmp_path / f"{n}/0.depth_m.npy") for n in ("own", "default", "w"))
     assert torch.equal(own, same)
     assert not torch.equal(own, other)
 

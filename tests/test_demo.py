@@ -77,7 +77,7 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert rows[-1]["coverage"] == 1.0
     camera = read_camera(tmp_path / "street/camera.json")
     assert read_image(tmp_path / "street/left.png").shape == (3, camera.height, camera.width)
-    depth_m = read_map(tmp_path / "fakestereo-net-compact/street.depth_m.npy")
+    depth_m = read_map(tmp_path / "selecting-generator/street.depth_m.npy")
     assert depth_m.shape == (camera.height, camera.width)
     assert read_settings(tmp_path) == {"command": "demo"}
     written = {path.name for path in tmp_path.iterdir()} - {"run.json"}
@@ -99,7 +99,7 @@ def test_without_a_matcher_the_pair_is_left_to_opencv() -> None:
     street = make_street(0.1)
     methods = _nets(net, replace(street, input=replace(street.input, name="street")))
     assert {name: sees for name, (sees, _) in methods.items()} == {
-        "Fakestereo-Net, compact": "one image",
+        "selecting generator": "one image",
         "SGBM, holes filled": "both images",
     }
 

@@ -17,14 +17,16 @@ from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import AugmentConfig, DegradeConfig, MatcherConfig, PairsConfig
 from depthpose.depth.config import PSMNetConfig as Config
+from depthpose.depth.datasets import open_dataset
 from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.losses import photometric_error, smoothness_loss
-from depthpose.depth.stereo import CallableMatcher, PSMNet
+from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.train import Run, train_adapt
 from depthpose.depth.train.adapt import (
     AdaptMetrics,
     AdaptTask,
     Guard,
+    fine_focal_px,
     refuse_worse,
     split_pairs,
 )
@@ -212,6 +214,20 @@ def test_a_matcher_that_changes_nothing_is_not_written(tmp_path: Path, start: Pa
     assert not (tmp_path / "out/matcher.safetensors").exists()
     before, after = json.loads((tmp_path / "out/adapt.json").read_text())
     assert before == pytest.approx(after, rel=1e-5)
+
+
+def test_pairs_are_adapted_to_at_the_size_of_a_fine_match(
+    tmp_path: Path, start: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never enlarged; large ones are reduced to what a fine match takes."""
+    network = read_matcher(start)
+    config = config_of(tmp_path, start, 1e-3)
+    camera = open_dataset(tmp_path / "pairs").read_input(0).camera
+    assert camera is not None
+    own_px = float(camera.K[0, 0])
+    assert fine_focal_px(config, network) == pytest.approx(own_px)
+    monkeypatch.setattr(PSMNetMatcher, "fine_pixels", camera.width * camera.height / 1.1)
+    assert fine_focal_px(config, network) == pytest.approx(own_px / 1.1**0.5)
 
 
 def test_an_adapted_matcher_carries_its_card(

@@ -102,10 +102,9 @@ def test_a_matcher_and_its_weights_belong_together(
 
 def test_without_a_name_the_default_is_loaded() -> None:
     """Its files say the same as those that are named; from_pretrained is what others call it."""
-    said = "FakestereoNet(SelectionSynthesiser + PSMNetMatcher, weights 'default', cpu)"
+    said = "FakestereoNet(SelectionSynthesiser + LightMatcher, weights 'default', cpu)"
     for net in (
         FakestereoNet.load(),
-        FakestereoNet.load(matcher="psmnet"),
         FakestereoNet.from_pretrained("default"),
     ):
         assert repr(net) == said

@@ -441,7 +441,9 @@ def test_an_answer_of_the_matcher_needs_one(tmp_path: Path, answer: Answer) -> N
         FakestereoNet(None, make_synthesiser(sure_of(3, answer)))
     assert FakestereoNet.load(path, matcher=constant_matcher(2.0)).matcher is not None
     with pytest.raises(InputError, match="there is no matcher in that"):
-        FakestereoNet.load(selection_file(tmp_path), matcher="psmnet")
+        FakestereoNet.load(path, matcher=path)
+    with pytest.raises(InputError, match="did you mean 'psmnet-compact'"):
+        FakestereoNet.load(path, matcher="psmnet")
     with pytest.raises(InputError, match="matcher is None"):
         FakestereoNet(None)
 

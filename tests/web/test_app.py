@@ -23,7 +23,7 @@ from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import CallableMatcher, PSMNetMatcher
+from depthpose.depth.stereo import CallableMatcher, LightMatcher
 from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.metrics import adds_m
@@ -214,7 +214,7 @@ def test_the_matcher_may_want_a_larger_picture_than_the_generator(
     nets: tuple[FakestereoNet, GeoPoseNet], samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synthesiser = make_synthesiser(sure_of(3, "matched"))
-    monkeypatch.setattr(PSMNetMatcher, "work_size", lambda *_: (100 * 47, 100 * 155))
+    monkeypatch.setattr(LightMatcher, "work_size", lambda *_: (100 * 47, 100 * 155))
     app = make_app(FakestereoNet(nets[0].matcher, synthesiser), nets[1])
     files = {"image": "left.png", "camera": "camera.json"}
     status, text = refusal(ask(TestClient(app, base_url=URL), "depth", samples, files))

@@ -33,7 +33,7 @@ PATHS = frozenset({
 """Arguments of commands that name files or folders that are read."""
 WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})
 """Arguments that name weights, by name or file."""
-_WORDS = ("psmnet", "sgbm", "nothing", "open3d")
+_WORDS = ("sgbm", "nothing", "open3d")
 """What they may say in place of weights."""
 _PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
 """Before the name of weights: how they are used."""

@@ -63,11 +63,11 @@ def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
     # The nearest surfaces of both scenes; OpenCV leaves that many columns unmatched.
     columns = 16 * math.ceil(sample.input.left.shape[2] / 16 / 10)
     sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
-    matched = {} if network.matcher is None else {"PSMNet, compact": (_FROM_PAIR, network)}
+    matched = {} if network.matcher is None else {"light matcher": (_FROM_PAIR, network)}
     filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
     pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
     is_street = sample.input.name == "street"
-    return {**pairs, "Fakestereo-Net, compact": (_FROM_ONE, network)} if is_street else pairs
+    return {**pairs, "selecting generator": (_FROM_ONE, network)} if is_street else pairs
 
 
 def _try_all(
@@ -129,7 +129,7 @@ _STREET_TEXT = (
 _MOTORCYCLE_TEXT = (
     "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "
     "scikit-image ships it. Distances from 1.5 m to 8 m. The shipped matcher was trained on "
-    "synthetic streets alone."
+    "synthetic scenes alone."
 )
 
 

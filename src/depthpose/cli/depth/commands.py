@@ -86,9 +86,8 @@ def _predict_on_ray(
     on: EngineOptions,
 ) -> int:
     from depthpose.cli.depth import engine
-    from depthpose.depth.stereo import is_own_matcher
 
-    if networks.matcher != "sgbm" and not is_own_matcher(networks.matcher):
+    if networks.matcher not in (None, "sgbm"):
         raise InputError(
             f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
             "file of both by 'depthpose weights pack G --matcher S --out W'"

@@ -17,7 +17,7 @@ from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConf
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
-from depthpose.depth.stereo import MATCHERS, is_own_matcher, with_usable_precision
+from depthpose.depth.stereo import MATCHERS, with_usable_precision
 
 
 class Method(NamedTuple):
@@ -47,8 +47,8 @@ def weights_method(
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
         with_right: give it the real right view; by default only to a matcher, which needs it.
-        matcher: what matches the drawn view: None or a kind such as psmnet (the weights' own),
-            sgbm (OpenCV's), or that of other weights, by name or file.
+        matcher: what matches the drawn view: None (the weights' own), sgbm (OpenCV's), or that of
+            other weights, by name or file.
         with_unlike: answer images unlike what the weights know too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
@@ -69,8 +69,8 @@ def weights_method(
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
     if not is_matcher:
         facts["sees"] = "both views" if is_shown else "left view"
-    if not is_own_matcher(matcher):
-        return _matched_by(path, str(matcher), config, facts, is_shown, with_unlike)
+    if matcher is not None:
+        return _matched_by(path, matcher, config, facts, is_shown, with_unlike)
     config = replace(config, device=own_device(config.device))
     net = FakestereoNet.load(path, config=config, answer=answer, with_unlike=with_unlike)
     if is_shown and net.matcher is None:

@@ -80,7 +80,7 @@ class PairNetworks:
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
     matcher: str | None = None
     """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
-    matcher, by name or file. Left out, or psmnet: that of the weights."""
+    matcher, by name or file. Left out: that of the weights."""
     cloud: bool = False
     """write a coloured point cloud, NAME.cloud.ply."""
     check: bool = True
@@ -93,9 +93,7 @@ class PairNetworks:
         Raises:
             InputError: both options are given.
         """
-        from depthpose.depth.stereo import is_own_matcher  # --help must not load torch
-
-        if is_own_matcher(self.matcher):
+        if self.matcher is None:
             return "default" if self.weights is None else self.weights
         if self.weights is not None:
             raise InputError(
@@ -114,7 +112,7 @@ class ImageNetworks:
     """weights with a generator, by name or file ('depthpose weights list')."""
     matcher: str | None = None
     """what matches the synthesised view: sgbm (OpenCV's), or other weights with a matcher, by name
-    or file. Left out, or psmnet: that of the weights."""
+    or file. Left out: that of the weights."""
     answer: Answer | None = None
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
     joined: both. Left out: what the weights say; another matcher matches."""
@@ -128,9 +126,7 @@ class ImageNetworks:
         Raises:
             InputError: which, and what to leave away.
         """
-        from depthpose.depth.stereo import is_own_matcher  # --help must not load torch
-
-        if not is_own_matcher(self.matcher) and self.answer is not None:
+        if self.matcher is not None and self.answer is not None:
             raise InputError(
                 f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
                 "synthesised view; leave one away."

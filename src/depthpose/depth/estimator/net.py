@@ -37,7 +37,7 @@ from depthpose.depth.estimator.rig import (
     set_answer,
     square_camera,
 )
-from depthpose.depth.stereo import CameraMatcher, Matcher, is_own_matcher
+from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser, openvino_generator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
@@ -116,8 +116,8 @@ class FakestereoNet:
             weights: weights of both networks, of the generator alone (pairs then need a
                 ``matcher``), or of a matcher alone (real pairs only). None: ``default``, or
                 ``matcher`` alone. What names weights: :func:`depthpose.core.hub.find_weights`.
-            matcher: a kind such as ``psmnet`` (the one of the weights), ``sgbm`` (OpenCV's),
-                weights with a matcher by file or name, or any matcher of your own.
+            matcher: ``sgbm`` (OpenCV's), weights with a matcher by file or name, or any matcher of
+                your own. None: that of ``weights``.
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
@@ -133,15 +133,14 @@ class FakestereoNet:
             MissingExtraError: OpenVINO is not installed.
         """
         refuse_unknown("engine", engine, ENGINES)
-        if weights is None and is_own_matcher(matcher):
+        if weights is None and matcher is None:
             weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
         if answer is not None:
             set_answer(found, answer)
         own = None
         # Paths first: a Path has a method 'match' too, and would pass for a matcher.
-        is_own = matcher == "sgbm" or is_own_matcher(matcher)
-        if isinstance(matcher, str | Path) and not is_own:
+        if isinstance(matcher, str | Path) and matcher != "sgbm":
             own = read_depth_weights(find_weights(matcher))
         terms = join_terms(*(held.facts for held in (found, own) if held is not None))
         say_terms({"terms": terms})

@@ -20,7 +20,7 @@ from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
 from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
-from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, is_own_matcher, make_matcher
+from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, make_matcher
 from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
 
 __all__ = [
@@ -42,7 +42,6 @@ __all__ = [
     "check_pair",
     "fill_holes",
     "import_psmnet",
-    "is_own_matcher",
     "make_matcher",
     "normalise",
     "psmnet_from_published",

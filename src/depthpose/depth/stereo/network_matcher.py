@@ -109,7 +109,7 @@ class NetworkMatcher(ABC):
         if camera is None or self.network_config.work_focal_px is None:
             return self._match_alike(pairs, self.network_config)
         size = self.work_size(camera)
-        network = self._reaching(self._work_focal_px(camera))
+        network = self._reaching(self.work_focal_px(camera))
         seen = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
         found = self._match_alike(seen, network)
         sizes = [left.shape[1:] for left, _ in pairs]
@@ -119,12 +119,13 @@ class NetworkMatcher(ABC):
         """Rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
-        return focal_size(camera, self._work_focal_px(camera))
+        return focal_size(camera, self.work_focal_px(camera))
 
-    def _work_focal_px(self, camera: Camera) -> float:
+    def work_focal_px(self, camera: Camera) -> float:
         """Focal length at which images of a camera are matched [px]."""
         trained_px = self.network_config.work_focal_px
-        assert trained_px is not None
+        if trained_px is None:
+            return float(camera.K[0, 0])
         if self.config.speed == "quick":
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))

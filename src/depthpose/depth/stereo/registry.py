@@ -49,8 +49,3 @@ def make_matcher(network: nn.Module, config: MatcherConfig) -> Matcher:
     raise InputError(
         f"{type(network).__name__} is no network of a matcher; known are {', '.join(MATCHERS)}"
     )
-
-
-def is_own_matcher(matcher: object) -> bool:
-    """Whether a matcher's name means the one that the weights hold: none, or that of a kind."""
-    return matcher is None or (isinstance(matcher, str) and matcher in MATCHERS)

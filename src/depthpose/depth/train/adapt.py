@@ -25,7 +25,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.labels import LabelConfig, is_consistent, label_pairs, match_both_ways
 from depthpose.depth.losses import heads_loss, photometric_error, smoothness_loss
 from depthpose.depth.metrics import disparity_errors
-from depthpose.depth.stereo import make_matcher, normalise
+from depthpose.depth.stereo import NetworkMatcher, make_matcher, normalise
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train.config import AdaptTraining
 from depthpose.depth.types import StereoInput
@@ -221,6 +221,17 @@ def split_pairs(
             "a calibration; two at least are needed, one to train on and one to measure by"
         )
     return dataset, usable[:: max(min(kept_back, len(usable)), 2)]
+
+
+def fine_focal_px(config: AdaptTraining, network: nn.Module) -> float:
+    """Give the focal length at which the first pair is matched at the fine speed [px]."""
+    folder, split = config.pairs.folders[0], config.pairs.split
+    dataset, back = split_pairs(folder, split, config.kept_back, config.pairs.exclude)
+    camera = dataset.read_input(back[0]).camera
+    assert camera is not None, "pairs with a calibration"
+    matcher = make_matcher(network, MatcherConfig())
+    assert isinstance(matcher, NetworkMatcher)
+    return matcher.work_focal_px(camera)
 
 
 def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:

@@ -29,6 +29,7 @@ from depthpose.depth.train.adapt import (
     AdaptTask,
     Guard,
     adapted_text,
+    fine_focal_px,
     label_folders,
     refuse_worse,
 )
@@ -54,8 +55,6 @@ _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_e
 """Settings of the loop that change no weight: a resumed run may have others."""
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
 """Settings that may name weights."""
-_LARGER = 1.5
-"""Times the focal length of the weights at which a matcher is adapted: that of fine matches."""
 _MEASURED = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
@@ -157,9 +156,8 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     if not config.pairs.folders:
         raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
     matcher = read_network(config.start)
-    focal_px = matcher.config.work_focal_px
-    if config.pairs.focal_px is None and focal_px is not None:
-        pairs = replace(config.pairs, focal_px=_LARGER * focal_px)
+    if config.pairs.focal_px is None:
+        pairs = replace(config.pairs, focal_px=fine_focal_px(config, matcher))
         config = replace(config, pairs=pairs)
     labelled, kept = label_folders(config, run.folder / "labels")
     pairs = _pairs(labelled, config.loop, needs_truth=True)
