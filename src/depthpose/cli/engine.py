@@ -6,9 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
@@ -18,7 +16,6 @@ if TYPE_CHECKING:  # --help imports this module and must answer at once
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Where the work is done: in this process, or by Ray."""
 
@@ -71,9 +68,6 @@ class EngineOptions:
             worker_cpus=self.worker_cpus,
             worker_gpus=self.worker_gpus,
         )
-
-
-Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 @dataclass(frozen=True, kw_only=True)

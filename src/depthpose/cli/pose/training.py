@@ -1,15 +1,14 @@
 """``depthpose pose train`` and ``pose calibrate``."""
 
 import dataclasses
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from depthpose.cli.help import group
-from depthpose.cli.options import Training, TrainingOptions, changed
+from depthpose.cli.options import TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 
@@ -24,7 +23,6 @@ _NOTHING = "nothing"
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class LearntOptions:
     """What is learnt, and from what."""
 
@@ -67,15 +65,12 @@ class LearntOptions:
         return changed(taken, with_found_symmetries=found)
 
 
-Learnt = Annotated[LearntOptions, tyro.conf.OmitArgPrefixes]
-
-
 def train(
     out: Path,
     config: Path | None = None,
-    learnt: Learnt = LearntOptions(),
+    learnt: LearntOptions = LearntOptions(),
     workers: int | None = None,
-    training: Training = TrainingOptions(),  # noqa: B008  frozen
+    training: TrainingOptions = TrainingOptions(),
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
@@ -116,7 +111,6 @@ def train(
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class CalibrationOptions:
     """How the refusal is chosen."""
 
@@ -148,11 +142,10 @@ class CalibrationOptions:
         return dataclasses.replace(chosen, calibration=limits)
 
 
-Calibration = Annotated[CalibrationOptions, tyro.conf.OmitArgPrefixes]
-
-
 def calibrate(
-    weights: tyro.conf.Positional[str], out: Path, calibration: Calibration = CalibrationOptions()
+    weights: tyro.conf.Positional[str],
+    out: Path,
+    calibration: CalibrationOptions = CalibrationOptions(),
 ) -> int:
     """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
 
