@@ -225,9 +225,9 @@ def measure_shards(
         InputError: a prediction is missing or damaged, or no frame has truth.
     """
     items = result_items(predictions)
-    made = read_job_settings(predictions)
+    before = read_job_settings(predictions)
     settings = {
-        "predictions": made, "data": truth.data, "split": truth.split,
+        "predictions": before, "data": truth.data, "split": truth.split,
         "protocol": truth.protocol, "caps_m": list(truth.caps_m),
     }  # fmt: skip
     home = str(out / "measured" / stem(predictions.rstrip("/")))
@@ -241,7 +241,7 @@ def measure_shards(
                     dataset, index, Path(nothing), truth.protocol, truth.caps_m
                 )
     name = stem(predictions.rstrip("/"))
-    return signed(summarise(dataset, truth.protocol, found), name, made)
+    return signed(summarise(dataset, truth.protocol, found), name, before)
 
 
 def _gather(home: str, every: Sequence[Done], names: set[str]) -> dict[str, list[Measured] | str]:

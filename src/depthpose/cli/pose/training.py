@@ -32,7 +32,7 @@ class LearntOptions:
     """of the numbers in the files."""
     symmetries: Literal["none", "found"] | None = None
     """found looks whether the part looks alike from several sides, and counts these poses as one;
-    without, you are told of what is found."""
+    without, what is found is printed."""
     data: str | None = None
     """folder of a data set; it takes the place of the config's, for models and frames."""
     what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
@@ -74,11 +74,11 @@ def train(
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
-    Views of the object are made while it trains: no photograph is needed. At the end the refusal
-    is calibrated and the whole is measured on held-out views; OUT holds the weights with
-    the model in them, their card, and all that led there. What stopped a training is made good by
-    --resume; --finish, or Ctrl-C twice, makes do with the steps so far. Without a terminal a line
-    is printed each minute.
+    Views of the object are rendered while it trains: no photograph is needed. At the end the
+    refusal is calibrated and the whole is measured on held-out views; OUT holds the weights with
+    the model in them, their card, and all that led there. A training that stopped goes on with
+    --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
+    line is printed each minute.
 
         depthpose pose train --cad part.stl --unit mm --out my_part
         depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
@@ -86,7 +86,7 @@ def train(
     Args:
         out: the run folder.
         config: YAML with what differs from the defaults.
-        workers: processes that make views beside the one that trains.
+        workers: processes that render views beside the one that trains.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -147,7 +147,7 @@ def calibrate(
     out: Path,
     calibration: CalibrationOptions = CalibrationOptions(),
 ) -> int:
-    """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
+    """Choose anew how much risk of a wrong pose is too much, on synthetic views of the objects.
 
     And of other things in their place: other objects, copies of another size, mirrored ones, boxes,
     balls, hands. A larger share of wrong answers buys more answers. The network stays as it is;
