@@ -132,14 +132,8 @@ class CalibrationOptions:
         from depthpose.pose.train import PoseTraining
 
         chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
-        limits = changed(
-            chosen.calibration,
-            max_wrong_share=self.max_wrong_share,
-            number=self.number,
-            negatives=self.negatives,
-            max_negative_share=self.max_negative_share,
-        )
-        return dataclasses.replace(chosen, calibration=limits)
+        limits = {name: value for name, value in vars(self).items() if name != "config"}
+        return dataclasses.replace(chosen, calibration=changed(chosen.calibration, **limits))
 
 
 def calibrate(

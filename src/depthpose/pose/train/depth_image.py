@@ -188,15 +188,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     crops = TrainingCrops(models, config, config.loop.seed)
     task = DepthImageTask(network, models, config)
-    seconds = train(
-        task,
-        crops,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
+    seconds = train(task, crops, config.loop, run.folder, **run.words)
     path = run.folder / "depth-image.safetensors"
     if find_shard().rank:
         return path

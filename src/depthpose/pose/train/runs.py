@@ -60,15 +60,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
-    seconds = train(
-        task,
-        clouds,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
+    seconds = train(task, clouds, config.loop, run.folder, **run.words)
     if run.tell is not None:
         run.tell("trained; now the refusal is calibrated and measured on synthetic views: minutes")
     if isinstance(network, PointNet):
