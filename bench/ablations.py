@@ -161,7 +161,7 @@ class Bench:
             assert depthpose([*real, *rule, "--out", str(folder / "real")]) == 0
             row: dict[str, Any] = json.loads((folder / "real" / "rows.json").read_text())[0]
             kept = ("abs_rel", "rmse", "d1", "right_l1", "right_psnr_db")
-            row = {name: row[name] for name in kept if name in row} | made_quality(weights)
+            row = {name: row[name] for name in kept if name in row} | synthetic_quality(weights)
             write_json(folder / "row.json", row)
         found = json.loads((folder / "row.json").read_text())
         facts = {"discriminator": arm.discriminator, "made": arm.made, "real": arm.real}
@@ -185,7 +185,7 @@ class Bench:
         return [*rows, self.measure(arm, "fine-tuned", self.tuned(arm, generator))]
 
 
-def made_quality(weights: Path) -> dict[str, float]:
+def synthetic_quality(weights: Path) -> dict[str, float]:
     """Errors of the generated view and of depth, in visible and in occluded regions."""
     net = FakestereoNet.load(weights, with_unlike=True)
     config = StreetsConfig(seed=9, scale=0.25)
@@ -200,7 +200,7 @@ def draw_growth(path: Path, rows: list[dict[str, Any]]) -> None:
     for row in of:
         if row["real"] is None:
             made[row["stage"]].append((row["made"], row["abs_rel"]))
-        if row["made"] == Arm.made:  # without real pairs: the made ones alone
+        if row["made"] == Arm.made:  # without real pairs: the synthetic ones alone
             real[row["stage"]].append((row["real"] or 0, row["abs_rel"]))
     draw_curves(
         path, {"synthetic pairs": made, "real pairs": real}, "AbsRel, 25 real pairs", log=True

@@ -55,11 +55,11 @@ def rows_of(number: int) -> Iterator[Row]:
     """Register every view of a random part, and of what is not it."""
     part, shown = seen_in_place(number)
     registration = Registration([part], refusal=OPEN)
-    made = ObjectsConfig(
+    config = ObjectsConfig(
         number=len(shown), seed=SEED + number, views=None, resolution=(1.0, 1.0),
         occluded_share=0.8, occlusion=(0.0, 0.6),
     )  # fmt: skip
-    views = Objects([model for _, model in shown], made)
+    views = Objects([model for _, model in shown], config)
     for k, (kind, _) in enumerate(shown):
         sample = views[k]
         found = registration.estimate_many([sample.input])[0]

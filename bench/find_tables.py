@@ -51,7 +51,7 @@ class Frame(NamedTuple):
     shown: list[Shown]
 
 
-def made_tables(models: Sequence[ObjectModel], number: int) -> Iterator[Frame]:
+def synthetic_tables(models: Sequence[ObjectModel], number: int) -> Iterator[Frame]:
     """Generate tables of another seed than any training."""
     config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0))
     by_number = {model.number: model for model in models}
@@ -118,7 +118,7 @@ def main() -> None:
     for name in words.weights:
         net = GeoPoseNet.load(find_weights(name))
         models = net.weights.models
-        frames = real_frames(words.real, models) if words.real else made_tables(
+        frames = real_frames(words.real, models) if words.real else synthetic_tables(
             models, words.tables)  # fmt: skip
         rows = []
         for frame in frames:

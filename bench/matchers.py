@@ -48,7 +48,7 @@ def make_nets(names: list[str]) -> dict[str, FakestereoNet]:
     return {SGBM: FakestereoNet.load(matcher="sgbm"), **ours}
 
 
-def told(sample: StereoSample) -> FakestereoNet:
+def sgbm_for(sample: StereoSample) -> FakestereoNet:
     """Build SGBM with the range of a pair."""
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
@@ -99,7 +99,7 @@ def main() -> None:
     nets = make_nets(given.weights)
     found: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
     for number, sample in enumerate(samples(given.data, given.number)):
-        nets[SGBM] = told(sample)
+        nets[SGBM] = sgbm_for(sample)
         if number == 0:
             for net in nets.values():
                 net.estimate_pair(sample.input)  # the first match makes what later ones reuse

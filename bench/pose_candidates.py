@@ -55,11 +55,11 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
     even = dict.fromkeys(RefusalConfig().candidate_slopes, 0.0)
     opened = RefusalConfig(max_risk=1.0, candidate_slopes=even)
     net = GeoPoseNet(dataclasses.replace(weights, refusal=opened))
-    made = ObjectsConfig(
+    config = ObjectsConfig(
         number=number * len(weights.models), seed=SEED, views=None, resolution=(1.0, 1.0),
         occluded_share=0.7, occlusion=(0.0, 0.5),
     )  # fmt: skip
-    views = Objects(weights.models, made, weights.cloud)
+    views = Objects(weights.models, config, weights.cloud)
     copies = [find_copies(model, up_to_symmetry=False) for model in weights.models]
     found: list[Case | None] = []
     for k in range(len(views)):

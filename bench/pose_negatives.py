@@ -4,7 +4,7 @@
 
 Eight kinds of negatives, ``--number`` of each: another object of the weights (or one of our parts,
 if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.2 (``--number`` each), mirrored ones,
-blobs, plates, boxes and cylinders, balls, and bunches of capsules like a hand. The mirror image of
+blobs, plates, boxes and cylinders, balls, and hands of capsules. The mirror image of
 an object that it deviates from by 3 % of the diameter at most is no negative: "mirror image alike".
 Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
 themselves, four times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of

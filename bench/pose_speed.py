@@ -43,7 +43,7 @@ FULL = ResUNetConfig(classes=1, norm="none")
 NO_RISK = RefusalConfig(max_risk=1.0, slopes=dict.fromkeys(SIGNALS, 0.0), min_hold=0.0)
 
 
-class Told(GeoPoseNet):
+class NoisyTruth(GeoPoseNet):
     """Calls the network, and replaces its directions by true ones with noise."""
 
     truth: Rigid
@@ -68,7 +68,7 @@ def cloud_of(voxels: int) -> tuple[Tensor, ObjectModel]:
     return points_m, make_model(points_m, torch.zeros(0, 3, dtype=torch.long), name="bumpy")
 
 
-def estimator(model: ObjectModel, width: str, voting: VotingConfig) -> Told:
+def estimator(model: ObjectModel, width: str, voting: VotingConfig) -> NoisyTruth:
     """Make an estimator that answers for this object."""
     torch.manual_seed(0)
     weights = PoseWeights(
@@ -78,7 +78,7 @@ def estimator(model: ObjectModel, width: str, voting: VotingConfig) -> Told:
         refusal=NO_RISK,
         facts={},
     )
-    net = Told(weights, EstimateConfig(voting=voting))
+    net = NoisyTruth(weights, EstimateConfig(voting=voting))
     net.truth = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 3.0]))
     return net
 

@@ -54,8 +54,8 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=24, help="streets")
     parser.add_argument("--scale", type=float, default=0.5, help="size as a share of KITTI's")
     options = parser.parse_args()
-    made = Streets(StreetsConfig(seed=SEED, scale=options.scale))
-    streets = [made[k] for k in tqdm(range(options.number), "streets")]
+    rendered = Streets(StreetsConfig(seed=SEED, scale=options.scale))
+    streets = [rendered[k] for k in tqdm(range(options.number), "streets")]
     rows = [measure(name, sees, streets) for name in options.weights for sees in ("one", "both")]
     print(markdown_table(rows))
 

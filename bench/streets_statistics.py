@@ -94,25 +94,25 @@ def main() -> None:
     frames = [draw_street(config, words.first + index) for index in range(words.number)]
     real_images, real_disparities = read_real(words.number, words.scale)
     real = statistics(real_images, real_disparities, words.scale)
-    made = statistics([f.left for f in frames], [f.disparity_px for f in frames], words.scale)
+    synthetic = statistics([f.left for f in frames], [f.disparity_px for f in frames], words.scale)
     words.out.mkdir(parents=True, exist_ok=True)
     for name in real:
         draw_curves(words.out / f"{name.split(' [')[0].replace(' ', '_')}.png", name,
-                    {"real": real[name], "made": made[name]})  # fmt: skip
+                    {"real": real[name], "made": synthetic[name]})  # fmt: skip
         print(f"{name:24s} real", np.round(real[name][::3], 3))
-        print(f"{'':24s} made", np.round(made[name][::3], 3))
+        print(f"{'':24s} made", np.round(synthetic[name][::3], 3))
     sky = np.mean([float(f.is_sky.float().mean()) for f in frames])
     road = np.mean([float(f.is_road.float().mean()) for f in frames])
     occluded = np.mean([float(f.occluded.float().mean()) for f in frames])
     print(f"synthetic: sky {sky:.3f}, road {road:.3f}, occluded {occluded:.3f} of the pixels")
-    bright = [float(one["brightness by row"].mean()) for one in (real, made)]
+    bright = [float(one["brightness by row"].mean()) for one in (real, synthetic)]
     print(f"mean brightness: real {bright[0]:.3f}, synthetic {bright[1]:.3f}")
     # JSON has no NaN: these are rows without data.
     listed = {
         kind: {
             name: [x if np.isfinite(x) else None for x in map(float, v)] for name, v in one.items()
         }
-        for kind, one in (("real", real), ("made", made))
+        for kind, one in (("real", real), ("made", synthetic))
     }
     write_json(words.out / "statistics.json", listed)
 

@@ -32,11 +32,11 @@ CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 def sources(data: str, view: ViewTraining) -> dict[str, PairsConfig]:
     """Three data sources for the compact generator."""
     pairs = replace(view.pairs, folders=(data,), with_cache=False)
-    made = StreetsConfig(scale=0.52)
+    synthetic = StreetsConfig(scale=0.52)
     return {
         "folder": pairs,
         "folder, in memory": replace(pairs, with_cache=True),
-        "streets on the fly": replace(pairs, folders=(), streets=made),
+        "streets on the fly": replace(pairs, folders=(), streets=synthetic),
     }
 
 
@@ -46,8 +46,8 @@ def data_rate(config: PairsConfig, workers: int, samples: int) -> float:
     if config.with_cache:
         for index in range(len(pairs)):
             pairs.read(index)
-    tickets = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(samples)]
-    loader = iter(DataLoader(pairs, batch_sampler=tickets, num_workers=workers))  # pyright: ignore[reportArgumentType]
+    indices = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(samples)]
+    loader = iter(DataLoader(pairs, batch_sampler=indices, num_workers=workers))  # pyright: ignore[reportArgumentType]
     warm = 2 + 2 * workers
     for _ in itertools.islice(loader, warm):
         pass

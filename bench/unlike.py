@@ -54,8 +54,8 @@ def dgp(folder: Path) -> Iterator[StereoInput]:
     """Read the pictures of scenes in DGP's layout, with their intrinsics."""
     for scene in sorted(folder.glob("scene_*")):
         (calibration,) = scene.glob("calibration/*.json")
-        told = json.loads(calibration.read_text())
-        focal_px = {n: k["fx"] for n, k in zip(told["names"], told["intrinsics"], strict=True)}
+        facts = json.loads(calibration.read_text())
+        focal_px = {n: k["fx"] for n, k in zip(facts["names"], facts["intrinsics"], strict=True)}
         for path in sorted(scene.glob("rgb/*/*.jpg")):
             yield given(path.stem, read_image(path), focal_px[path.parent.name])
 

@@ -26,7 +26,7 @@ KEYPOINTS = 8
 WRONG_SHARE = 0.2
 
 
-def made_votes(points: int, noise: float, seed: int) -> tuple[torch.Tensor, ...]:
+def exact_votes(points: int, noise: float, seed: int) -> tuple[torch.Tensor, ...]:
     """The visible half of a ball of 5 cm, eight keypoints in and about it, noisy directions."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.nn.functional.normalize(torch.randn(points, 3, generator=generator), dim=-1) * 0.05
@@ -55,7 +55,7 @@ def least_seconds(run: Callable[[], object], budget_s: float = 1.5, most: int = 
 
 def measure(points: int, hypotheses: list[int], noise: float) -> list[dict[str, object]]:
     """Measure all ways for one number of points; errors are means over ten clouds."""
-    clouds = [made_votes(points, noise, seed) for seed in range(10)]
+    clouds = [exact_votes(points, noise, seed) for seed in range(10)]
     x, n, _ = clouds[0]
     x_numpy, n_numpy = x.double().numpy(), n.double().numpy()
     ways: list[tuple[str, int, Callable[..., np.ndarray], Callable[[], object]]] = []

@@ -20,8 +20,8 @@ TURNS = ((0.01, -0.012, 0.008), (-0.008, 0.01, -0.012))
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """A raw pair and what made it.
+class DrawnPair:
+    """A raw pair and how it was drawn.
 
     Attributes:
         left: the raw left image.
@@ -36,7 +36,7 @@ class Made:
     turns: tuple[np.ndarray, np.ndarray]
 
 
-def make_raw(seen: StereoInput, *, is_fisheye: bool = False) -> Made:
+def make_raw(seen: StereoInput, *, is_fisheye: bool = False) -> DrawnPair:
     """Draw a rectified pair as two turned lenses see it, in the size of the pair."""
     rig = seen.camera
     assert isinstance(rig, StereoRig)
@@ -57,7 +57,7 @@ def make_raw(seen: StereoInput, *, is_fisheye: bool = False) -> Made:
     )
     size = (rig.width, rig.height)
     pair = RawPair(left=cameras[0], right=cameras[1], right_from_left=motion, size=size)
-    return Made(left, right, pair, (turns[0], turns[1]))
+    return DrawnPair(left, right, pair, (turns[0], turns[1]))
 
 
 def _bend(image: torch.Tensor, K: np.ndarray, camera: RawCamera, turn: np.ndarray) -> torch.Tensor:
@@ -113,12 +113,12 @@ def write_kalibr(path: Path, pair: RawPair) -> Path:
     return path
 
 
-def write_ros(folder: Path, made: Made, baseline_m: float) -> Path:
+def write_ros(folder: Path, drawn: DrawnPair, baseline_m: float) -> Path:
     """Write left.yaml and right.yaml as ROS's calibrator does."""
     folder.mkdir()
-    assert made.pair.size is not None
-    width, height = made.pair.size
-    sides = zip(("left", "right"), (made.pair.left, made.pair.right), made.turns, strict=True)
+    assert drawn.pair.size is not None
+    width, height = drawn.pair.size
+    sides = zip(("left", "right"), (drawn.pair.left, drawn.pair.right), drawn.turns, strict=True)
     for side, camera, turn in sides:
         P = np.hstack([camera.K.numpy(), np.zeros((3, 1))])
         P[0, 3] = -P[0, 0] * baseline_m if side == "right" else 0

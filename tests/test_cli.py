@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.made_street import make_street
+from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
 from depthpose.cli.help import refuse_missing
@@ -20,7 +20,7 @@ NAMES = [name.split() for name in COMMANDS]
 
 @pytest.fixture(scope="module")
 def pair_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pairs of the made street, 621 x 188, with their rig."""
+    """Two pairs of the synthetic street, 621 x 188, with their rig."""
     folder = tmp_path_factory.mktemp("pairs")
     pair = make_street(0.5).input
     assert pair.right is not None

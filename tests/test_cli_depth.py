@@ -13,9 +13,9 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from tests.depth.made_selection import sure_of
-from tests.made_street import make_street
+from tests.depth.constant_selection import sure_of
 from tests.pages.read_page import read_page
+from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.training import Lines
@@ -534,7 +534,7 @@ def test_kills_at_any_moment_change_no_weight_of_a_stage(
         ("loop: {steps: many}", "steps"),
     ],
 )
-def test_a_misspelt_config_names_its_nearest_knob(
+def test_a_misspelt_config_names_its_nearest_setting(
     pairs: Path, tmp_path: Path, text: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "c.yaml").write_text(text)

@@ -3,7 +3,7 @@
 from importlib import metadata
 
 import pytest
-from tests.depth.made_selection import sure_of
+from tests.depth.constant_selection import sure_of
 
 from depthpose import __version__
 from depthpose.cli import main
@@ -13,7 +13,7 @@ from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.estimator import GeoPoseNet
 
 
-def test_doctor_names_what_is_here_and_tries_each_room(
+def test_doctor_names_what_is_here_and_tries_depth_and_pose(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     version = metadata.version
@@ -50,7 +50,7 @@ def test_weights_without_a_matcher_are_tried_on_one_image(
         assert "one image got a depth for 0% of its pixels" in said.err
 
 
-def test_a_room_that_fails_is_named_and_the_other_is_tried(
+def test_the_check_that_fails_is_named_and_the_other_is_tried(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(name: str) -> GeoPoseNet:

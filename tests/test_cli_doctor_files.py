@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 from tests.core.test_camera_rectified import pair
-from tests.pose.made_object import K, bracket, cloud_of, pose_at, view_of
+from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, StereoRig, write_camera

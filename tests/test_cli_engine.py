@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 from tests.core.engine.doubles import InProcessEngine, unpacked
-from tests.pose.made_frames import draw_frame, made_models, made_pose, make_dataset
-from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_frames import draw_frame, frame_models, make_dataset, pose_in_frame
+from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 from tests.test_cli_pose_predict import oracle_weights
 
 from depthpose.cli import engine, main
@@ -268,8 +268,10 @@ def test_a_data_set_of_poses_gives_the_files_of_the_plain_command(
     tmp_path: Path, double: InProcessEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset = make_dataset(tmp_path / "made", frames=2)
-    truths = [made_pose(0.24 * k - 0.12, 10 * number + k) for number in range(2) for k in range(2)]
-    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*made_models()), truths))
+    truths = [
+        pose_in_frame(0.24 * k - 0.12, 10 * number + k) for number in range(2) for k in range(2)
+    ]
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*frame_models()), truths))
     (dataset.instances[3].depth.parent / "000001.png").write_bytes(b"damaged")
     words = ["pose", "predict", "--bop", str(dataset.folder), "--weights", str(path), "--out"]
     assert main([*words, str(tmp_path / "plain"), "--batch", "1"]) == 1
@@ -290,7 +292,7 @@ def test_a_data_set_of_poses_gives_the_files_of_the_plain_command(
     assert (tmp_path / "big" / picture).read_bytes() == (tmp_path / "plain" / picture).read_bytes()
     # What was unreadable is tried again, and nothing else.
     before = (tmp_path / "big" / "shards" / "000000.json").stat().st_mtime_ns
-    write_bop_scene(dataset.folder, "test", 1, [draw_frame(i, made_models()) for i in range(2)])
+    write_bop_scene(dataset.folder, "test", 1, [draw_frame(i, frame_models()) for i in range(2)])
     assert main(big) == 0
     assert [row["status"] for row in without_seconds(tmp_path / "big")] == ["ok"] * 4
     assert (tmp_path / "big" / "shards" / "000000.json").stat().st_mtime_ns != before

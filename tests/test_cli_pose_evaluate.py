@@ -8,8 +8,8 @@ from typing import ClassVar
 import pytest
 import torch
 from tests.pages.read_page import read_page
-from tests.pose.made_frames import made_models, make_dataset, moved, predictions_of
-from tests.pose.made_object import tiny_weights
+from tests.pose.synthetic_frames import frame_models, make_dataset, moved, predictions_of
+from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
@@ -22,14 +22,14 @@ from depthpose.pose.weights import write_pose_weights
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*made_models()))
+    write_pose_weights(path, tiny_weights(*frame_models()))
     return path
 
 
@@ -38,13 +38,13 @@ def rows_of(out: Path) -> list[dict[str, object]]:
 
 
 def test_a_csv_is_measured(
-    made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    synthetic: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "theirs_made-test.csv"
-    off = predictions_of(made, lambda i: moved(i, [0.0] * 5 + [0.01]) if i.index else None)
+    off = predictions_of(synthetic, lambda i: moved(i, [0.0] * 5 + [0.01]) if i.index else None)
     write_bop_results(file, off)
     out = tmp_path / "out"
-    words = ["--bop", str(made.folder), "--csv", str(file), "--out", str(out)]
+    words = ["--bop", str(synthetic.folder), "--csv", str(file), "--out", str(out)]
     assert main(["pose", "evaluate", *words]) == 0
     bracket, bottle, mean, pooled = rows_of(out)
     assert (bracket["refused"], bracket["success"]) == (1.0, 0.0)
@@ -52,7 +52,7 @@ def test_a_csv_is_measured(
     assert mean["success"] == pooled["success"] == 0.5
     assert mean["method"] == "theirs_made-test"
     assert mean["weights_sha256"] == file_sha256(file)[:12]
-    assert mean["frames_sha256"] == frames_hash(made.instances)[:12]
+    assert mean["frames_sha256"] == frames_hash(synthetic.instances)[:12]
     assert mean["diameters"] == "bop"
     assert "| theirs_made-test |" in (out / "table.md").read_text()
     with (out / "instances.csv").open() as lines:
@@ -68,19 +68,22 @@ def test_a_csv_is_measured(
 
 
 def test_the_page_shows_best_median_and_worst_beside_the_truth(
-    made: BopDataset, tmp_path: Path
+    synthetic: BopDataset, tmp_path: Path
 ) -> None:
-    off_m = {name: 0.004 * (k + 1) for k, name in enumerate(i.name for i in made.instances)}
-    refused = made.instances[2].name
+    off_m = {name: 0.004 * (k + 1) for k, name in enumerate(i.name for i in synthetic.instances)}
+    refused = synthetic.instances[2].name
     found = predictions_of(
-        made, lambda i: None if i.name == refused else moved(i, [0.0] * 5 + [off_m[i.name]])
+        synthetic, lambda i: None if i.name == refused else moved(i, [0.0] * 5 + [off_m[i.name]])
     )
     write_predictions(tmp_path / "own", found)
-    words = ["--bop", str(made.folder), "--predictions", str(tmp_path / "own"), "--no-vsd"]
+    words = ["--bop", str(synthetic.folder), "--predictions", str(tmp_path / "own"), "--no-vsd"]
     assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
     page = read_page(tmp_path / "out/report.html")
     shown = [text for text in page.texts["h2"] if text.startswith("own: ")]
-    names = {instance.name: made.objects[instance.object_id].name for instance in made.instances}
+    names = {
+        instance.name: synthetic.objects[instance.object_id].name
+        for instance in synthetic.instances
+    }
     rows = json.loads((tmp_path / "out/instances.json").read_text())
     size = {row["instance"]: (row["error_m"] or 9.0) / row["diameter_m"] for row in rows}
     ranked = sorted((i for i in names if i != refused), key=size.__getitem__, reverse=True)
@@ -100,10 +103,10 @@ def test_the_page_shows_best_median_and_worst_beside_the_truth(
 
 
 def test_weights_predict_once_with_true_and_predicted_masks(
-    made: BopDataset, weights: Path, tmp_path: Path
+    synthetic: BopDataset, weights: Path, tmp_path: Path
 ) -> None:
     # Of the second image nothing is detected; of the first both, and something of another set.
-    seen = [i for i in made.instances if i.image_id == 0]
+    seen = [i for i in synthetic.instances if i.image_id == 0]
     masks = [read_mask(i.mask) for i in seen if i.mask is not None]
     found = [
         Detection(scene_id=i.scene_id, image_id=i.image_id, object_id=i.object_id, score=0.9,
@@ -114,7 +117,7 @@ def test_weights_predict_once_with_true_and_predicted_masks(
                       segmentation=encode_rle(masks[0]))  # fmt: skip
     write_detections(tmp_path / "found.json", [*found, stray])
     out = tmp_path / "out"
-    words = ["--bop", str(made.folder), "--weights", str(weights), "--out", str(out)]
+    words = ["--bop", str(synthetic.folder), "--weights", str(weights), "--out", str(out)]
     words += ["--masks", "truth", str(tmp_path / "found.json"), "--no-vsd"]
     assert main(["pose", "evaluate", *words]) == 0
     homes = [out / "predictions" / f"tiny_{masks}" for masks in ("truth", "found")]
@@ -157,29 +160,29 @@ class KnowsNoPose:
 
 
 def test_registration_is_a_row_beside_weights(
-    made: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fpfh, "FpfhRegistration", KnowsNoPose)
-    words = ["--bop", str(made.folder), "--weights", str(weights), "open3d", "--no-vsd"]
+    words = ["--bop", str(synthetic.folder), "--weights", str(weights), "open3d", "--no-vsd"]
     assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
     own = [row for row in rows_of(tmp_path / "out") if row["method"] == "open3d"]
     assert [row["object"] for row in own] == ["bracket", "bottle", "mean", "all"]
     assert all(row["refused"] == 1 and not row["weights"] for row in own)
-    for cloud, instance in zip(KnowsNoPose.clouds, made.instances, strict=True):
-        truth = made.view(instance).truth.camera_from_model
-        diameter_m = made.objects[instance.object_id].diameter_m
+    for cloud, instance in zip(KnowsNoPose.clouds, synthetic.instances, strict=True):
+        truth = synthetic.view(instance).truth.camera_from_model
+        diameter_m = synthetic.objects[instance.object_id].diameter_m
         assert len(cloud.points_m) > 100
         assert float((cloud.points_m - truth.t_m).norm(dim=1).max()) < diameter_m
 
 
 def test_registration_wants_a_data_set_and_open3d(
-    made: BopDataset,
+    synthetic: BopDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    words = ["--bop", str(made.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
+    words = ["--bop", str(synthetic.folder), "--weights", "open3d", "--out", str(tmp_path / "out")]
     assert main(["pose", "evaluate", *words]) == 2
     assert "pip install -e '.[open3d]'" in capsys.readouterr().err
     assert main(["pose", "predict", *words]) == 2
@@ -187,11 +190,11 @@ def test_registration_wants_a_data_set_and_open3d(
 
 
 def test_what_cannot_be_measured_is_refused(
-    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    here = ["--bop", str(made.folder), "--out", str(tmp_path / "out")]
+    here = ["--bop", str(synthetic.folder), "--out", str(tmp_path / "out")]
     few = tmp_path / "few.safetensors"
-    write_pose_weights(few, tiny_weights(made_models()[0]))
+    write_pose_weights(few, tiny_weights(frame_models()[0]))
     nobody = tmp_path / "nobody.json"
     nobody.write_text("[]")
     for words, said in (
@@ -208,14 +211,14 @@ def test_what_cannot_be_measured_is_refused(
     )
 
 
-def test_weights_and_predictions_of_one_name_are_told_apart(
-    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_weights_and_predictions_of_one_name_are_distinguished(
+    synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = [tmp_path / folder / "pose.safetensors" for folder in ("x", "y")]
     for file in files:
         file.parent.mkdir()
         file.write_bytes(weights.read_bytes())
-    words = ["pose", "evaluate", "--bop", str(made.folder), "--no-vsd", "--out"]
+    words = ["pose", "evaluate", "--bop", str(synthetic.folder), "--no-vsd", "--out"]
     out = tmp_path / "out"
     assert main([*words, str(out), "--weights", *map(str, files)]) == 0
     assert [row["method"] for row in rows_of(out)[::4]] == ["x-pose", "y-pose"]
@@ -236,11 +239,19 @@ def test_weights_and_predictions_of_one_name_are_told_apart(
 
 
 def test_predictions_whose_record_names_another_data_set_are_refused(
-    made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    synthetic: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     home = tmp_path / "theirs"
-    write_predictions(home, predictions_of(made, lambda i: i.camera_from_model))
-    words = ["pose", "evaluate", "--bop", str(made.folder), "--no-vsd", "--predictions", str(home)]
+    write_predictions(home, predictions_of(synthetic, lambda i: i.camera_from_model))
+    words = [
+        "pose",
+        "evaluate",
+        "--bop",
+        str(synthetic.folder),
+        "--no-vsd",
+        "--predictions",
+        str(home),
+    ]
     words += ["--out", str(tmp_path / "out")]
     for settings, said in (
         ({"dataset": "made", "split": "train"}, "the split 'train', but 'test' is measured"),

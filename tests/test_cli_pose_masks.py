@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.made_frames import HEIGHT, WIDTH, made_models, make_dataset
-from tests.pose.made_object import tiny_weights
+from tests.pose.synthetic_frames import HEIGHT, WIDTH, frame_models, make_dataset
+from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import write_image
@@ -35,7 +35,7 @@ PICTURE = torch.stack([LEFT, ~LEFT, LEFT & False]).float()
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     data = make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
     for instance in data.instances:
         assert instance.rgb is not None
@@ -46,7 +46,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*made_models()))
+    write_pose_weights(path, tiny_weights(*frame_models()))
     return path
 
 
@@ -71,14 +71,14 @@ def halves(
     return path
 
 
-def found_by_truth(made: BopDataset, path: Path) -> Path:
-    masks = [read_mask(i.mask) for i in made.instances if i.mask is not None]
+def found_by_truth(synthetic: BopDataset, path: Path) -> Path:
+    masks = [read_mask(i.mask) for i in synthetic.instances if i.mask is not None]
     write_detections(
         path,
         [
             Detection(scene_id=i.scene_id, image_id=i.image_id, object_id=i.object_id, score=0.9,
                       segmentation=encode_rle(mask), seconds=0.5)
-            for i, mask in zip(made.instances, masks, strict=True)
+            for i, mask in zip(synthetic.instances, masks, strict=True)
         ],
     )  # fmt: skip
     return path
@@ -90,14 +90,14 @@ def statuses(out: Path) -> dict[str, str]:
 
 
 def test_predict_takes_a_file_of_detections(
-    made: BopDataset, weights: Path, tmp_path: Path
+    synthetic: BopDataset, weights: Path, tmp_path: Path
 ) -> None:
-    found = found_by_truth(made, tmp_path / "found.json")
-    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights)]
+    found = found_by_truth(synthetic, tmp_path / "found.json")
+    words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(weights)]
     assert main([*words, "--out", str(tmp_path / "truth")]) == 0
     assert main([*words, "--out", str(tmp_path / "out"), "--masks", str(found)]) == 0
     by_truth, by_file = (read_predictions(tmp_path / name) for name in ("truth", "out"))
-    assert len(by_file) == len(made.instances)
+    assert len(by_file) == len(synthetic.instances)
     for one, other in zip(by_truth, by_file, strict=True):
         # The same pixels, the same pose or refusal; the time of the segmentation is counted.
         assert (one.place, one.estimate.status) == (other.place, other.estimate.status)
@@ -105,9 +105,11 @@ def test_predict_takes_a_file_of_detections(
         assert other.estimate.seconds["segmentation"] == 0.25
 
 
-def test_predict_segments_by_weights_once(made: BopDataset, weights: Path, tmp_path: Path) -> None:
+def test_predict_segments_by_weights_once(
+    synthetic: BopDataset, weights: Path, tmp_path: Path
+) -> None:
     masks, out = halves(tmp_path / "halves.safetensors"), tmp_path / "out"
-    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights)]
+    words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(weights)]
     words += ["--masks", str(masks), "--out", str(out)]
     assert main(words) == 0
     found = read_detections(out / "detections" / "halves.json")
@@ -124,10 +126,18 @@ def test_predict_segments_by_weights_once(made: BopDataset, weights: Path, tmp_p
 
 
 def test_objects_asked_for_later_are_found_too(
-    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     masks, out = halves(tmp_path / "halves.safetensors"), tmp_path / "out"
-    words = ["pose", "evaluate", "--bop", str(made.folder), "--weights", str(weights), "--no-vsd"]
+    words = [
+        "pose",
+        "evaluate",
+        "--bop",
+        str(synthetic.folder),
+        "--weights",
+        str(weights),
+        "--no-vsd",
+    ]
     words += ["--masks", str(masks), "--out", str(out)]
     assert main([*words, "--objects", "7"]) == 0
     assert len(statuses(out)) == 2
@@ -148,9 +158,17 @@ def test_objects_asked_for_later_are_found_too(
 
 
 def test_objects_are_matched_by_name_else_by_number(
-    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(weights), "--masks"]
+    words = [
+        "pose",
+        "predict",
+        "--bop",
+        str(synthetic.folder),
+        "--weights",
+        str(weights),
+        "--masks",
+    ]
     for names, numbers, objects in (
         (("obj_000007", "obj_000010"), (7, 10), {7, 10}),
         (("bracket", "bottle"), (1, 2), {7, 10}),
@@ -169,14 +187,22 @@ def test_objects_are_matched_by_name_else_by_number(
     assert "shows objects [7, 10]; give weights of its objects" in said
 
 
-def test_masks_of_one_name_are_told_apart_by_their_folders(
-    made: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_masks_of_one_name_are_distinguished_by_their_folders(
+    synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folder in ("x", "y"):
         (tmp_path / folder).mkdir()
-        found_by_truth(made, tmp_path / folder / "found.json")
+        found_by_truth(synthetic, tmp_path / folder / "found.json")
     files = [str(tmp_path / folder / "found.json") for folder in ("x", "y")]
-    words = ["pose", "evaluate", "--bop", str(made.folder), "--weights", str(weights), "--no-vsd"]
+    words = [
+        "pose",
+        "evaluate",
+        "--bop",
+        str(synthetic.folder),
+        "--weights",
+        str(weights),
+        "--no-vsd",
+    ]
     words += ["--out", str(tmp_path / "out"), "--masks"]
     assert main([*words, *files]) == 0
     rows = json.loads((tmp_path / "out" / "rows.json").read_text())

@@ -12,8 +12,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tests.pages.read_page import read_page
-from tests.pose.made_frames import make_dataset
-from tests.pose.made_object import (
+from tests.pose.synthetic_frames import make_dataset
+from tests.pose.synthetic_objects import (
     K,
     Oracle,
     bottle,
@@ -48,7 +48,7 @@ TRUTH = pose_at(seed=1)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
 
 
@@ -190,7 +190,7 @@ def test_a_file_of_somebody_else_is_not_written_over(
 
 
 def test_a_folder_of_inputs_takes_no_results(
-    weights: Path, made: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    weights: Path, synthetic: BopDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = frames(tmp_path)
     end = ["--weights", str(weights), "--out", str(tmp_path / "depth")]
@@ -296,32 +296,32 @@ def test_an_unreadable_image_stops_no_other_and_is_read_when_mended(
 
 
 def test_a_data_set_gives_the_csv_and_pictures(
-    made: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    synthetic: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    truths = [instance.camera_from_model for instance in made.instances]
-    models = [made.objects[number] for number in sorted(made.objects)]
+    truths = [instance.camera_from_model for instance in synthetic.instances]
+    models = [synthetic.objects[number] for number in sorted(synthetic.objects)]
     path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*models), truths))
     out = tmp_path / "out"
-    words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(out)]
+    words = ["--bop", str(synthetic.folder), "--weights", str(path), "--out", str(out)]
     assert main(["pose", "predict", *words]) == 0
     answered = [p for p in read_predictions(out) if p.estimate.is_ok]
-    assert len(read_predictions(out)) == len(made.instances)
-    results = read_results(out / f"depthpose_{made.folder.name}-test.csv")
+    assert len(read_predictions(out)) == len(synthetic.instances)
+    results = read_results(out / f"depthpose_{synthetic.folder.name}-test.csv")
     assert len(results) == len(answered) > 0
     images = {(p.place.scene_id, p.place.image_id) for p in answered if p.place is not None}
     assert {f"{s:06d}_{i:06d}.pose.png" for s, i in images} == {p.name for p in out.glob("*.png")}
     page = read_page(out / "report.html")
-    assert page.texts["h2"][1:] == [instance.name for instance in made.instances]
+    assert page.texts["h2"][1:] == [instance.name for instance in synthetic.instances]
     assert any(picture["alt"].startswith("picture; ") for picture in page.pictures)
 
 
 def test_two_processes_share_the_work(
-    made: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    synthetic: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    models = [made.objects[number] for number in sorted(made.objects)]
-    truths = [instance.camera_from_model for instance in made.instances]
+    models = [synthetic.objects[number] for number in sorted(synthetic.objects)]
+    truths = [instance.camera_from_model for instance in synthetic.instances]
     path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*models), truths))
-    words = ["pose", "predict", "--bop", str(made.folder), "--weights", str(path), "--out"]
+    words = ["pose", "predict", "--bop", str(synthetic.folder), "--weights", str(path), "--out"]
     monkeypatch.setenv("WORLD_SIZE", "2")
     for rank in ("1", "0"):
         monkeypatch.setenv("RANK", rank)
@@ -333,7 +333,7 @@ def test_two_processes_share_the_work(
     for name, row in one.items():
         assert row["camera_from_model"] == two[name]["camera_from_model"]
     parts = [len(read_predictions(tmp_path / "two" / f"part-{k}")) for k in (0, 1)]
-    assert sum(parts) == len(made.instances)
+    assert sum(parts) == len(synthetic.instances)
     assert min(parts) >= 1
 
 
@@ -374,15 +374,15 @@ def test_a_mask_of_another_name_is_refused(
 
 
 def test_weights_of_other_objects_are_refused(
-    made: BopDataset,
+    synthetic: BopDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    stranger = bracket("stranger")
-    stranger = type(stranger)(**{**vars(stranger), "number": 99})
-    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(stranger), [TRUTH]))
-    words = ["--bop", str(made.folder), "--weights", str(path), "--out", str(tmp_path / "out")]
+    unknown = bracket("stranger")
+    unknown = type(unknown)(**{**vars(unknown), "number": 99})
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(unknown), [TRUTH]))
+    words = ["--bop", str(synthetic.folder), "--weights", str(path), "--out", str(tmp_path / "out")]
     assert main(["pose", "predict", *words]) == 2
     assert "but the weights know stranger; give weights of its objects" in capsys.readouterr().err
 

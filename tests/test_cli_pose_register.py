@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.made_frames import make_dataset
+from tests.pose.synthetic_frames import make_dataset
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
@@ -18,13 +18,13 @@ from depthpose.pose.synthetic import Objects, make_part, write_part
 def cad(tmp_path: Path) -> Path:
     """A part, a cloud of it in millimetres, and a depth image with its mask and camera."""
     write_part("connector", tmp_path)
-    made = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
-    views = Objects([make_part("connector")], made)
+    config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
+    views = Objects([make_part("connector")], config)
     write_cloud(tmp_path / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
-    centre_px = torch.tensor(made.centre_px)
+    centre_px = torch.tensor(config.centre_px)
     left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
-    width, height = made.image_px
+    width, height = config.image_px
     height_px, width_px = window.mask.shape
     depth_m, mask = torch.full((height, width), torch.nan), torch.zeros(3, height, width)
     place = (slice(top, top + height_px), slice(left, left + width_px))

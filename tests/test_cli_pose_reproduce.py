@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.pose.made_frames import made_models, moved, predictions_of
-from tests.pose.made_linemod import make_linemod
-from tests.pose.made_object import tiny_weights
+from tests.pose.synthetic_frames import frame_models, moved, predictions_of
+from tests.pose.synthetic_linemod import make_linemod
+from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import read_image
@@ -23,7 +23,7 @@ def linemod(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*made_models()))
+    write_pose_weights(path, tiny_weights(*frame_models()))
     return path
 
 
@@ -86,7 +86,7 @@ def test_table_3_1_sets_methods_side_by_side(
     assert "give --linemod FOLDER, or --bop FOLDER" in capsys.readouterr().err
 
 
-def test_table_3_3_votes_on_frames_and_on_made_views(
+def test_table_3_3_votes_on_frames_and_on_synthetic_views(
     linemod: BopDataset, weights: Path, tmp_path: Path
 ) -> None:
     words = ["reproduce", "3.3", "--weights", str(weights), "--points", "60"]

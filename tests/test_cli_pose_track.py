@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 from tests.pages.read_page import read_page
-from tests.pose.made_frames import make_dataset
-from tests.pose.made_object import K, Oracle, bottle, bracket, tiny_weights, view_of
+from tests.pose.synthetic_frames import make_dataset
+from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, tiny_weights, view_of
 from tests.pose.test_track import moving
 
 from depthpose.cli import main
@@ -62,8 +62,8 @@ def test_a_folder_of_depth_images_is_followed(
 def test_the_objects_of_a_scene_are_followed(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = make_dataset(tmp_path / "made", frames=2)
-    words = ["--bop", str(made.folder), "--object", "bracket", "--weights", str(weights)]
+    synthetic = make_dataset(tmp_path / "made", frames=2)
+    words = ["--bop", str(synthetic.folder), "--object", "bracket", "--weights", str(weights)]
     assert main(["pose", "track", *words, "--out", str(tmp_path / "out")]) == 0
     found = read_predictions(tmp_path / "out")
     assert [p.place for p in found] == [(1, 0, 7), (1, 1, 7)]

@@ -127,7 +127,7 @@ def test_words_that_do_not_go_together_are_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_made_frames_are_a_data_set_that_the_check_accepts(
+def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "made"
@@ -184,7 +184,7 @@ def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_
     assert "held_out/iou_objects" in (run / "metrics.jsonl").read_text()
 
 
-def test_symmetries_of_a_cad_file_are_told_and_declared_if_wanted(
+def test_symmetries_of_a_cad_file_are_printed_and_declared_if_wanted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = write_part("flange", tmp_path)

@@ -1,4 +1,4 @@
-"""``data rectify``, as a user runs it, on made pairs whose cameras and depth are known."""
+"""``data rectify``, as a user runs it, on synthetic pairs whose cameras and depth are known."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 import torch
 
 pytest.importorskip("cv2")
-from tests.made_street import make_street
-from tests.raw_pairs import Made, make_raw, opencv_names, write_kalibr, write_opencv
+from tests.raw_pairs import DrawnPair, make_raw, opencv_names, write_kalibr, write_opencv
+from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.core.camera import (
@@ -36,16 +36,16 @@ def street() -> StereoSample:
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["pinhole", "fisheye"])
-def made(request: pytest.FixtureRequest, street: StereoSample) -> Made:
+def drawn(request: pytest.FixtureRequest, street: StereoSample) -> DrawnPair:
     return make_raw(street.input, is_fisheye=request.param)
 
 
 @pytest.fixture
-def home(tmp_path: Path, made: Made) -> Path:
+def home(tmp_path: Path, drawn: DrawnPair) -> Path:
     """A raw pair and its camchain."""
-    write_image(tmp_path / "raw/left.png", made.left)
-    write_image(tmp_path / "raw/right.png", made.right)
-    write_kalibr(tmp_path / "camchain.yaml", made.pair)
+    write_image(tmp_path / "raw/left.png", drawn.left)
+    write_image(tmp_path / "raw/right.png", drawn.right)
+    write_kalibr(tmp_path / "camchain.yaml", drawn.pair)
     return tmp_path
 
 
@@ -56,30 +56,30 @@ def rectify(home: Path, *words: str, out: str = "out", camera: str = "camchain.y
     return main(["data", "rectify", *given, *words, *fixed])
 
 
-def rectifier_of(made: Made) -> Rectifier:
-    assert made.pair.size is not None
-    return make_rectifier(made.pair, made.pair.size)
+def rectifier_of(drawn: DrawnPair) -> Rectifier:
+    assert drawn.pair.size is not None
+    return make_rectifier(drawn.pair, drawn.pair.size)
 
 
-def test_rows_agree_after_and_not_before(made: Made) -> None:
-    raw = epipolar_residual(match_features(made.left, made.right))
+def test_rows_agree_after_and_not_before(drawn: DrawnPair) -> None:
+    raw = epipolar_residual(match_features(drawn.left, drawn.right))
     assert raw.median_px > 1
-    after = epipolar_residual(match_features(*rectifier_of(made).rectify(made.left, made.right)))
+    after = epipolar_residual(match_features(*rectifier_of(drawn).rectify(drawn.left, drawn.right)))
     assert after.matches > 50
     assert after.median_px < 0.3
     assert not after.is_swapped
 
 
 def test_depth_of_the_rectified_pair_is_that_of_the_street(
-    made: Made, street: StereoSample
+    drawn: DrawnPair, street: StereoSample
 ) -> None:
-    rectifier = rectifier_of(made)
+    rectifier = rectifier_of(drawn)
     rig = rectifier.rig
-    left, right = rectifier.rectify(made.left, made.right)
+    left, right = rectifier.rectify(drawn.left, drawn.right)
     found_m = depth_from_disparity(SGBMMatcher().match(left, right).disparity_px, rig)
     points_m = back_project(found_m.double(), rig.K)[found_m < 40]
     street_from_rectified = (
-        torch.from_numpy(made.turns[0]) @ rectifier.rectified_from_raw.inverse().R
+        torch.from_numpy(drawn.turns[0]) @ rectifier.rectified_from_raw.inverse().R
     )
     there_m = points_m @ street_from_rectified.mT
     seen = street.input.camera
@@ -95,7 +95,7 @@ def test_depth_of_the_rectified_pair_is_that_of_the_street(
 
 
 def test_the_folder_is_what_match_and_check_take(
-    home: Path, made: Made, capsys: pytest.CaptureFixture[str]
+    home: Path, drawn: DrawnPair, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert rectify(home) == 0
     shown = capsys.readouterr().out
@@ -103,7 +103,7 @@ def test_the_folder_is_what_match_and_check_take(
     out = home / "out"
     rig = read_rig(out / "camera.json")
     assert rig.baseline_m == pytest.approx(0.54)
-    assert (rig.width, rig.height) == made.pair.size
+    assert (rig.width, rig.height) == drawn.pair.size
     assert main(["data", "check", str(out)]) == 0
     pair = [str(out / "left"), str(out / "right"), "--camera", str(out / "camera.json")]
     matched = ["depth", "match", *pair, "--matcher", "sgbm", "--out", str(home / "matched")]
@@ -121,10 +121,10 @@ def test_match_refuses_the_raw_pair_and_names_the_command(
     assert "rectify the pair ('depthpose data rectify', with" in capsys.readouterr().err
 
 
-def test_folders_and_patterns_are_paired_by_name(home: Path, made: Made) -> None:
+def test_folders_and_patterns_are_paired_by_name(home: Path, drawn: DrawnPair) -> None:
     for number in range(2):
-        write_image(home / f"many/l{number}.png", made.left)
-        write_image(home / f"many/r{number}.png", made.right)
+        write_image(home / f"many/l{number}.png", drawn.left)
+        write_image(home / f"many/r{number}.png", drawn.right)
     assert rectify(home, str(home / "many/l*.png"), str(home / "many/r*.png")) == 0
     assert sorted(p.name for p in (home / "out/right").iterdir()) == ["l0.png", "l1.png"]
     assert rectify(home, str(home / "out/left"), str(home / "out/right")) == 2
@@ -141,7 +141,7 @@ def test_a_rerun_gives_the_same_and_other_settings_are_refused(
     assert "keep" in capsys.readouterr().err
 
 
-def test_what_is_not_kept_is_black(home: Path, made: Made) -> None:
+def test_what_is_not_kept_is_black(home: Path, drawn: DrawnPair) -> None:
     assert rectify(home, "--keep", "1") == 0
     assert rectify(home, out="tight") == 0
     black = [(read_image(home / f"{o}/left/left.png") == 0).all(0) for o in ("out", "tight")]
@@ -198,7 +198,7 @@ def test_another_rigs_calibration_is_refused_or_warned_of(
     assert "the median is above 0.5 px" in capsys.readouterr().err
 
 
-def test_a_bare_scene_cannot_be_judged(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bare_scene_cannot_be_checked(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grey = torch.full_like(read_image(home / "raw/left.png"), 0.5)
     for side in ("left", "right"):
         write_image(home / f"raw/{side}.png", grey)
@@ -207,25 +207,25 @@ def test_a_bare_scene_cannot_be_judged(home: Path, capsys: pytest.CaptureFixture
 
 
 def test_images_of_another_size_are_refused(
-    home: Path, made: Made, capsys: pytest.CaptureFixture[str]
+    home: Path, drawn: DrawnPair, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_image(home / "raw/right.png", made.right[:, :100])
+    write_image(home / "raw/right.png", drawn.right[:, :100])
     assert rectify(home) == 2
     assert "right.png is 621x100, but the cameras were calibrated at 621x188" in (
         capsys.readouterr().err
     )
 
 
-def test_opencvs_file_with_millimetres_and_no_size(home: Path, made: Made) -> None:
-    names = opencv_names(made.pair)
+def test_opencvs_file_with_millimetres_and_no_size(home: Path, drawn: DrawnPair) -> None:
+    names = opencv_names(drawn.pair)
     write_opencv(home / "stereo.yml", {**names, "T": 1000 * names["T"]})
-    kind = ["--fisheye"] if made.pair.left.is_fisheye else []
+    kind = ["--fisheye"] if drawn.pair.left.is_fisheye else []
     assert rectify(home, "--unit", "mm", *kind, camera="stereo.yml") == 0
     camera = json.loads((home / "out/camera.json").read_text())
     assert camera["baseline_m"] == pytest.approx(0.54)
 
 
-def test_keep_out_of_range_is_refused(made: Made) -> None:
-    assert made.pair.size is not None
+def test_keep_out_of_range_is_refused(drawn: DrawnPair) -> None:
+    assert drawn.pair.size is not None
     with pytest.raises(InputError, match=r"--keep 2: 0 keeps what both lenses show"):
-        make_rectifier(made.pair, made.pair.size, 2.0)
+        make_rectifier(drawn.pair, drawn.pair.size, 2.0)

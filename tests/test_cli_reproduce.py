@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.made_street import make_street
 from tests.pages.read_page import read_page
+from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth.methods import Method
@@ -43,7 +43,7 @@ class FlatMono:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four pairs of the made street with depth, 621 x 188."""
+    """Four pairs of the synthetic street with depth, 621 x 188."""
     folder = tmp_path_factory.mktemp("street")
     sample = make_street(0.5)
     assert sample.input.right is not None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from tests.pose.made_linemod import make_linemod
+from tests.pose.synthetic_linemod import make_linemod
 
 from depthpose.cli import main
 from depthpose.cli.thesis import reproduce_all

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.cli import main
 from depthpose.cli.pose import methods as pose_methods

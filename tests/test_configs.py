@@ -84,7 +84,7 @@ def _drives(index: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("name", ["view", "stereo", "finetune"])
-def test_one_knob_leaves_the_stages_other_defaults(name: str, tmp_path: Path) -> None:
+def test_one_setting_leaves_the_stages_other_defaults(name: str, tmp_path: Path) -> None:
     """Nested defaults are the stage's: Adam's betas for the GAN, the length of each loop."""
     kind = STAGES[name][0]
     adam = "generator_adam" if name == "view" else "adam"
@@ -129,7 +129,7 @@ def pair(height: int, width: int) -> TrainingPair:
 
 @pytest.mark.slow
 def test_the_full_widths_take_a_step() -> None:
-    """54 million parameters against the 70x70 judge, then through the full PSMNet, at 256x512."""
+    """54 million parameters against a 70x70 discriminator, then the full PSMNet, at 256x512."""
     view = read_config(FOLDER / "view.yaml", ViewTraining)
     stereo = read_config(FOLDER / "stereo.yaml", StereoTraining)
     tune = read_config(FOLDER / "finetune.yaml", FinetuneTraining)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.depth.made_selection import sure_of
-from tests.made_street import make_street
+from tests.depth.constant_selection import sure_of
+from tests.synthetic_street import make_street
 
 from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.errors import InputError

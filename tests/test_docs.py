@@ -47,10 +47,10 @@ def test_the_search_finds_the_estimators_without_a_server(site: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_pictures_show_every_room_and_module(site: Path) -> None:
+def test_the_pictures_show_every_package_and_module(site: Path) -> None:
     page = (site / "architecture.html").read_text()
-    for room in ("core", "depth", "pose"):
-        for path in (ROOT / "src/depthpose" / room).iterdir():
+    for package in ("core", "depth", "pose"):
+        for path in (ROOT / "src/depthpose" / package).iterdir():
             if (
                 path.stem.isidentifier()
                 and not path.stem.startswith("__")
@@ -70,9 +70,9 @@ def test_each_class_of_the_api_has_a_page(site: Path) -> None:
     ):
         full = f"depthpose.{module}.{name}"
         assert f'id="{full}"' in (site / f"api/classes/{full}.html").read_text()
-        room = (site / f"api/{module.partition('.')[0]}.html").read_text()
-        assert f'href="classes/{full}.html"' in room
-        assert f'<dt class="sig sig-object py" id="{full}">' not in room
+        page = (site / f"api/{module.partition('.')[0]}.html").read_text()
+        assert f'href="classes/{full}.html"' in page
+        assert f'<dt class="sig sig-object py" id="{full}">' not in page
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ def modules_after(statement: str) -> set[str]:
     return set(answer.stdout.split())
 
 
-def test_core_imports_no_room() -> None:
+def test_core_imports_neither_depth_nor_pose() -> None:
     names = [
         path.stem
         for path in Path(str(core.__file__)).parent.iterdir()

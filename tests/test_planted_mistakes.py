@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from tests.core.test_camera_rectified import pair
-from tests.pose.made_object import K, bracket, cloud_of, pose_at, view_of
+from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import (
@@ -135,7 +135,7 @@ def truth_m() -> torch.Tensor:
     return torch.linspace(2, 10, 64).expand(48, 64)
 
 
-def judged(depth_m: torch.Tensor) -> str | None:
+def advice_for(depth_m: torch.Tensor) -> str | None:
     return disparity_advice(
         disparity_from_depth(depth_m, RIG), disparity_from_depth(truth_m(), RIG)
     )
@@ -286,13 +286,13 @@ MISTAKES: dict[str, tuple[Work, Work, str]] = {
         "or give the mask of this image: this one may lie on the background",
     ),
     "prediction in millimetres": (
-        lambda _: judged(1000 * truth_m()),
-        lambda _: judged(1.3 * truth_m()),
+        lambda _: advice_for(1000 * truth_m()),
+        lambda _: advice_for(1.3 * truth_m()),
         "as far as the truth: is its depth in millimetres (divide by 1000)",
     ),
     "prediction times 256": (
-        lambda _: judged(256 * truth_m()),
-        lambda _: judged(0.6 * truth_m()),
+        lambda _: advice_for(256 * truth_m()),
+        lambda _: advice_for(0.6 * truth_m()),
         "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
     ),
     "disparity of the other sign": (

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import pytest
 import yaml
-from tests.pose.made_linemod import make_linemod
-from tests.pose.made_object import bracket
+from tests.pose.synthetic_linemod import make_linemod
+from tests.pose.synthetic_objects import bracket
 from torch import nn
 
 from depthpose.core.config import config_to_dict, read_config
@@ -137,8 +137,8 @@ def pose_training(
     config = read_config(CONFIGS / f"pose/{name}.yaml", kind)
     parts = {"models": "bop", "frames": "folder", "images": "folder"}
     there = {
-        part: dataclasses.replace(getattr(config, part), **{knob: str(linemod)})
-        for part, knob in parts.items()
+        part: dataclasses.replace(getattr(config, part), **{setting: str(linemod)})
+        for part, setting in parts.items()
         if hasattr(config, part)
     }
     config = dataclasses.replace(config, **there)
@@ -151,12 +151,12 @@ def parameters(module: nn.Module) -> int:
     return sum(p.numel() for p in module.parameters())
 
 
-def knobs(content: Mapping[str, Any], prefix: str = "") -> set[str]:
-    """Dotted names of all that holds no further knobs."""
+def settings(content: Mapping[str, Any], prefix: str = "") -> set[str]:
+    """Dotted names of all settings that hold no further ones."""
     found: set[str] = set()
     for name, value in content.items():
         place = f"{prefix}{name}"
-        found |= knobs(value, f"{place}.") if isinstance(value, Mapping) else {place}
+        found |= settings(value, f"{place}.") if isinstance(value, Mapping) else {place}
     return found
 
 
@@ -167,9 +167,9 @@ def knobs(content: Mapping[str, Any], prefix: str = "") -> set[str]:
 )
 def test_no_default_is_relied_on(path: str, kind: type) -> None:
     """A default may change for other reasons, and a published setting may not change with it."""
-    written = knobs(yaml.safe_load((CONFIGS / path).read_text()))
-    every = knobs(config_to_dict(read_config(CONFIGS / path, kind)))
-    free = NO_WEIGHT_FOLLOWS | {knob for knob in every if knob.startswith(ONLY_LOOKED_AT)}
+    written = settings(yaml.safe_load((CONFIGS / path).read_text()))
+    every = settings(config_to_dict(read_config(CONFIGS / path, kind)))
+    free = NO_WEIGHT_FOLLOWS | {setting for setting in every if setting.startswith(ONLY_LOOKED_AT)}
     assert every - written - free == set()
 
 
@@ -254,7 +254,7 @@ def test_the_pose_network_is_the_published_one(
     assert (config.loop.batch_size, config.loop.epochs) == (8, 500)
     assert found.rates("network", 0, 99, 100, 250, 499) == [1e-4, 1e-4, 5e-5, 2.5e-5, 6.25e-6]
     assert found.betas("network") == (0.9, 0.999)
-    assert len(found.samples) == 13, "an epoch shows each training frame once, and no made view"
+    assert len(found.samples) == 13, "each training frame once an epoch, and no synthetic view"
     cloud = found.samples[0]
     assert cloud.features.unique().tolist() == [1.0]
     assert len(cloud.points_m) <= 500

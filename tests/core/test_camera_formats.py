@@ -108,7 +108,7 @@ def pinhole(camera: Camera) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_format_is_told_by_its_content(tmp_path: Path, name: str) -> None:
+def test_a_format_is_recognised_by_its_content(tmp_path: Path, name: str) -> None:
     text, lengths, more = READ[name]
     camera = read_camera(saved(tmp_path, text), SIZE)
     assert (camera.width, camera.height) == SIZE
@@ -130,7 +130,7 @@ def test_these_do_not_and_it_is_asked_for(tmp_path: Path, name: str) -> None:
         read_camera(saved(tmp_path, READ[name][0]))
 
 
-def test_a_pair_of_ros_is_a_folder_told_by_its_content(tmp_path: Path) -> None:
+def test_a_pair_of_ros_is_a_folder_recognised_by_its_content(tmp_path: Path) -> None:
     saved(tmp_path, ros(), "z.yaml")
     saved(tmp_path, ros(Tx=-49, cx=325), "a.yaml")
     rig = read_rig(tmp_path)

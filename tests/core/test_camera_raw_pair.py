@@ -9,7 +9,7 @@ import torch
 import yaml
 
 pytest.importorskip("cv2")
-from tests.raw_pairs import Made, make_raw, opencv_names, write_kalibr, write_opencv, write_ros
+from tests.raw_pairs import DrawnPair, make_raw, opencv_names, write_kalibr, write_opencv, write_ros
 
 from depthpose.core.camera import RawPair, StereoRig, read_camera, read_raw_pair
 from depthpose.core.errors import InputError
@@ -19,7 +19,7 @@ SIZE = (64, 48)
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["pinhole", "fisheye"])
-def made(request: pytest.FixtureRequest) -> Made:
+def drawn(request: pytest.FixtureRequest) -> DrawnPair:
     K = torch.tensor([[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(width=64, height=48, K=K, baseline_m=0.12)
     image = torch.rand(3, 48, 64)
@@ -37,40 +37,40 @@ def same(read: RawPair, pair: RawPair, coefficients: int) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
-def test_opencvs_file_is_read(tmp_path: Path, made: Made, suffix: str) -> None:
-    path = write_opencv(tmp_path / f"stereo{suffix}", opencv_names(made.pair), SIZE)
-    read = read_raw_pair(path, is_fisheye=made.pair.left.is_fisheye)
-    same(read, made.pair, 5)
+def test_opencvs_file_is_read(tmp_path: Path, drawn: DrawnPair, suffix: str) -> None:
+    path = write_opencv(tmp_path / f"stereo{suffix}", opencv_names(drawn.pair), SIZE)
+    read = read_raw_pair(path, is_fisheye=drawn.pair.left.is_fisheye)
+    same(read, drawn.pair, 5)
     assert read.size == SIZE
 
 
-def test_opencvs_two_files_are_a_folder(tmp_path: Path, made: Made) -> None:
-    names = opencv_names(made.pair)
+def test_opencvs_two_files_are_a_folder(tmp_path: Path, drawn: DrawnPair) -> None:
+    names = opencv_names(drawn.pair)
     renamed = {"M1": "K1", "D1": "D1", "M2": "K2", "D2": "D2"}
     write_opencv(tmp_path / "intrinsics.yml", {new: names[old] for new, old in renamed.items()})
     write_opencv(tmp_path / "extrinsics.yml", {name: names[name] for name in ("R", "T")})
-    read = read_raw_pair(tmp_path, is_fisheye=made.pair.left.is_fisheye)
-    same(read, made.pair, 5)
+    read = read_raw_pair(tmp_path, is_fisheye=drawn.pair.left.is_fisheye)
+    same(read, drawn.pair, 5)
     assert read.size is None
 
 
-def test_a_camchain_of_kalibr_is_read(tmp_path: Path, made: Made) -> None:
-    read = read_raw_pair(write_kalibr(tmp_path / "camchain.yaml", made.pair))
-    same(read, made.pair, 4)
+def test_a_camchain_of_kalibr_is_read(tmp_path: Path, drawn: DrawnPair) -> None:
+    read = read_raw_pair(write_kalibr(tmp_path / "camchain.yaml", drawn.pair))
+    same(read, drawn.pair, 4)
     assert read.size == SIZE
 
 
-def test_two_camera_info_of_ros_are_read(tmp_path: Path, made: Made) -> None:
-    read = read_raw_pair(write_ros(tmp_path / "calibration", made, 0.12))
-    same(read, made.pair, 5)
+def test_two_camera_info_of_ros_are_read(tmp_path: Path, drawn: DrawnPair) -> None:
+    read = read_raw_pair(write_ros(tmp_path / "calibration", drawn, 0.12))
+    same(read, drawn.pair, 5)
     assert read.size == SIZE
 
 
-def test_millimetres_become_metres(tmp_path: Path, made: Made) -> None:
-    names = opencv_names(made.pair)
+def test_millimetres_become_metres(tmp_path: Path, drawn: DrawnPair) -> None:
+    names = opencv_names(drawn.pair)
     path = write_opencv(tmp_path / "stereo.yml", {**names, "T": 1000 * names["T"]})
-    is_fisheye = made.pair.left.is_fisheye
-    same(read_raw_pair(path, unit_m=0.001, is_fisheye=is_fisheye), made.pair, 5)
+    is_fisheye = drawn.pair.left.is_fisheye
+    same(read_raw_pair(path, unit_m=0.001, is_fisheye=is_fisheye), drawn.pair, 5)
     with pytest.raises(InputError, match=r"stand 120 m apart, .* give --unit mm"):
         read_raw_pair(path, is_fisheye=is_fisheye)
 
@@ -162,7 +162,7 @@ def test_a_camchain_given_for_a_rectified_camera_names_the_command(tmp_path: Pat
         read_camera(path)
 
 
-def test_two_camera_info_of_single_cameras_are_no_pair(tmp_path: Path, made: Made) -> None:
-    folder = write_ros(tmp_path / "calibration", made, 0.0)
+def test_two_camera_info_of_single_cameras_are_no_pair(tmp_path: Path, drawn: DrawnPair) -> None:
+    folder = write_ros(tmp_path / "calibration", drawn, 0.0)
     with pytest.raises(InputError, match=r"Tx / fx 0 and -?0, .*calibrate as a pair"):
         read_raw_pair(folder)

@@ -78,7 +78,7 @@ def test_answers_that_differ_are_not_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_one_large_difference_is_judged_by_its_kind(tmp_path: Path) -> None:
+def test_one_large_difference_is_compared_by_its_kind(tmp_path: Path) -> None:
     y = 2 * X + 1
     y[0, 0] += 3e-6
     with pytest.raises(InputError, match="differ by"):

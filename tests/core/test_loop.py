@@ -38,9 +38,9 @@ PROGRAM = Path(__file__).with_name("loop_task.py")
 
 
 def loop(**changes: object) -> LoopConfig:
-    knobs = {"steps": 12, "batch_size": 4, "save_every_steps": 4, "device": "cpu",
+    settings = {"steps": 12, "batch_size": 4, "save_every_steps": 4, "device": "cpu",
              "log_every_steps": 4, **changes}  # fmt: skip
-    return LoopConfig(**knobs)
+    return LoopConfig(**settings)
 
 
 def trained(folder: Path, config: LoopConfig, **words: object) -> ToyTask:
@@ -538,7 +538,7 @@ def test_epochs_become_steps() -> None:
         ({"ema_decay": 1.0}, "ema_decay must be between 0 and 1"),
     ],
 )
-def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
+def test_bad_settings_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         loop(**changes)
 
@@ -550,7 +550,7 @@ def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None
         ({"beta1": 1.0}, "betas must be in"),
     ],
 )
-def test_bad_knobs_of_adam_are_refused(changes: dict[str, object], message: str) -> None:
+def test_bad_settings_of_adam_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         AdamConfig(**changes)  # pyright: ignore[reportArgumentType]
 

@@ -97,7 +97,7 @@ def test_results_among_inputs_are_refused(tmp_path: Path) -> None:
             refuse_among_inputs(tmp_path, [word], files)
 
 
-def test_a_file_is_not_replaced_without_being_told(tmp_path: Path) -> None:
+def test_a_file_is_not_replaced_without_consent(tmp_path: Path) -> None:
     refuse_to_replace(tmp_path / "w.safetensors")
     (tmp_path / "w.safetensors").touch()
     with pytest.raises(InputError, match=r"w\.safetensors: is there already; delete it, or give"):
@@ -153,7 +153,7 @@ def test_waiting_in_vain_names_what_is_missing() -> None:
         wait_for(["a", "b"], lambda name: name == "a", patience_s=0.1)
 
 
-def test_a_nested_setting_is_named_by_its_path_and_a_new_knob_may_be_off(tmp_path: Path) -> None:
+def test_a_nested_setting_is_named_by_its_path_and_a_new_one_may_be_off(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"pairs": {"limit": 3}})
     claim_folder(tmp_path, {"pairs": {"limit": 3, "later": None, "share": 0.0}})
     with pytest.raises(InputError, match=r"pairs\.share = None, but now it is 0\.5"):

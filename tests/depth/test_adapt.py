@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.made_street import make_street, write_pairs
+from tests.synthetic_street import make_street, write_pairs
 from torch import Tensor, nn
 
 from depthpose.cli import main

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.made_street import make_street
+from tests.synthetic_street import make_street
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
@@ -243,7 +243,7 @@ def test_flips_come_at_their_share() -> None:
         ({"misaligned_px": 10.0}, "misaligned_px must be in"),
     ],
 )
-def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
+def test_bad_settings_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         AugmentConfig(**changes)  # pyright: ignore[reportArgumentType]
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 import torch
-from tests.depth.made_selection import BASELINE_M, CONFIG, FOCAL_PX, of_all_kinds
+from tests.depth.constant_selection import BASELINE_M, CONFIG, FOCAL_PX, of_all_kinds
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.devices import computes_bf16

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.made_street import make_street
+from tests.synthetic_street import make_street
 
 from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig, write_camera

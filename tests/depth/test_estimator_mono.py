@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tests.depth.made_selection import BASELINE_M, FOCAL_PX, sure_of
+from tests.depth.constant_selection import BASELINE_M, FOCAL_PX, sure_of
 from torch import Tensor, nn
 
 import depthpose

@@ -165,13 +165,13 @@ def test_predictions_become_depth_of_a_nerfstudio_data_set(
     data = data_set(tmp_path / "data", "ba")
     before = (data / "transforms.json").read_bytes()
     assert export(results, data, "--format", "nerfstudio") == 0
-    told = json.loads((data / "transforms_depth.json").read_text())
-    assert [f["depth_file_path"] for f in told["frames"]] == ["depths/b.png", "depths/a.png"]
-    assert told["fl_x"] == F
-    units = np.asarray(Image.open(data / told["frames"][0]["depth_file_path"]))
+    transforms = json.loads((data / "transforms_depth.json").read_text())
+    assert [f["depth_file_path"] for f in transforms["frames"]] == ["depths/b.png", "depths/a.png"]
+    assert transforms["fl_x"] == F
+    units = np.asarray(Image.open(data / transforms["frames"][0]["depth_file_path"]))
     assert units.dtype == np.uint16
     is_far = DEPTH_M.numpy() > 65.535
-    depth_m = units * told["depth_unit_scale_factor"]
+    depth_m = units * transforms["depth_unit_scale_factor"]
     assert np.allclose(depth_m, np.where(is_far, 0, DEPTH_M.nan_to_num().numpy()), atol=1e-3)
     assert f"{2 * is_far.sum()} pixels are beyond 65.535 m" in capsys.readouterr().err
     assert (data / "transforms.json").read_bytes() == before

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests.depth.made_selection import CONFIG, of_all_kinds
+from tests.depth.constant_selection import CONFIG, of_all_kinds
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
@@ -40,10 +40,10 @@ DOCS = (Path(__file__).parents[2] / "docs/export.md").read_text()
 TERMS = {"licence": "MIT", "trained_on": "nothing"}
 
 
-def tiny_matcher(**knobs: object) -> PSMNet:
+def tiny_matcher(**settings: object) -> PSMNet:
     torch.manual_seed(1)
     size = {"width": 2, "max_disparity_px": 32, "blocks": (1, 1, 1, 1), "pools": (8, 4)}
-    return PSMNet(PSMNetConfig(**size | knobs)).eval()  # pyright: ignore[reportArgumentType]
+    return PSMNet(PSMNetConfig(**size | settings)).eval()  # pyright: ignore[reportArgumentType]
 
 
 def calm_matcher() -> PSMNet:
@@ -56,10 +56,10 @@ def calm_matcher() -> PSMNet:
     return matcher
 
 
-def tiny_weights(**knobs: object) -> DepthWeights:
+def tiny_weights(**settings: object) -> DepthWeights:
     torch.manual_seed(0)
     rig = {"width": 2, "levels": 4, "virtual_focal_px": 90.0, "virtual_baseline_m": 0.5}
-    generator = UNetGenerator(GeneratorConfig(**rig | knobs)).eval()  # pyright: ignore[reportArgumentType]
+    generator = UNetGenerator(GeneratorConfig(**rig | settings)).eval()  # pyright: ignore[reportArgumentType]
     matcher = tiny_matcher(work_focal_px=70.0)
     return DepthWeights(generator=generator, matcher=matcher, facts=TERMS)
 

@@ -1,4 +1,4 @@
-"""Layouts, calibration, splits and the check, on made folders and on the real samples."""
+"""Layouts, calibration, splits and the check, on synthetic folders and on the real samples."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -94,8 +94,8 @@ def test_the_reference_metrics_are_reproduced(real: Path, tmp_path: Path) -> Non
     dataset = open_dataset(real / "depth/kitti_raw")
     rows = json.loads((real / "reference/eigen_raw/metrics.json").read_text())
     for row in rows:
-        made_px = _made_prediction(row["k"])
-        write_map(tmp_path / f"{row['drive']}_{row['frame']}.disparity_px.npy", made_px)
+        reference_px = _reference_prediction(row["k"])
+        write_map(tmp_path / f"{row['drive']}_{row['frame']}.disparity_px.npy", reference_px)
     result = evaluate(dataset, tmp_path, "eigen-raw", caps_m=(80.0, 50.0))
     ours = {(row.frame, row.cap_m): row for row in result.per_frame}
     assert len(rows) == len(ours) == 20
@@ -108,8 +108,8 @@ def test_the_reference_metrics_are_reproduced(real: Path, tmp_path: Path) -> Non
     assert len(result.skipped) == 8
 
 
-def _made_prediction(k: int) -> torch.Tensor:
-    """The reference's made-up disparity, in pixels of its own width."""
+def _reference_prediction(k: int) -> torch.Tensor:
+    """The reference's invented disparity, in pixels of its own width."""
     v, u = np.meshgrid(np.linspace(0, 1, 256), np.linspace(0, 1, 512), indexing="ij")
     share = 0.004 + 0.07 * np.maximum(v - 0.42, 0) + 0.002 * (1 + np.sin(9 * u + k)) * v
     return torch.from_numpy(share.astype(np.float32)) * 512

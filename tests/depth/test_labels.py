@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.made_street import make_street, write_pairs
+from tests.synthetic_street import make_street, write_pairs
 from torch import Tensor
 
 from depthpose import FakestereoNet

@@ -43,8 +43,8 @@ def test_the_discriminator_pays_half_of_both_mistakes() -> None:
 
 
 def test_l1_by_hand() -> None:
-    made, real = torch.zeros(1, 3, 1, 2), torch.tensor([0.5, -1.0]).expand(1, 3, 1, 2)
-    assert float(l1_loss(made, real)) == pytest.approx(0.75)
+    generated, real = torch.zeros(1, 3, 1, 2), torch.tensor([0.5, -1.0]).expand(1, 3, 1, 2)
+    assert float(l1_loss(generated, real)) == pytest.approx(0.75)
 
 
 def test_smooth_l1_by_hand() -> None:

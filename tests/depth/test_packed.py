@@ -12,7 +12,7 @@ from pathlib import Path
 import fsspec
 import pytest
 import torch
-from tests.made_street import write_pairs
+from tests.synthetic_street import write_pairs
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint

@@ -45,8 +45,8 @@ def test_a_camera_of_a_small_angle_keeps_the_focal_length_that_was_asked_for(
         folders=(str(tmp_path),), focal_px=200.0, augment=AugmentConfig(crop_px=(100, 200))
     )
     pairs = TrainingPairs(config, 0, needs_truth=True)
-    for ticket in range(6):
-        pair = pairs[ticket]
+    for index in range(6):
+        pair = pairs[index]
         assert pair.left.shape == (3, 100, 200)
         assert float(pair.focal_px) == pytest.approx(200.0)
         seen = pair.left_px[torch.isfinite(pair.left_px)]

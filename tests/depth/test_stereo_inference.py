@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.depth.made_matchers import with_lively_norms
+from tests.depth.random_norms import with_random_norms
 
 from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
@@ -33,7 +33,7 @@ SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4
 def random_network(config: PSMNetConfig, seed: int = 0) -> PSMNet:
     """A network in eval mode whose batch norms do something."""
     torch.manual_seed(seed)
-    return with_lively_norms(PSMNet(config))
+    return with_random_norms(PSMNet(config))
 
 
 def plain(network: PSMNet, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.depth.made_matchers import with_lively_norms
+from tests.depth.random_norms import with_random_norms
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
@@ -45,7 +45,7 @@ SMALL = LightConfig(
 def random_network(config: LightConfig = SMALL) -> LightStereo:
     """A network in eval mode whose batch norms do something."""
     torch.manual_seed(0)
-    return with_lively_norms(LightStereo(config))
+    return with_random_norms(LightStereo(config))
 
 
 def shifted_pair(height: int, width: int, shift: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -175,7 +175,7 @@ def test_weights_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "said"),
+    ("settings", "said"),
     [
         ({"max_disparity_px": 48}, "multiple of 32"),
         ({"width": 10, "groups": 4}, "multiple of groups"),
@@ -185,9 +185,9 @@ def test_weights_come_back(tmp_path: Path) -> None:
         ({"work_focal_px": -1.0}, "work_focal_px must be positive"),
     ],
 )
-def test_sizes_that_no_network_has_are_refused(knobs: dict[str, Any], said: str) -> None:
+def test_sizes_that_no_network_has_are_refused(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        LightConfig(**knobs)
+        LightConfig(**settings)
 
 
 def test_images_of_another_size_are_refused() -> None:
@@ -203,9 +203,9 @@ def training_batch() -> TrainingPair:
     return TrainingPair(left, right, left_px, left_px, torch.full((2,), torch.nan))
 
 
-def stereo_task(**knobs: Any) -> StereoTask:  # noqa: ANN401
+def stereo_task(**settings: Any) -> StereoTask:  # noqa: ANN401
     torch.manual_seed(0)
-    return StereoTask(LightStereo(SMALL), StereoTraining(light=SMALL, **knobs), None)
+    return StereoTask(LightStereo(SMALL), StereoTraining(light=SMALL, **settings), None)
 
 
 def test_it_learns_and_every_part_gets_gradients() -> None:

@@ -159,7 +159,7 @@ def test_import_names_what_is_missing_unknown_and_misshaped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("settings", "text"),
     [
         ({"max_disparity_px": 100}, "multiple of 16.*got 100; take 192"),
         ({"max_disparity_px": 0}, "multiple of 16.*got 0"),
@@ -168,22 +168,22 @@ def test_import_names_what_is_missing_unknown_and_misshaped() -> None:
         ({"pools": ()}, "pools must hold 1 to 16 windows"),
     ],
 )
-def test_network_config_refuses_nonsense(knobs: dict, text: str) -> None:
+def test_network_config_refuses_nonsense(settings: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        PSMNetConfig(**knobs)
+        PSMNetConfig(**settings)
 
 
 @pytest.mark.parametrize(
-    ("knobs", "text"),
+    ("settings", "text"),
     [
         ({"max_memory_bytes": 0}, "max_memory_bytes must be positive"),
         ({"tile_px": (0, 5)}, "tile_px must be two positive sizes"),
         ({"tile_overlap_px": -1}, "tile_overlap_px must be 0 or more"),
     ],
 )
-def test_matcher_config_refuses_nonsense(knobs: dict, text: str) -> None:
+def test_matcher_config_refuses_nonsense(settings: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        MatcherConfig(**knobs)
+        MatcherConfig(**settings)
 
 
 @pytest.mark.data

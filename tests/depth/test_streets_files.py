@@ -20,7 +20,7 @@ from depthpose.depth.synthetic import camera_from_velodyne, draw_street
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     assert main(make(folder, 3)) == 0
     return folder
@@ -31,30 +31,30 @@ def make(folder: Path, number: int, *more: str) -> list[str]:
             "--scale", "0.25", "--seed", "7", *more]  # fmt: skip
 
 
-def test_the_check_finds_nothing_wrong(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data", "check", str(made)]) == 0
+def test_the_check_finds_nothing_wrong(synthetic: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "check", str(synthetic)]) == 0
     said = capsys.readouterr().out
     assert "KITTI raw: 3 frames, 3 right views, 3 calibrations, 3 LiDAR scans" in said
     assert "3 disparity maps; nothing is wrong" in said
 
 
-def test_finished_frames_are_kept(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = {path: path.stat().st_mtime_ns for path in made.rglob("*.png")}
-    assert main(make(made, 3)) == 0
+def test_finished_frames_are_kept(synthetic: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in synthetic.rglob("*.png")}
+    assert main(make(synthetic, 3)) == 0
     assert "0 frames made, 3 were there" in capsys.readouterr().out
-    assert before == {path: path.stat().st_mtime_ns for path in made.rglob("*.png")}
+    assert before == {path: path.stat().st_mtime_ns for path in synthetic.rglob("*.png")}
 
 
-def test_other_settings_are_refused(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = make(made, 3)
+def test_other_settings_are_refused(synthetic: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = make(synthetic, 3)
     words[words.index("0.25")] = "0.5"
     assert main(words) == 2
     assert "scale = 0.25, but now it is 0.5" in capsys.readouterr().err
-    assert main(make(made, 0)) == 2
+    assert main(make(synthetic, 0)) == 2
 
 
-def test_what_is_read_is_metric(made: Path) -> None:
-    dataset = open_dataset(made)
+def test_what_is_read_is_metric(synthetic: Path) -> None:
+    dataset = open_dataset(synthetic)
     frame = dataset.frames[0]
     rig, truth = dataset.read_rig(0), dataset.read_truth(0)
     assert rig is not None

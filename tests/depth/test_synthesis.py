@@ -19,8 +19,8 @@ def parameters(module: nn.Module) -> int:
 
 def small(levels: int = 4, **changes: object) -> UNetGenerator:
     torch.manual_seed(0)
-    knobs = {"width": 4, "levels": levels, **changes}
-    return UNetGenerator(GeneratorConfig(**knobs))
+    settings = {"width": 4, "levels": levels, **changes}
+    return UNetGenerator(GeneratorConfig(**settings))
 
 
 def test_parameters_are_the_published_ones() -> None:
@@ -65,9 +65,9 @@ def test_initial_weights_follow_pix2pix() -> None:
     ("discriminator", "field"), [(PatchDiscriminator, 70), (PixelDiscriminator, 1)]
 )
 def test_the_receptive_field_is_70_by_gradient(discriminator: type[nn.Module], field: int) -> None:
-    judge = discriminator(4).eval()
+    network = discriminator(4).eval()
     left = torch.rand(1, 3, 256, 256, requires_grad=True)
-    logits = judge(left, torch.rand(1, 3, 256, 256))
+    logits = network(left, torch.rand(1, 3, 256, 256))
     assert logits.shape[-1] == (30 if field == 70 else 256)
     row, column = (s // 2 for s in logits.shape[-2:])
     logits[0, 0, row, column].backward()
@@ -144,7 +144,7 @@ def _warmed(network: UNetGenerator) -> UNetGenerator:
         ({"virtual_focal_px": 0.0}, "virtual rig needs a positive"),
     ],
 )
-def test_bad_knobs_are_refused(changes: dict[str, object], message: str) -> None:
+def test_bad_settings_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         GeneratorConfig(**changes)  # pyright: ignore[reportArgumentType]
 

@@ -1,11 +1,11 @@
-"""The three stages on small made pairs: what moves, what stays, what is refused."""
+"""The three stages on small synthetic pairs: what moves, what stays, what is refused."""
 
 import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
-from tests.made_street import make_street, write_pairs
+from tests.synthetic_street import make_street, write_pairs
 from torch import Tensor, nn
 
 from depthpose.core.camera import StereoRig
@@ -47,7 +47,7 @@ LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A plain folder of three made pairs with disparity."""
+    """A plain folder of three synthetic pairs with disparity."""
     return write_pairs(tmp_path_factory.mktemp("pairs"), (0.2, 0.2, 0.25))
 
 
@@ -60,7 +60,7 @@ def pairs(folder: Path) -> PairsConfig:
 
 def batch(pairs: PairsConfig, count: int = 2) -> TrainingPair:
     samples = TrainingPairs(pairs, 0, needs_truth=True)
-    parts = zip(*(samples[ticket] for ticket in range(count)), strict=True)
+    parts = zip(*(samples[index] for index in range(count)), strict=True)
     return TrainingPair(*(torch.stack(part) for part in parts))
 
 
@@ -80,7 +80,7 @@ def take_step(task: ViewTask | StereoTask | FinetuneTask, given: TrainingPair) -
     return names
 
 
-def test_a_view_step_moves_first_the_judge_then_the_generator(pairs: PairsConfig) -> None:
+def test_a_view_step_updates_first_the_discriminator_then_the_generator(pairs: PairsConfig) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator_width=4)
     task = ViewTask(UNetGenerator(GENERATOR), config, None)
     before = {name: snapshot(module) for name, module in task.modules.items()}
@@ -100,7 +100,7 @@ def _weight(state: dict[str, Tensor]) -> Tensor:
     return next(tensor for name, tensor in state.items() if name.endswith("weight"))
 
 
-def test_l1_alone_has_no_judge(pairs: PairsConfig) -> None:
+def test_l1_alone_has_no_discriminator(pairs: PairsConfig) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator="none")
     task = ViewTask(UNetGenerator(GENERATOR), config, None)
     assert take_step(task, batch(pairs)) == ["generator"]
@@ -245,8 +245,8 @@ def test_pairs_that_cannot_train_are_refused(
 
 
 def test_another_rig_than_the_generators_is_refused(pairs: PairsConfig) -> None:
-    made = PairsConfig(streets=StreetsConfig(frames=3))
-    for config in (pairs, made):
+    synthetic = PairsConfig(streets=StreetsConfig(frames=3))
+    for config in (pairs, synthetic):
         with pytest.raises(InputError, match=r"imitates one rig of 0\.3 m"):
             TrainingPairs(config, 0, needs_truth=False, baseline_m=0.3)
 
@@ -265,7 +265,7 @@ def test_another_focal_length_than_the_generators_is_refused(
         train_view(zoomed, run)
 
 
-def test_a_start_of_another_network_names_the_knob(pairs: PairsConfig, tmp_path: Path) -> None:
+def test_a_start_of_another_network_names_the_setting(pairs: PairsConfig, tmp_path: Path) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
     first = train_view(config, Run(folder=tmp_path / "first"))
     wider = dataclasses.replace(GENERATOR, width=6)
@@ -348,15 +348,15 @@ def test_terms_of_what_a_training_begins_with_bind_what_comes_of_it(
     assert "Terms" not in card
 
 
-def test_streets_are_made_while_training() -> None:
-    made = StreetsConfig(frames=2, scale=0.2, jpeg_share=0.0)
+def test_streets_are_rendered_while_training() -> None:
+    synthetic = StreetsConfig(frames=2, scale=0.2, jpeg_share=0.0)
     config = PairsConfig(
-        streets=made, focal_px=130.0, augment=AugmentConfig(crop_px=(48, 96), jitter=0.0)
+        streets=synthetic, focal_px=130.0, augment=AugmentConfig(crop_px=(48, 96), jitter=0.0)
     )
     samples = TrainingPairs(config, 0, needs_truth=True, baseline_m=0.5327)
     assert len(samples) == 2
-    for ticket in range(4):
-        pair = samples[ticket]
+    for index in range(4):
+        pair = samples[index]
         error = (warp_right_to_left(pair.right, pair.left_px) - pair.left).abs()
         assert float(error.nanmedian()) < 0.06
 

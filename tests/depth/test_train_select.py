@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.made_street import write_pairs
+from tests.synthetic_street import write_pairs
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
@@ -65,7 +65,7 @@ def samples(*sources: PairsConfig, share: float = 0.5) -> SelectionSamples:
 
 
 def batch(source: SelectionSamples, count: int = 2) -> SelectionSample:
-    parts = zip(*(source[ticket] for ticket in range(count)), strict=True)
+    parts = zip(*(source[index] for index in range(count)), strict=True)
     return SelectionSample(*(torch.stack(part) for part in parts))
 
 
@@ -85,7 +85,7 @@ def test_a_share_of_the_samples_comes_from_the_second_source(
     folder: Path, pairs: PairsConfig
 ) -> None:
     """Street samples have sky (0), which a plain folder does not know."""
-    made = PairsConfig(
+    synthetic = PairsConfig(
         streets=StreetsConfig(frames=1, scale=0.2, jpeg_share=0.0),
         focal_px=130.0,
         with_cache=True,
@@ -93,7 +93,7 @@ def test_a_share_of_the_samples_comes_from_the_second_source(
     )
     found = [
         bool((sample.left_px == 0).any())
-        for sample in map(samples(pairs, made, share=0.25).__getitem__, range(8))
+        for sample in map(samples(pairs, synthetic, share=0.25).__getitem__, range(8))
     ]
     assert found == [False, False, False, True] * 2
 
@@ -111,8 +111,8 @@ def test_an_image_without_a_right_view_teaches_disparity_alone(
     with pytest.raises(InputError, match="no frame has a right view and a truth"):
         TrainingPairs(config, 0, needs_truth=True)
     source = samples(config)
-    for ticket in range(4):  # mirrored ones too
-        sample = source[ticket]
+    for index in range(4):  # mirrored ones too
+        sample = source[index]
         assert not bool(sample.has_right)
         assert torch.equal(sample.left, sample.right)
         assert bool((sample.left_px > 0).any())

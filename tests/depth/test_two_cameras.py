@@ -1,4 +1,4 @@
-"""One made scene, seen by cameras of several focal lengths and sizes, has one depth."""
+"""One synthetic scene, seen by cameras of several focal lengths and sizes, has one depth."""
 
 import dataclasses
 

@@ -78,7 +78,7 @@ def test_one_network_alone_says_what_it_lacks(
         read_generator(tmp_path / "s.safetensors")
 
 
-def test_weights_of_another_room_are_refused(tmp_path: Path) -> None:
+def test_weights_of_a_pose_network_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "pose.safetensors"
     save_checkpoint(path, Checkpoint(kind="geoposenet", config={}, state={"a": torch.zeros(1)}))
     with pytest.raises(InputError, match="kind 'geoposenet'; depth takes 'generator'"):

@@ -16,8 +16,8 @@ import trimesh
 from PIL import Image
 from tests.core.test_files_fuzz import CALIB, CAMERA, CASES, LZF_PCD, MIDDLEBURY, ROS, XML
 from tests.fuzz import damage
-from tests.pose.made_frames import make_dataset
-from tests.pose.made_object import bracket, tiny_weights
+from tests.pose.synthetic_frames import make_dataset
+from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.cli.doctor_files import look_at_all
 from depthpose.core.camera import StereoRig, read_camera
@@ -366,12 +366,12 @@ def _bop() -> dict[str, Kind]:
 
 def open_bop_results(home: Path) -> dict[str, Kind]:
     """Results, detections and predictions of a data set."""
-    from tests.pose.made_frames import made_pose
+    from tests.pose.synthetic_frames import pose_in_frame
 
     from depthpose.pose.datasets.masks import Detection, write_detections
     from depthpose.pose.predictions import Prediction, write_predictions
 
-    pose = made_pose(0.1, 3)
+    pose = pose_in_frame(0.1, 3)
     rows = [BopResult(scene_id=0, image_id=k, object_id=7, score=0.5, camera_from_model=pose,
                       seconds=0.1) for k in range(3)]  # fmt: skip
     write_results(home / "r.csv", rows)

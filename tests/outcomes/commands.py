@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from tests.depth.made_selection import of_all_kinds, sure_of
-from tests.made_street import make_street, write_pairs
-from tests.pose.made_frames import made_models, make_dataset
-from tests.pose.made_object import bracket, cloud_of, pose_at, tiny_weights
+from tests.depth.constant_selection import of_all_kinds, sure_of
+from tests.pose.synthetic_frames import frame_models, make_dataset
+from tests.pose.synthetic_objects import bracket, cloud_of, pose_at, tiny_weights
 from tests.pose.test_network import published_state
 from tests.raw_pairs import make_raw, write_kalibr
+from tests.synthetic_street import make_street, write_pairs
 from tests.test_cli_engine import make_home
 from tests.test_cli_reproduce_all import write_configs
 
@@ -131,7 +131,7 @@ def make_inputs(home: Path) -> Path:
     for name, text in (("view", VIEW), ("part", PART)):
         (home / f"{name}.yaml").write_text(text)
     make_dataset(home / "bop", frames=2)
-    weights = tiny_weights(*made_models())
+    weights = tiny_weights(*frame_models())
     write_pose_weights(home / "p.safetensors", weights)
     part = make_part("bracket", 3)
     write_bop_models(home / "parts", [part])

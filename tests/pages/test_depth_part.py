@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.made_street import make_street
 from tests.pages.read_page import drawings
+from tests.synthetic_street import make_street
 
 from depthpose.core.draw import draw_depth, draw_share
 from depthpose.core.files import Cloud

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tests.pages.read_page import drawings
-from tests.pose.made_object import K, bracket, cloud_of, pose_at, view_of
+from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.pose.made_object import (
+from tests.pose.synthetic_objects import (
     Oracle,
     bottle,
     box_faces,

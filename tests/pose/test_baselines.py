@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.pose.made_object import bracket
+from tests.pose.synthetic_objects import bracket
 from torch import Tensor
 
 from depthpose.core.camera import project

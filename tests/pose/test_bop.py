@@ -73,7 +73,7 @@ def frame(number: int) -> BopFrame:
 
 
 @pytest.fixture
-def made(tmp_path: Path) -> Path:
+def synthetic(tmp_path: Path) -> Path:
     write_bop_models(tmp_path, [block(1), block(2)])
     write_bop_scene(tmp_path, "test", 3, [frame(0), frame(7)])
     return tmp_path
@@ -85,9 +85,9 @@ def change(path: Path, edit: Callable[[Any], object]) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_what_is_written_is_read_back(made: Path) -> None:
-    assert is_bop(made)
-    data = open_bop(made)
+def test_what_is_written_is_read_back(synthetic: Path) -> None:
+    assert is_bop(synthetic)
+    data = open_bop(synthetic)
     assert (data.layout, len(data)) == ("BOP", 4)
     assert [i.name for i in data.instances] == [
         "000003_000000_000000", "000003_000000_000001",
@@ -104,14 +104,14 @@ def test_what_is_written_is_read_back(made: Path) -> None:
     assert model.diameter_m == pytest.approx(block(2).diameter_m)
     assert torch.allclose(model.keypoints_m, block(2).keypoints_m, atol=1e-6)
     assert model.symmetries.discrete is not None
-    info = read_json(made / "test/000003/scene_gt_info.json")
+    info = read_json(synthetic / "test/000003/scene_gt_info.json")
     assert isinstance(info, dict)
     assert info["0"][1]["bbox_visib"] == [41, 11, 19, 39]
     assert info["7"][0]["visib_fract"] == 1
 
 
-def test_a_predicted_mask_takes_the_place_of_the_annotated(made: Path) -> None:
-    data = open_bop(made)
+def test_a_predicted_mask_takes_the_place_of_the_annotated(synthetic: Path) -> None:
+    data = open_bop(synthetic)
     mask = torch.zeros(60, 80, dtype=torch.bool)
     mask[20:30, 10:20] = True
     assert len(data.sample(data.instances[0], mask).input.points_m) == 100
@@ -119,32 +119,34 @@ def test_a_predicted_mask_takes_the_place_of_the_annotated(made: Path) -> None:
         data.sample(data.instances[0], mask[:4, :5])
 
 
-def test_objects_are_chosen_by_number_or_name(made: Path) -> None:
-    data = open_bop(made)
+def test_objects_are_chosen_by_number_or_name(synthetic: Path) -> None:
+    data = open_bop(synthetic)
     assert {i.object_id for i in data.of_objects(2).instances} == {2}
     assert {i.object_id for i in data.of_objects("block 1").instances} == {1}
     with pytest.raises(InputError, match=r"objects here: \[1, 2\]"):
         data.of_objects("cat")
 
 
-def test_a_whole_folder_passes_the_check(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = check_bop(made)
+def test_a_whole_folder_passes_the_check(
+    synthetic: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = check_bop(synthetic)
     assert report.problems == []
     assert report.summary == (
         "BOP: 2 images, 4 instances, 4 masks, 2 objects, 2 models; nothing is wrong, 0 notices"
     )
-    assert main(["data", "check", str(made)]) == 0
+    assert main(["data", "check", str(synthetic)]) == 0
     assert "nothing is wrong" in capsys.readouterr().out
-    (made / "test/000003/depth/000007.png").unlink()
-    assert main(["data", "check", str(made)]) == 1
+    (synthetic / "test/000003/depth/000007.png").unlink()
+    assert main(["data", "check", str(synthetic)]) == 1
     assert "missing: " in capsys.readouterr().out
 
 
-def test_the_check_names_what_is_wrong(made: Path) -> None:
-    scene = made / "test/000003"
+def test_the_check_names_what_is_wrong(synthetic: Path) -> None:
+    scene = synthetic / "test/000003"
 
     def said() -> str:
-        return " | ".join(f"{p.kind}: {p.message}" for p in check_bop(made, "test").problems)
+        return " | ".join(f"{p.kind}: {p.message}" for p in check_bop(synthetic, "test").problems)
 
     kept = (scene / "scene_camera.json").read_text()
     change(scene / "scene_camera.json", lambda c: c["0"].update(depth_scale=100.0))
@@ -159,20 +161,22 @@ def test_the_check_names_what_is_wrong(made: Path) -> None:
     mask.write_bytes((scene / "mask_visib/000000_000001.png").read_bytes())
     assert "the posed model does not lie on its mask" in said()
     mask.write_bytes(whole)
-    change(made / "models/models_info.json", lambda c: c["1"].update(diameter=70.0))
+    change(synthetic / "models/models_info.json", lambda c: c["1"].update(diameter=70.0))
     assert "is 82.5 mm across, but models_info says 70.0 mm" in said()
-    (made / "models/obj_000002.ply").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    (synthetic / "models/obj_000002.ply").write_bytes(
+        b"version https://git-lfs.github.com/spec/v1\n"
+    )
     assert "is a Git LFS pointer" in said()
-    (made / "models/obj_000002.ply").unlink()
+    (synthetic / "models/obj_000002.ply").unlink()
     assert "has no mesh of object 2" in said()
     with pytest.raises(InputError, match=r"no split 'val'. Here: test"):
-        check_bop(made, "val")
+        check_bop(synthetic, "val")
 
 
-def test_a_model_in_metres_is_reported(made: Path) -> None:
+def test_a_model_in_metres_is_reported(synthetic: Path) -> None:
     mesh = trimesh.creation.box((0.04, 0.04, 0.06))
-    mesh.export(made / "models/obj_000001.ply")
-    problems = check_bop(made).problems
+    mesh.export(synthetic / "models/obj_000001.ply")
+    problems = check_bop(synthetic).problems
     assert any("is it in metres? Then say unit m" in p.message for p in problems)
 
 
@@ -189,40 +193,40 @@ def test_a_model_in_metres_is_reported(made: Path) -> None:
     ],
 )
 def test_damaged_annotations_are_refused(
-    made: Path, edit: Callable[[Any], object], said: str
+    synthetic: Path, edit: Callable[[Any], object], said: str
 ) -> None:
-    change(made / "test/000003/scene_gt.json", edit)
+    change(synthetic / "test/000003/scene_gt.json", edit)
     with pytest.raises(InputError, match=said):
-        open_bop(made)
-    assert not check_bop(made).is_ok
+        open_bop(synthetic)
+    assert not check_bop(synthetic).is_ok
 
 
-def test_damaged_cameras_and_files_are_refused(made: Path) -> None:
-    scene = made / "test/000003"
+def test_damaged_cameras_and_files_are_refused(synthetic: Path) -> None:
+    scene = synthetic / "test/000003"
     kept = (scene / "scene_camera.json").read_text()
     for edit, said in (({"cam_K": [1.0] * 9}, "K is"), ({"depth_scale": 0}, "millimetres a unit"),
                        ({"depth_scale": "1"}, "where a number belongs")):  # fmt: skip
         change(scene / "scene_camera.json", lambda c, e=edit: c["0"].update(e))
         with pytest.raises(InputError, match=said):
-            open_bop(made)
+            open_bop(synthetic)
         (scene / "scene_camera.json").write_text(kept)
     (scene / "scene_gt.json").write_text("[]")
     with pytest.raises(InputError, match="where names to values belong"):
-        open_bop(made)
+        open_bop(synthetic)
     with pytest.raises(InputError, match=r"no split 'val' .*Here: test"):
-        open_bop(made, "val")
+        open_bop(synthetic, "val")
     with pytest.raises(InputError, match=r"no folder models or"):
-        _ = open_bop(linemod(made / "other")).objects
+        _ = open_bop(linemod(synthetic / "other")).objects
     scene.rename(scene.with_name("kitchen"))
     with pytest.raises(InputError, match="scenes have numbers for names"):
-        open_bop(made)
+        open_bop(synthetic)
 
 
-def test_no_mask_is_reported_with_a_remedy(made: Path) -> None:
-    (made / "test/000003/mask_visib/000000_000000.png").unlink()
+def test_no_mask_is_reported_with_a_remedy(synthetic: Path) -> None:
+    (synthetic / "test/000003/mask_visib/000000_000000.png").unlink()
     with pytest.raises(InputError, match="render mask_visib, or give masks of your own"):
-        open_bop(made)[0]
-    assert any("has no mask_visib" in p.message for p in check_bop(made).notices)
+        open_bop(synthetic)[0]
+    assert any("has no mask_visib" in p.message for p in check_bop(synthetic).notices)
 
 
 def linemod(folder: Path) -> Path:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tests.pose.made_frames import make_dataset
+from tests.pose.synthetic_frames import make_dataset
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid

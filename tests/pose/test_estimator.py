@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.pose.made_object import (
+from tests.pose.synthetic_objects import (
     FACTS,
     K,
     Oracle,
@@ -217,18 +217,18 @@ def test_the_keypoints_of_another_object_do_not_fit(part: ObjectModel) -> None:
     cloud = cloud_of(part, truth)
     net = Oracle(tiny_weights(part), [truth])
     stretched = dataclasses.replace(part, keypoints_m=part.keypoints_m.flip(0) * 1.2)
-    told = dataclasses.replace(net.weights, models=(stretched,))
+    weights = dataclasses.replace(net.weights, models=(stretched,))
 
     class Liar(Oracle):
         def _true(self, points_m: torch.Tensor, number: int) -> torch.Tensor:
             return net._true(points_m, number)
 
-    found = Liar(told, [truth]).estimate(cloud=cloud)
+    found = Liar(weights, [truth]).estimate(cloud=cloud)
     assert found.status == "keypoints do not fit"
     assert "another object, or too much of it occluded" in found.reason
 
 
-def test_rough_votes_are_mended_where_a_risk_judges_them(part: ObjectModel) -> None:
+def test_rough_votes_are_refined_where_a_risk_is_estimated(part: ObjectModel) -> None:
     """Keypoints off by a seventh of the diameter break the strict test; ICP mends their pose."""
     truth = pose_at()
     cloud = cloud_of(part, truth)

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import torch
-from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 

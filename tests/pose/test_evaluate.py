@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from tests.pose.made_frames import (
+from tests.pose.synthetic_frames import (
     K,
-    made_models,
-    made_pose,
+    frame_models,
     make_dataset,
     moved,
+    pose_in_frame,
     predictions_of,
 )
 
@@ -45,12 +45,12 @@ def columns(rows: Sequence[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str,
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_dataset(tmp_path_factory.mktemp("made"))
 
 
-def test_the_truth_itself_is_perfect(made: BopDataset) -> None:
-    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model))
+def test_the_truth_itself_is_perfect(synthetic: BopDataset) -> None:
+    result = evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model))
     assert [row.object for row in result.rows] == ["bracket", "bottle", "mean", "all"]
     for row in columns(result.rows):
         for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
@@ -60,15 +60,15 @@ def test_the_truth_itself_is_perfect(made: BopDataset) -> None:
         assert row["ms_network"] == pytest.approx(20.0)
         assert row["ms_total"] == pytest.approx(25.0)
         assert "ms_icp" not in row
-        assert row["frames_sha256"] == frames_hash(made.instances)[:12]
+        assert row["frames_sha256"] == frames_hash(synthetic.instances)[:12]
     assert [row.metric for row in result.rows[:2]] == ["ADD", "ADD-S"]
     assert columns(result.rows)[2]["instances"] == columns(result.rows)[3]["instances"] == 6
 
 
-def test_a_turn_about_the_axis_of_a_bottle_is_no_error(made: BopDataset) -> None:
+def test_a_turn_about_the_axis_of_a_bottle_is_no_error(synthetic: BopDataset) -> None:
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
     quarter = Rigid(turn, torch.zeros(3).double())
-    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model @ quarter))
+    result = evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model @ quarter))
     bracket, bottle = columns(result.rows[:2])
     assert bracket["wrong"] == 1.0
     assert bracket["rotation_deg_median"] == pytest.approx(90.0)
@@ -78,13 +78,13 @@ def test_a_turn_about_the_axis_of_a_bottle_is_no_error(made: BopDataset) -> None
     assert bottle["ar"] > 0.99
 
 
-def test_errors_are_those_of_the_definitions(made: BopDataset) -> None:
+def test_errors_are_those_of_the_definitions(synthetic: BopDataset) -> None:
     def off(instance):  # noqa: ANN001, ANN202
         return moved(instance, [0.0, 0.0, 0.0, 0.0, 0.0, 0.012])
 
-    result = evaluate(made, predictions_of(made, off))
-    for row, instance in zip(columns(result.per_instance), made.instances, strict=True):
-        points = made.objects[instance.object_id].vertices_m
+    result = evaluate(synthetic, predictions_of(synthetic, off))
+    for row, instance in zip(columns(result.per_instance), synthetic.instances, strict=True):
+        points = synthetic.objects[instance.object_id].vertices_m
         error = add_m if row["metric"] == "ADD" else adds_m
         exact = float(error(off(instance), instance.camera_from_model, points))
         assert row["error_m"] == pytest.approx(exact)
@@ -101,10 +101,10 @@ def test_errors_are_those_of_the_definitions(made: BopDataset) -> None:
     assert columns(result.rows)[0]["auc"] == pytest.approx(1 - 0.12)
 
 
-def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDataset) -> None:
-    first, second = made.instances[0].name, made.instances[2].name
-    every = predictions_of(made, lambda i: None if i.name == second else i.camera_from_model)
-    result = evaluate(made, [p for p in every if p.estimate.name != first])
+def test_a_missing_or_refused_estimate_stays_in_every_denominator(synthetic: BopDataset) -> None:
+    first, second = synthetic.instances[0].name, synthetic.instances[2].name
+    every = predictions_of(synthetic, lambda i: None if i.name == second else i.camera_from_model)
+    result = evaluate(synthetic, [p for p in every if p.estimate.name != first])
     bracket, bottle, mean, pooled = columns(result.rows)
     for name in ("success", "coverage", "auc", "ar", "ar_vsd", "ar_mssd", "ar_mspd"):
         assert bracket[name] == pytest.approx(1 / 3), name
@@ -118,21 +118,23 @@ def test_a_missing_or_refused_estimate_stays_in_every_denominator(made: BopDatas
     assert result.per_instance[2].reason == "the directions are parallel"
 
 
-def test_without_vsd_no_depth_is_decoded(made: BopDataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = predictions_of(made, lambda i: i.camera_from_model)
+def test_without_vsd_no_depth_is_decoded(
+    synthetic: BopDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = predictions_of(synthetic, lambda i: i.camera_from_model)
     monkeypatch.setattr(errors, "read_depth_png", None)
-    result = evaluate(made, answers, EvaluationConfig(with_vsd=False))
+    result = evaluate(synthetic, answers, EvaluationConfig(with_vsd=False))
     assert columns(result.rows)[0]["ar_mspd"] == pytest.approx(1.0)
 
 
-def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
+def test_a_wrong_answer_is_no_refusal(synthetic: BopDataset) -> None:
     far = [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
-    first = made.instances[0].name
+    first = synthetic.instances[0].name
     every = predictions_of(
-        made, lambda i: moved(i, far) if i.name == first else i.camera_from_model
+        synthetic, lambda i: moved(i, far) if i.name == first else i.camera_from_model
     )
     every[0] = replace(every[0], estimate=replace(every[0].estimate, inlier_share=0.1))
-    result = evaluate(made, every)
+    result = evaluate(synthetic, every)
     assert columns(result.rows)[0]["wrong"] == pytest.approx(1 / 3)
     assert columns(result.rows)[0]["refused"] == 0.0
     # The wrong one is the least sure: who asks for less gets no wrong answer.
@@ -141,29 +143,29 @@ def test_a_wrong_answer_is_no_refusal(made: BopDataset) -> None:
     assert result.risk[-1].coverage == 1.0
 
 
-def test_behind_the_camera_is_measured_too(made: BopDataset) -> None:
+def test_behind_the_camera_is_measured_too(synthetic: BopDataset) -> None:
     back = [0.0, 0.0, 0.0, 0.0, 0.0, -1.5]
-    result = evaluate(made, predictions_of(made, lambda i: moved(i, back)))
+    result = evaluate(synthetic, predictions_of(synthetic, lambda i: moved(i, back)))
     assert columns(result.rows)[-1]["ar"] == 0.0
     assert result.per_instance[0].error("mspd_px") is None
     assert result.per_instance[0].error("vsd") == 1.0
 
 
-def test_files_are_measured_alike(made: BopDataset, tmp_path: Path) -> None:
-    every = predictions_of(made, lambda i: moved(i, [0.1, 0.0, 0.0, 0.0, 0.0, 0.01]))
+def test_files_are_measured_alike(synthetic: BopDataset, tmp_path: Path) -> None:
+    every = predictions_of(synthetic, lambda i: moved(i, [0.1, 0.0, 0.0, 0.0, 0.0, 0.01]))
     write_predictions(tmp_path, every)
     write_bop_results(tmp_path / "ours_made-test.csv", every)
-    ours = columns(evaluate(made, read_any(tmp_path)).rows)
-    csv = columns(evaluate(made, read_any(tmp_path / "ours_made-test.csv")).rows)
+    ours = columns(evaluate(synthetic, read_any(tmp_path)).rows)
+    csv = columns(evaluate(synthetic, read_any(tmp_path / "ours_made-test.csv")).rows)
     for one, other in zip(ours, csv, strict=True):
         for name in ("success", "auc", "ar", "rotation_deg_median", "ms_total"):
             assert one[name] == pytest.approx(other[name]), name
     assert "ms_network" not in csv[0]
 
 
-def test_several_of_an_object_are_set_against_their_nearest(made: BopDataset) -> None:
+def test_several_of_an_object_are_set_against_their_nearest(synthetic: BopDataset) -> None:
     # Both objects of each image are taken for brackets, and their estimates have no names.
-    two = replace(made, instances=[replace(i, object_id=7) for i in made.instances[:2]])
+    two = replace(synthetic, instances=[replace(i, object_id=7) for i in synthetic.instances[:2]])
     answers = predictions_of(two, lambda i: moved(i, [0.0] * 5 + [0.001]))
     stray = predictions_of(two, lambda i: moved(i, [0.0] * 5 + [0.4]))[0]
     stray = replace(stray, estimate=replace(stray.estimate, inlier_share=0.2))
@@ -175,58 +177,58 @@ def test_several_of_an_object_are_set_against_their_nearest(made: BopDataset) ->
     assert (row.success, row.instances) == (1.0, 2)
 
 
-def test_the_diameter_table_is_named_and_decides(made: BopDataset) -> None:
-    cat = replace(made.objects[7], number=6, diameter_m=0.154546)
+def test_the_diameter_table_is_named_and_decides(synthetic: BopDataset) -> None:
+    cat = replace(synthetic.objects[7], number=6, diameter_m=0.154546)
     pvnet = EvaluationConfig(diameters="pvnet")
     assert diameter_of(cat, EvaluationConfig()) == 0.154546
     assert diameter_of(cat, pvnet) == 0.152633
     with pytest.raises(InputError, match=r"object 7 \(bracket\) .* no object of PVNet's table"):
-        evaluate(made, predictions_of(made, lambda i: i.camera_from_model), pvnet)
+        evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model), pvnet)
 
 
-def test_symmetry_or_the_rule_decides_which_of_the_two_adds(made: BopDataset) -> None:
-    glue = replace(made.objects[7], symmetries=linemod_symmetries(11))
+def test_symmetry_or_the_rule_decides_which_of_the_two_adds(synthetic: BopDataset) -> None:
+    glue = replace(synthetic.objects[7], symmetries=linemod_symmetries(11))
     cat = replace(glue, symmetries=linemod_symmetries(6))
     assert [is_adds(model, EvaluationConfig()) for model in (glue, cat)] == [True, False]
     assert is_adds(cat, EvaluationConfig(adds="all"))
 
 
-def test_targets_keep_the_most_visible(made: BopDataset) -> None:
-    hidden = replace(made.instances[1], object_id=7, visible_fraction=0.2)
-    some = replace(made, instances=[hidden, *made.instances])
+def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:
+    hidden = replace(synthetic.instances[1], object_id=7, visible_fraction=0.2)
+    some = replace(synthetic, instances=[hidden, *synthetic.instances])
     target = Target(scene_id=1, image_id=0, object_id=7, count=1)
-    assert [i.name for i in of_targets(some, [target]).instances] == [made.instances[0].name]
-    assert frames_hash(some.instances) != frames_hash(made.instances)
+    assert [i.name for i in of_targets(some, [target]).instances] == [synthetic.instances[0].name]
+    assert frames_hash(some.instances) != frames_hash(synthetic.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
         of_targets(some, [replace(target, count=3)])
 
 
-def test_an_estimate_that_belongs_elsewhere_answers_for_none(made: BopDataset) -> None:
-    every = predictions_of(made, lambda i: i.camera_from_model)
+def test_an_estimate_that_belongs_elsewhere_answers_for_none(synthetic: BopDataset) -> None:
+    every = predictions_of(synthetic, lambda i: i.camera_from_model)
     elsewhere = [replace(p, place=Place(9, 9, 99)) for p in every]
     with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
-        evaluate(made, elsewhere)
-    result = evaluate(made, [*every[:1], *elsewhere[1:]])
+        evaluate(synthetic, elsewhere)
+    result = evaluate(synthetic, [*every[:1], *elsewhere[1:]])
     assert [row.status for row in result.per_instance] == ["ok"] + ["missing"] * 5
     nowhere = [replace(p, place=None) for p in every]
-    assert evaluate(made, nowhere).rows[-1].success == 1.0
+    assert evaluate(synthetic, nowhere).rows[-1].success == 1.0
 
 
-def test_predictions_of_another_data_set_are_refused(made: BopDataset) -> None:
-    strangers = [
+def test_predictions_of_another_data_set_are_refused(synthetic: BopDataset) -> None:
+    unknown = [
         replace(p, estimate=replace(p.estimate, name=f"x{k}"), place=None)
-        for k, p in enumerate(predictions_of(made, lambda i: i.camera_from_model))
+        for k, p in enumerate(predictions_of(synthetic, lambda i: i.camera_from_model))
     ]
     with pytest.raises(InputError, match="none of the 6 predictions is of one of its 6 instances"):
-        evaluate(made, strangers)
-    assert evaluate(made, []).rows[0].refused == 1.0
+        evaluate(synthetic, unknown)
+    assert evaluate(synthetic, []).rows[0].refused == 1.0
     with pytest.raises(InputError, match="vsd_delta_m is 15"):
         EvaluationConfig(vsd_delta_m=15.0)
 
 
 def test_the_nearest_copy_of_what_turns_freely_is_the_estimate_itself() -> None:
-    bracket, bottle = made_models()
-    true = made_pose(0.0, 3)
+    bracket, bottle = frame_models()
+    true = pose_in_frame(0.0, 3)
     (axis,) = bottle.symmetries.continuous
     turn = perturb(
         Rigid(torch.eye(3).double(), torch.zeros(3).double()),
@@ -244,8 +246,8 @@ _SCORES = ["auc", "auc_adds", "ar_mssd", "ar_mspd", "ar_vsd", "ar", "rotation_de
            "translation_m_median"]  # fmt: skip
 
 
-def test_columns_come_in_the_declared_order(made: BopDataset) -> None:
-    result = evaluate(made, predictions_of(made, lambda i: i.camera_from_model))
+def test_columns_come_in_the_declared_order(synthetic: BopDataset) -> None:
+    result = evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model))
     found = result.of(Origin(method="ours", masks="truth", weights="w", weights_sha256="ab"))
     who, times = ["method", "masks"], ["ms_network", "ms_voting", "ms_total"]
     stamp = ["diameters", "frames", "frames_sha256"]

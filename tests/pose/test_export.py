@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.pose.made_object import bottle, bracket, tiny_weights
+from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
 from torch import Tensor
 
 from depthpose.cli import main

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.pose.made_frames import make_dataset, moved, predictions_of
-from tests.pose.made_object import bracket
+from tests.pose.synthetic_frames import make_dataset, moved, predictions_of
+from tests.pose.synthetic_objects import bracket
 from torch.nn.functional import huber_loss
 
 from depthpose.cli import main

@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from tests.pose.made_object import bracket
+from tests.pose.synthetic_objects import bracket
 
 from depthpose.core.errors import InputError
 from depthpose.thesis.pose_figures import (

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.pose.made_object import K, Oracle, bottle, bracket, pose_at, tiny_weights, view_of
+from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, pose_at, tiny_weights, view_of
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.errors import InputError

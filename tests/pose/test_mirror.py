@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tests.pose.made_object import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig

@@ -1,7 +1,7 @@
 """What a 3D view shows of a pose."""
 
 import torch
-from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.files import Cloud
 from depthpose.pose.mesh import make_model

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.pose.made_object import bracket, cloud_of, pose_at
+from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
@@ -150,7 +150,7 @@ def test_what_a_start_won_is_not_lost_on_the_way() -> None:
     assert float(add_m(found, truth, model.vertices_m)) < 0.01 * model.diameter_m
 
 
-def test_one_step_is_judged_by_the_last_limit(stone: ObjectModel, surface: Surface) -> None:
+def test_one_step_is_checked_by_the_last_limit(stone: ObjectModel, surface: Surface) -> None:
     cloud = seen_half(stone, TRUE)
     noise = torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0)).double()
     cloud = cloud + 0.04 * stone.diameter_m * noise

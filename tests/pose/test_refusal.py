@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from tests.pose.made_object import bracket, cloud_of, pose_at
+from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
 
 from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
@@ -27,7 +27,7 @@ def answer(**signals: float) -> PoseEstimate:
     return PoseEstimate(name="a", object="b", status="ok", camera_from_model=EYE, signals=every)
 
 
-def made(count: int, seed: int) -> tuple[list[PoseEstimate], list[bool]]:
+def labelled_answers(count: int, seed: int) -> tuple[list[PoseEstimate], list[bool]]:
     """Wrong with the odds ``(20 far + 0.2)^4 / 400``, whatever ``tilt`` says."""
     generator = torch.Generator().manual_seed(seed)
     far, tilt, luck = torch.rand(3, count, generator=generator)
@@ -78,7 +78,7 @@ def test_the_means_are_those_of_right_answers() -> None:
 
 
 def test_calibration_finds_what_makes_answers_wrong() -> None:
-    config = calibrate_refusal(*made(4000, 0), max_wrong_share=0.02)
+    config = calibrate_refusal(*labelled_answers(4000, 0), max_wrong_share=0.02)
     assert config.slopes["far"] == pytest.approx(4, rel=0.2)
     assert config.bias == pytest.approx(4 * math.log(20) - math.log(400), rel=0.2)
     assert 0 <= config.slopes["tilt"] < 0.5
@@ -87,8 +87,8 @@ def test_calibration_finds_what_makes_answers_wrong() -> None:
 
 
 def test_wrong_answers_stay_below_the_settled_share_on_other_data() -> None:
-    config = calibrate_refusal(*made(4000, 0), max_wrong_share=0.02)
-    answers, is_right = made(4000, 1)
+    config = calibrate_refusal(*labelled_answers(4000, 0), max_wrong_share=0.02)
+    answers, is_right = labelled_answers(4000, 1)
     risks = [risk_of(a.signals, config) or 0.0 for a in answers]
     kept = [ok for ok, risk in zip(is_right, risks, strict=True) if risk <= config.max_risk]
     assert 300 < len(kept) < 1600
@@ -105,7 +105,7 @@ def test_too_few_data_for_the_share_allow_no_mistake() -> None:
 
 
 def test_answers_that_are_all_right_are_all_given() -> None:
-    answers, _ = made(200, 0)
+    answers, _ = labelled_answers(200, 0)
     config = calibrate_refusal(answers, [True] * 200)
     assert all((risk_of(a.signals, config) or 0) <= config.max_risk for a in answers)
 

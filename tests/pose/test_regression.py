@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from tests.pose.made_object import FACTS, K, bracket, pose_at, view_of
+from tests.pose.synthetic_objects import FACTS, K, bracket, pose_at, view_of
 
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet

@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 import torch
-from tests.pose.made_object import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator

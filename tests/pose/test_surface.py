@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.pose.made_object import bottle, bracket, cloud_of, pose_at
+from tests.pose.synthetic_objects import bottle, bracket, cloud_of, pose_at
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
@@ -72,7 +72,7 @@ def test_the_true_pose_hides_nothing_and_shows_what_was_seen(
     front, unseen = look_along_rays(cloud_m, poses, surface)
     assert front.tolist() == pytest.approx([0, 1, 0, 1], abs=0.08)
     assert unseen.tolist() == pytest.approx([0, 0, 1, 1], abs=0.16)
-    # Each is judged alone.
+    # Each is checked alone.
     alone = [look_along_rays(cloud_m, batch_of(Rigid(R, t_m)), surface)
              for R, t_m in zip(poses.R, poses.t_m, strict=True)]  # fmt: skip
     assert torch.equal(torch.cat([f for f, _ in alone]), front)

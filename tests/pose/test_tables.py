@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.pose.made_frames import made_pose
-from tests.pose.made_object import bracket, tiny_weights
+from tests.pose.synthetic_frames import pose_in_frame
+from tests.pose.synthetic_objects import bracket, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -92,7 +92,7 @@ def test_baselines_stand_below_the_method() -> None:
 def exact_case(points: int, wrong: float, seed: int = 0) -> VotingCase:
     """A cloud of the bracket whose votes are exact, but for a share that points anywhere."""
     generator = torch.Generator().manual_seed(seed)
-    model, pose = bracket(), made_pose(0.0, seed)
+    model, pose = bracket(), pose_in_frame(0.0, seed)
     truth = Rigid(pose.R.float(), pose.t_m.float())
     chosen = torch.randint(len(model.vertices_m), (points,), generator=generator)
     jitter = 0.03 * torch.rand(points, 3, generator=generator)

@@ -10,8 +10,8 @@ from typing import Literal
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.pose.made_object import bottle, bracket, tiny_weights
 from tests.pose.stopping import StoppedError, stop_after
+from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
@@ -59,7 +59,7 @@ from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_we
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
 _CLOUD = CloudConfig(voxel_m=0.01, max_points=300)
-_MADE = ObjectsConfig(views=2, number=6)
+_VIEWS = ObjectsConfig(views=2, number=6)
 _FOUR_KEYPOINTS = ModelsConfig(parts=("bracket",), mesh=MeshConfig(keypoints=4))
 
 
@@ -73,7 +73,7 @@ def _models() -> tuple[ObjectModel, ...]:
 def _training(**changes: object) -> PoseTraining:
     config = PoseTraining(
         models=ModelsConfig(parts=("bracket",)),
-        objects=_MADE,
+        objects=_VIEWS,
         cloud=_CLOUD,
         network=_SMALL,
         held_out=HeldOutConfig(number=2, occlusions=(0.0,)),
@@ -84,7 +84,7 @@ def _training(**changes: object) -> PoseTraining:
 
 
 def test_an_index_gives_the_same_cloud_at_any_time() -> None:
-    one, other = (TrainingClouds(_models(), _MADE, None, _CLOUD, 0) for _ in range(2))
+    one, other = (TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0) for _ in range(2))
     for ticket in (0, 5, 17):
         first, second = one[ticket], other[ticket]
         assert torch.equal(first.points_m, second.points_m)
@@ -93,16 +93,16 @@ def test_an_index_gives_the_same_cloud_at_any_time() -> None:
 
 
 def test_the_first_object_may_begin_alone() -> None:
-    clouds = TrainingClouds(_models(), _MADE, None, _CLOUD, 0, first_alone=4)
+    clouds = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0, first_alone=4)
     assert [clouds[i].class_number for i in range(8)] == [0, 0, 0, 0, 0, 1, 0, 1]
-    plain = TrainingClouds(_models(), _MADE, None, _CLOUD, 0)
+    plain = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0)
     assert torch.equal(clouds[5].points_m, plain[5].points_m)
     # They are different views.
     assert not torch.equal(clouds[1].R, clouds[2].R)
 
 
 def test_a_batch_keeps_clouds_apart_and_points_in_their_voxels() -> None:
-    clouds = TrainingClouds(_models(), _MADE, None, _CLOUD, 0)
+    clouds = TrainingClouds(_models(), _VIEWS, None, _CLOUD, 0)
     parts = [clouds[i] for i in range(3)]
     batch = TrainingClouds.collate(parts)
     assert batch.class_of.tolist() == [0, 1, 0]
@@ -134,7 +134,7 @@ def _truth_of(batch, models, copy: int) -> torch.Tensor:  # noqa: ANN001
 @pytest.mark.parametrize("copy", [0, 7])
 def test_true_directions_cost_nothing_whichever_copy_they_point_at(copy: int) -> None:
     models = _models()
-    clouds = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     batch = TrainingClouds.collate([clouds[0], clouds[1]])
     network = _Oracle(_SMALL)
     task = PoseTask(network, models, _training(), None)
@@ -159,7 +159,7 @@ def test_copies_of_the_keypoints_lie_on_the_turned_object() -> None:
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
     models = _models()
-    clouds = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    clouds = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     batch = TrainingClouds.collate([clouds[i] for i in range(4)])
     config = _training(adam=AdamConfig(learning_rate=0.01))
     task = PoseTask(ResUNet(_SMALL), models, config, None)
@@ -189,14 +189,14 @@ def _frames_folder(folder: Path) -> Path:
     return folder
 
 
-def test_frames_and_made_views_mix_and_frames_stay_true(tmp_path: Path) -> None:
+def test_frames_and_synthetic_views_mix_and_frames_stay_true(tmp_path: Path) -> None:
     folder = _frames_folder(tmp_path)
     models = read_models(ModelsConfig(bop=str(folder)))
     frames = FramesConfig(folder=str(folder), share=0.5)
-    clouds = TrainingClouds(models, _MADE, frames, _CLOUD, 0)
-    real = TrainingClouds(models, _MADE, dataclasses.replace(frames, share=1.0), _CLOUD, 0)
+    clouds = TrainingClouds(models, _VIEWS, frames, _CLOUD, 0)
+    real = TrainingClouds(models, _VIEWS, dataclasses.replace(frames, share=1.0), _CLOUD, 0)
     assert len(clouds) == 2 * len(real)
-    made = Objects(models, _MADE, _CLOUD)
+    made = Objects(models, _VIEWS, _CLOUD)
     is_made = [
         torch.allclose(clouds[i].t_m.norm(), made.sample(i).truth.camera_from_model.t_m.norm())
         for i in range(30)
@@ -215,11 +215,11 @@ def test_frames_of_other_names_are_refused(tmp_path: Path) -> None:
     frames = FramesConfig(folder=str(folder))
     models = [dataclasses.replace(model, name=model.name + "_x") for model in _models()]
     with pytest.raises(InputError, match="is called 'bracket' there, and 'bracket_x' here"):
-        TrainingClouds(models, _MADE, frames, _CLOUD, 0)
+        TrainingClouds(models, _VIEWS, frames, _CLOUD, 0)
 
 
 def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
-    far = dataclasses.replace(_MADE, distance_m=(19.0, 20.0))
+    far = dataclasses.replace(_VIEWS, distance_m=(19.0, 20.0))
     clouds = TrainingClouds(_models(), far, None, CloudConfig(min_points=500), 0)
     with pytest.raises(InputError, match="20 samples in a row have fewer than 500 points; bring"):
         clouds[0]
@@ -227,8 +227,8 @@ def test_views_too_far_for_their_voxels_are_refused_with_a_reason() -> None:
 
 def test_held_out_views_are_not_those_that_are_trained_on() -> None:
     models = _models()
-    held_out = HeldOut(models, _MADE, _CLOUD, HeldOutConfig(number=2))
-    trained = TrainingClouds(models, _MADE, None, _CLOUD, 0)
+    held_out = HeldOut(models, _VIEWS, _CLOUD, HeldOutConfig(number=2))
+    trained = TrainingClouds(models, _VIEWS, None, _CLOUD, 0)
     known = [trained[i].R for i in range(8)]
     for cloud in held_out._of(0.3):
         assert not any(torch.allclose(cloud.R, R) for R in known)
@@ -246,16 +246,16 @@ def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
     config = HeldOutConfig(number=3, occlusions=(0.0,), with_ransac=False)
     network = ResUNet(_SMALL).eval()
     none = HeldOut(
-        _models(), _MADE, dataclasses.replace(_CLOUD, max_points=None, min_points=10**6), config
+        _models(), _VIEWS, dataclasses.replace(_CLOUD, max_points=None, min_points=10**6), config
     )
     numbers = none.look(network).numbers
     assert numbers["held_out/occluded_0/lines_add_10"] == 0
     assert numbers["held_out/occluded_0/lines_median"] == math.inf
-    made = held_out_objects(_models(), _MADE, _CLOUD, config, 0.0)
+    made = held_out_objects(_models(), _VIEWS, _CLOUD, config, 0.0)
     seen = sorted(len(made[i].input.points_m) for i in range(6))
     some = dataclasses.replace(_CLOUD, max_points=None, min_points=seen[4])
     with torch.no_grad():
-        errors = HeldOut(_models(), _MADE, some, config)._errors(network, 0.0)["lines"]
+        errors = HeldOut(_models(), _VIEWS, some, config)._errors(network, 0.0)["lines"]
     assert len(errors) == 6
     assert int(errors.isfinite().sum()) == sum(count >= seen[4] for count in seen) < 6
 
@@ -291,7 +291,7 @@ def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> Non
     config = _training(models=parts, start=str(first), adam=still, loop=loop)
     then = train_pose(config, Run(folder=tmp_path / "then"))
     networks = [read_pose_weights(path).network for path in (first, then)]
-    cloud = TrainingClouds(_models(), _MADE, None, _CLOUD, seed=1)[0]
+    cloud = TrainingClouds(_models(), _VIEWS, None, _CLOUD, seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
     seen = [n.point_features(voxels).detach() for n in networks if isinstance(n, ResUNet)]
     assert float((seen[1] - seen[0]).norm() / seen[0].norm()) < 0.1
@@ -321,7 +321,7 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("norm", ["batch", "none"])
-def test_a_start_that_was_told_less_of_a_voxel_does_not_listen_to_more(
+def test_a_start_with_fewer_voxel_features_ignores_the_new_ones(
     tmp_path: Path, norm: Literal["batch", "none"]
 ) -> None:
     first = train_pose(_training(), Run(folder=tmp_path / "first"))
@@ -336,7 +336,7 @@ def test_a_start_that_was_told_less_of_a_voxel_does_not_listen_to_more(
     assert [network.config.inputs for network in networks] == [1, 9]
     answers = []
     for weights, network in zip(found, networks, strict=True):
-        view = TrainingClouds(_models()[:1], _MADE, None, weights.cloud, seed=1)[0]
+        view = TrainingClouds(_models()[:1], _VIEWS, None, weights.cloud, seed=1)[0]
         answers.append(network.directions(TrainingClouds.collate([view]).seen).detach())
     # A batch norm has other statistics after its first batch, and nothing else changed.
     assert float((answers[1] - answers[0]).norm() / answers[0].norm()) < 0.1
@@ -420,15 +420,15 @@ def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", _as_known)
     weights = tiny_weights(*_models())
     held_out = HeldOutConfig(number=100, occlusions=(0.0,))
-    uncalibrated = score_held_out(weights, _MADE, held_out)["0"]
+    uncalibrated = score_held_out(weights, _VIEWS, held_out)["0"]
     assert uncalibrated["wrong"] == pytest.approx(0.4)
     views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=0)
-    chosen = calibrated(weights, _MADE, views)
-    table = score_held_out(chosen, _MADE, held_out)
+    chosen = calibrated(weights, _VIEWS, views)
+    table = score_held_out(chosen, _VIEWS, held_out)
     assert (table["0"]["wrong"] or 0.0) <= 0.02
     assert (table["0"]["right"] or 0.0) > 0.55
     opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
-    without = score_held_out(dataclasses.replace(chosen, refusal=opened), _MADE, held_out)["0"]
+    without = score_held_out(dataclasses.replace(chosen, refusal=opened), _VIEWS, held_out)["0"]
     assert without["wrong"] == pytest.approx(0.4)
     assert "| occluded % | right % | wrong % | refused %" in table_text(table)
     assert table_text(table).splitlines()[-1].startswith("| 0 | ")
@@ -443,9 +443,9 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
     weights = tiny_weights(*_models())
-    assert calibrated(weights, _MADE, CalibrationConfig(number=0)) is weights
-    _ = calibrated(weights, _MADE, CalibrationConfig(number=20, negatives=0))
-    _ = score_held_out(weights, _MADE, HeldOutConfig(number=6, occlusions=(0.0,)))
+    assert calibrated(weights, _VIEWS, CalibrationConfig(number=0)) is weights
+    _ = calibrated(weights, _VIEWS, CalibrationConfig(number=20, negatives=0))
+    _ = score_held_out(weights, _VIEWS, HeldOutConfig(number=6, occlusions=(0.0,)))
     calibration, held_out = (objects[0].input.points_m for objects in seen)
     assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
@@ -465,7 +465,7 @@ def test_the_refusal_is_chosen_on_negatives_too(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
     weights = tiny_weights(*_models())
     views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=16)
-    config = calibrated(weights, _MADE, views).refusal
+    config = calibrated(weights, _VIEWS, views).refusal
     assert [len(models) for models in shown] == [2, 2, 32]
     assert {model.name for model in shown[-1]} == {"bracket", "bottle"}
     right, negative = dict.fromkeys(SIGNALS, 0.0), {"far": 0.5, "size": 0.5}
@@ -485,7 +485,7 @@ def test_a_network_that_is_never_right_is_not_looked_at_for_long(
 
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", wrong)
     weights = tiny_weights(*_models())
-    refusal = calibrated(weights, _MADE, CalibrationConfig(number=600)).refusal
+    refusal = calibrated(weights, _VIEWS, CalibrationConfig(number=600)).refusal
     assert looked_at == [2 * 50]
     assert refusal.max_risk == 0
 
@@ -503,14 +503,14 @@ def test_models_come_from_one_source(tmp_path: Path) -> None:
 
 
 def test_symmetries_of_a_cad_file_are_reported_and_taken_on_request(tmp_path: Path) -> None:
-    file, told = str(write_part("flange", tmp_path)), []
-    (plain,) = read_models(ModelsConfig(cad=(file,)), told.append)
+    file, printed = str(write_part("flange", tmp_path)), []
+    (plain,) = read_models(ModelsConfig(cad=(file,)), printed.append)
     assert plain.symmetries.is_none
-    assert "flange: looks the same after 5 turns, about 0 axes" in told[0]
-    assert "--symmetries found" in told[0]
-    (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", told[0])
+    assert "flange: looks the same after 5 turns, about 0 axes" in printed[0]
+    assert "--symmetries found" in printed[0]
+    (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", printed[0])
     assert float(certainty) > 0.5
-    (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), told.append)
+    (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), printed.append)
     assert taken.symmetries.discrete is not None
     assert len(taken.symmetries.discrete.R) == 5
 
@@ -519,15 +519,15 @@ def test_symmetries_that_a_data_set_does_not_declare_are_found_too(tmp_path: Pat
     declared = dataclasses.replace(bottle(), number=1)
     silent = dataclasses.replace(bottle(), number=2, symmetries=Symmetries())
     write_bop_models(tmp_path, [declared, silent])
-    told: list[str] = []
+    printed: list[str] = []
     config = ModelsConfig(bop=str(tmp_path), with_found_symmetries=True)
-    models = read_models(config, told.append)
+    models = read_models(config, printed.append)
     assert [len(model.symmetries.continuous) for model in models] == [1, 1]
     axis = models[1].symmetries.continuous[0].direction
     assert float(axis[2].abs()) == pytest.approx(1, abs=1e-3)
     # What is declared stands, and nobody looks for more.
-    assert len(told) == 1
-    assert "about 1 axes" in told[0]
+    assert len(printed) == 1
+    assert "about 1 axes" in printed[0]
     assert read_models(ModelsConfig(bop=str(tmp_path)))[1].symmetries.is_none
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.pose.made_object import bottle, bracket
 from tests.pose.stopping import StoppedError, stop_after
+from tests.pose.synthetic_objects import bottle, bracket
 
 from depthpose.core.checkpoint import (
     Checkpoint,
@@ -48,7 +48,7 @@ from depthpose.pose.train.images import (
 from depthpose.pose.train.other_configs import ImageAugmentConfig, ImagesConfig
 
 LOOP = LoopConfig(steps=2, batch_size=2, device="cpu", log_every_steps=1)
-MADE = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))
+VIEWS = ObjectsConfig(number=8, views=2, resolution=(0.25, 0.25), distance_m=(0.6, 0.7))
 HELD_OUT = HeldOutConfig(number=1, occlusions=(0.0,), with_ransac=False)
 
 
@@ -62,14 +62,14 @@ def models_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pointnet_config(folder: Path) -> PointNetTraining:
     network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8), with_transforms=False)
     return PointNetTraining(
-        models=ModelsConfig(bop=str(folder)), objects=MADE, network=network, held_out=HELD_OUT,
+        models=ModelsConfig(bop=str(folder)), objects=VIEWS, network=network, held_out=HELD_OUT,
         cloud=CloudConfig(max_points=50), loop=LOOP, calibration=CalibrationConfig(number=0),
     )  # fmt: skip
 
 
 def depth_image_config(folder: Path) -> DepthImageTraining:
     return DepthImageTraining(
-        models=ModelsConfig(bop=str(folder)), objects=MADE, held_out=HELD_OUT, loop=LOOP,
+        models=ModelsConfig(bop=str(folder)), objects=VIEWS, held_out=HELD_OUT, loop=LOOP,
         network=DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8)), surface_points=50,
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ def test_the_pointnet_trains_and_its_file_is_an_estimators(
     assert "held_out/occluded_0/lines_add_10" in rows[-1]
     net = GeoPoseNet.load(path)
     assert net.objects == ("bracket",)
-    (found,) = net.estimate_many([Objects([bracket()], MADE)[0].input])
+    (found,) = net.estimate_many([Objects([bracket()], VIEWS)[0].input])
     assert found.is_ok or found.reason
 
 
@@ -110,7 +110,7 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
         assert said in card
     with pytest.warns(LicenceNotice, match="For research alone"):
         regressor = DepthImageRegressor.load(path)
-    view = Objects([bracket()], MADE).view(0).input
+    view = Objects([bracket()], VIEWS).view(0).input
     found, refused = regressor.estimate_many(
         [view, dataclasses.replace(view, mask=view.mask & False)]
     )
@@ -147,9 +147,9 @@ def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) ->
 
 
 def test_crops_carry_the_truth_of_their_view() -> None:
-    config = DepthImageTraining(objects=MADE, network=DepthImageConfig(crop_px=32))
+    config = DepthImageTraining(objects=VIEWS, network=DepthImageConfig(crop_px=32))
     crops = TrainingCrops([bracket(), bottle()], config, 0)
-    sample, view = crops[3], Objects([bracket(), bottle()], MADE).view(3)
+    sample, view = crops[3], Objects([bracket(), bottle()], VIEWS).view(3)
     assert int(sample.class_of) == 1
     torch.testing.assert_close(sample.R, view.truth.camera_from_model.R.float())
     assert len(crops) == 8
@@ -335,7 +335,7 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_training_images_are_the_same_for_the_same_ticket(colored: Path) -> None:
+def test_training_images_are_the_same_for_the_same_index(colored: Path) -> None:
     config = segmentation_config(colored, 1)
     images = AnnotatedImages(config.images)
     samples = TrainingImages(images, config.augment, config.network, 3)

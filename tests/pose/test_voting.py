@@ -34,7 +34,7 @@ def random_pose(seed: int, batch: tuple[int, ...] = ()) -> Rigid:
     return Rigid(q * torch.linalg.det(q)[..., None, None], shift)
 
 
-def made_votes(
+def exact_votes(
     seed: int = 0, n: int = 300, batch: tuple[int, ...] = ()
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Points on half of a ball, keypoints about it, and the exact directions between them."""
@@ -55,7 +55,7 @@ def with_noise(directions: Tensor, sigma: float, seed: int = 5) -> Tensor:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_perfect_directions_give_perfect_keypoints_and_pose(method: str) -> None:
-    points, directions, keypoints = made_votes(batch=(2,))
+    points, directions, keypoints = exact_votes(batch=(2,))
     vote = METHODS[method](points, directions)
     assert float((vote.keypoints_m - keypoints).abs().max()) < 1e-9
     assert vote.inlier_share.min() == 1
@@ -71,7 +71,7 @@ def test_perfect_directions_give_perfect_keypoints_and_pose(method: str) -> None
 
 @pytest.mark.parametrize("method", METHODS)
 def test_keypoints_move_with_the_cloud(method: str) -> None:
-    points, directions, _ = made_votes(1)
+    points, directions, _ = exact_votes(1)
     directions = with_noise(directions, 0.03)
     motion = random_pose(2)
     here = METHODS[method](points, directions)
@@ -85,7 +85,7 @@ def test_keypoints_move_with_the_cloud(method: str) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_batches_and_weights_change_no_single_answer(method: str) -> None:
-    points, directions, _ = made_votes(3, batch=(3,))
+    points, directions, _ = exact_votes(3, batch=(3,))
     # Half a millimetre of tolerance leaves no inliers of noisier votes.
     directions = with_noise(directions, 0.002 if method == "ransac by distance" else 0.02)
     weight = torch.ones(3, 300, 8).double()
@@ -98,7 +98,7 @@ def test_batches_and_weights_change_no_single_answer(method: str) -> None:
 
 
 def test_the_nearest_point_is_that_of_the_normal_equations() -> None:
-    points, directions, _ = made_votes(4, n=40)
+    points, directions, _ = exact_votes(4, n=40)
     directions = with_noise(directions, 0.2)
     weight = torch.rand(40, 8, generator=generator(0)).double()
     found = meet_lines(points, 3 * directions, weight, refinements=0)
@@ -114,7 +114,7 @@ def test_the_nearest_point_is_that_of_the_normal_equations() -> None:
 
 def test_refinement_takes_the_bias_of_noisy_directions_away() -> None:
     """Nearest points are drawn toward the cloud; the most likely ones are not."""
-    points, directions, keypoints = made_votes(5, n=2000)
+    points, directions, keypoints = exact_votes(5, n=2000)
     noisy = with_noise(directions, 0.1)
     nearest = meet_lines(points, noisy, refinements=0).keypoints_m
     likely = meet_lines(points, noisy).keypoints_m
@@ -124,7 +124,7 @@ def test_refinement_takes_the_bias_of_noisy_directions_away() -> None:
 
 
 def test_ransac_overrules_a_third_of_wrong_votes() -> None:
-    points, directions, keypoints = made_votes(6)
+    points, directions, keypoints = exact_votes(6)
     directions = with_noise(directions, 0.01)
     wrong = with_noise(torch.zeros_like(directions), 1.0, seed=7)
     directions[::3] = wrong[::3]
@@ -135,7 +135,7 @@ def test_ransac_overrules_a_third_of_wrong_votes() -> None:
 
 
 def test_a_vote_that_points_away_is_no_inlier_by_angle_but_by_distance() -> None:
-    points, directions, keypoints = made_votes(7)
+    points, directions, keypoints = exact_votes(7)
     directions[::4] *= -1
     by_angle = vote_ransac(points, directions)
     assert by_angle.inlier_share.tolist() == pytest.approx([0.75] * 8)
@@ -145,7 +145,7 @@ def test_a_vote_that_points_away_is_no_inlier_by_angle_but_by_distance() -> None
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
-    points, directions, _ = made_votes(8)
+    points, directions, _ = exact_votes(8)
     directions = with_noise(directions, 0.2)
     first, again = (vote_ransac(points, directions) for _ in range(2))
     other = vote_ransac(points, directions, config=VotingConfig(seed=1))
@@ -157,7 +157,7 @@ def test_the_same_seed_gives_the_same_answer() -> None:
 def test_covariances_of_keypoints_are_honest(method: str) -> None:
     """The squared error over its covariance follows chi-square with 3 degrees of freedom."""
     runs = 300
-    points, directions, keypoints = made_votes(9, n=150)
+    points, directions, keypoints = exact_votes(9, n=150)
     noisy = with_noise(directions.expand(runs, -1, -1, -1), 0.02, seed=10)
     vote = METHODS[method](points.expand(runs, -1, -1), noisy)
     mean = vote.keypoints_m.mean(0) if method == "nearest" else keypoints  # the bias is known
@@ -168,7 +168,7 @@ def test_covariances_of_keypoints_are_honest(method: str) -> None:
     assert float((square < 7.815).double().mean()) == pytest.approx(0.95, abs=0.025)
 
 
-def test_parallel_votes_are_told_by_their_condition() -> None:
+def test_parallel_votes_are_detected_by_their_condition() -> None:
     points = torch.rand(50, 3, generator=generator(5)).double()
     directions = torch.tensor([0, 0, 1.0]).double().expand(50, 2, 3)
     vote = meet_lines(points, directions)
@@ -178,7 +178,7 @@ def test_parallel_votes_are_told_by_their_condition() -> None:
 
 
 def test_a_point_on_its_keypoint_does_no_harm() -> None:
-    points, directions, keypoints = made_votes(10)
+    points, directions, keypoints = exact_votes(10)
     points[0] = keypoints[0]
     directions = torch.nn.functional.normalize(keypoints - points[:, None], dim=-1)
     assert float(directions[0, 0].norm()) == 0
@@ -187,7 +187,7 @@ def test_a_point_on_its_keypoint_does_no_harm() -> None:
 
 
 def test_float32_is_enough() -> None:
-    points, directions, keypoints = made_votes(11)
+    points, directions, keypoints = exact_votes(11)
     for method in METHODS.values():
         vote = method(points.float(), directions.float())
         assert vote.keypoints_m.dtype == torch.float32
@@ -195,7 +195,7 @@ def test_float32_is_enough() -> None:
 
 
 def test_too_few_votes_are_refused() -> None:
-    points, directions, _ = made_votes(12, n=5)
+    points, directions, _ = exact_votes(12, n=5)
     weight = torch.zeros(5, 8).double()
     weight[0] = 1
     for method in METHODS.values():

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.made_object import FACTS, bottle, bracket, tiny_weights
+from tests.pose.synthetic_objects import FACTS, bottle, bracket, tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint

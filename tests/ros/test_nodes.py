@@ -202,7 +202,7 @@ def test_parts_are_posed_from_messages(after_demo: Path) -> None:
 # nodes.py, on the double
 
 
-def made_node(monkeypatch: pytest.MonkeyPatch, name: str, **parameters: object) -> Any:  # noqa: ANN401
+def started_node(monkeypatch: pytest.MonkeyPatch, name: str, **parameters: object) -> Any:  # noqa: ANN401
     rclpy_double.install(monkeypatch, **parameters)
     return getattr(importlib.import_module("depthpose_ros.nodes"), name)()
 
@@ -217,7 +217,7 @@ def wait_until(is_so: Any) -> None:  # noqa: ANN401
 def test_the_node_of_a_pair_publishes_depth_and_warns_of_what_it_cannot_use(
     recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = made_node(monkeypatch, "DepthPairNode", weights="sgbm", encoding="16UC1")
+    node = started_node(monkeypatch, "DepthPairNode", weights="sgbm", encoding="16UC1")
     topics = [one.topic for one in node._heard.heard]
     assert {one.qos.depth for one in node._heard.heard} == {1}
     assert {one.qos.reliability for one in node._heard.heard} == {"best effort"}
@@ -240,7 +240,7 @@ def test_every_parameter_of_the_file_is_one_that_the_node_declares(
     nodes = {"depth_image": "DepthImageNode", "depth_pair": "DepthPairNode", "poses": "PosesNode"}
     assert {name.rpartition("/")[2] for name in files} == set(nodes)
     for name, content in files.items():
-        node = made_node(monkeypatch, nodes[name.rpartition("/")[2]])
+        node = started_node(monkeypatch, nodes[name.rpartition("/")[2]])
         assert node.parameters == content["ros__parameters"]
         node.destroy_node()
 

@@ -1,4 +1,4 @@
-"""What the tests of the page upload: a made street and a made part, small ones of the demo's."""
+"""What the tests of the page upload: a synthetic street and part, small ones of the demo's."""
 
 from pathlib import Path
 

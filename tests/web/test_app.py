@@ -18,7 +18,7 @@ import pytest
 import torch
 from httpx2 import Response
 from starlette.testclient import TestClient
-from tests.depth.made_selection import sure_of
+from tests.depth.constant_selection import sure_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.rigid import Rigid
@@ -454,7 +454,7 @@ def test_a_request_without_a_size_is_refused(page: TestClient) -> None:
     )  # fmt: skip
 
 
-def test_strangers_are_refused(page: TestClient) -> None:
+def test_requests_from_other_hosts_are_refused(page: TestClient) -> None:
     status, text = refusal(page.get("/", headers={"host": "evil.example"}))
     assert (status, "not to 'evil.example'" in text) == (403, True)
     assert refusal(page.get("/", headers={"host": "[::1"}))[0] == 403

@@ -238,7 +238,7 @@ def _run(name: str, rest: list[str]) -> int:
             prog=f"depthpose {name}",
             description=text,
             args=rest,
-            config=(tyro.conf.PositionalMetavarFromFieldName,),
+            config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitArgPrefixes),
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)

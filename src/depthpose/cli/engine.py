@@ -6,19 +6,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Any, Literal
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
-    from depthpose.core.engine import Done, Files, Item, Job, RayEngine
+    from depthpose.core.engine import Done, Files, Item, RayEngine
+    from depthpose.core.engine.work import Work
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Where the work is done: in this process, or by Ray."""
 
@@ -71,9 +69,6 @@ class EngineOptions:
             worker_cpus=self.worker_cpus,
             worker_gpus=self.worker_gpus,
         )
-
-
-Engine = Annotated[EngineOptions, tyro.conf.OmitArgPrefixes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,11 +129,22 @@ class Weights:
             yield str(path)
 
 
-def run(job: "Job", options: EngineOptions, what: str) -> int:
-    """Run a job, list what failed, and give the exit code."""
-    from depthpose.core.engine import run_job
+def run(
+    work: "Work", inputs: Inputs, out: str, settings: dict[str, Any], options: EngineOptions
+) -> "Sequence[Done]":
+    """Do the work on all inputs by the engine of the options, and give what is done."""
+    from depthpose.core.engine import Job, run_job
 
-    return say(run_job(job, options.build()), job.out, what)
+    job = Job(
+        work=work,
+        items=inputs.items,
+        tars=inputs.tars,
+        out=out,
+        settings=settings,
+        form=options.shards,
+        block=options.block,
+    )
+    return run_job(job, options.build())
 
 
 def say(every: "Sequence[Done]", out: str, what: str) -> int:

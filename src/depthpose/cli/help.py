@@ -4,7 +4,7 @@ Types become words (``{None}|PATH`` is PATH), and a default that is nothing is n
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, is_dataclass
 from difflib import get_close_matches
 from inspect import signature, unwrap
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    dataclass_transform,
     get_args,
     get_origin,
     get_type_hints,
@@ -87,8 +88,10 @@ def in_words(metavar: str | None) -> Any:  # noqa: ANN401  tyro's own object
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint)
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 def group(options: type[Group]) -> type[Group]:
-    """Show each field of a group of options, a dataclass, with its type in words."""
+    """Make a class a frozen dataclass of options, each shown with its type in words."""
+    options = dataclass(frozen=True, kw_only=True)(options)
     for name, hint in get_type_hints(options, include_extras=True).items():
         if name in options.__annotations__:
             options.__annotations__[name] = Annotated[hint, in_words(_metavar(name, hint))]

@@ -1,11 +1,10 @@
 """Options that several commands take: each is declared, and described, once.
 
-A group is a frozen dataclass whose fields are options without a prefix; ``Annotated[GROUP,
-tyro.conf.OmitArgPrefixes]`` makes it a parameter of a command.
+A group is a class with ``@group``; a parameter of a command that is one gives the command all of
+its fields as options.
 """
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +27,6 @@ def voting_config(voting: Voting, hypotheses: int | None = None) -> VotingConfig
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PoseDataOptions:
     """The data set of a table or figure of poses."""
 
@@ -56,7 +54,6 @@ class PoseDataOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PoseMeasureOptions:
     """How poses of a data set are estimated and measured."""
 
@@ -88,7 +85,6 @@ class PoseMeasureOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PoseTableOptions(PoseMeasureOptions):
     """How the poses of a table are estimated, measured and shown."""
 
@@ -97,7 +93,6 @@ class PoseTableOptions(PoseMeasureOptions):
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
     """How long a training goes, on what, and from which state."""
 
@@ -128,9 +123,3 @@ class TrainingOptions:
 def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config
     """Give a config with other values; None leaves a setting as it is."""
     return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})
-
-
-PoseData = Annotated[PoseDataOptions, tyro.conf.OmitArgPrefixes]
-PoseMeasure = Annotated[PoseMeasureOptions, tyro.conf.OmitArgPrefixes]
-PoseTable = Annotated[PoseTableOptions, tyro.conf.OmitArgPrefixes]
-Training = Annotated[TrainingOptions, tyro.conf.OmitArgPrefixes]

@@ -1,16 +1,12 @@
 """``depthpose serve``."""
 
-from dataclasses import dataclass
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError, MissingExtraError
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class ServeOptions:
     """Where the page is, and what answers."""
 
@@ -27,10 +23,7 @@ class ServeOptions:
     """all files of one request together [1e6 bytes]."""
 
 
-Page = Annotated[ServeOptions, tyro.conf.OmitArgPrefixes]
-
-
-def serve(page: Page = ServeOptions()) -> int:
+def serve(page: ServeOptions = ServeOptions()) -> int:
     """Serve a page for your browser: drop an image, a pair, a depth image or a cloud onto it.
 
     Tab Depth: depth, the synthesised right view, confidence and a cloud. Tab Pose: votes, the posed

@@ -154,7 +154,7 @@ def rasterize_orthographic(
 def edge_functions(
     triangles: Float[Tensor, "n 3 3"], K: Float64[Tensor, "3 3"]
 ) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
-    """Give what tells where a pixel's ray meets each triangle's plane, at any fraction of a pixel.
+    """Give the edge functions of triangles and their volumes, for any fraction of a pixel.
 
     ``edges[i] @ (u, v, 1) / volume`` are the barycentric coordinates divided by the depth, so
     their sum is 1 / depth, and all three are positive inside the triangle.

@@ -38,9 +38,11 @@ def discriminator_loss(
     return (real_loss + adversarial_loss(fake, mode, is_real=False)) / 2
 
 
-def l1_loss(made: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]) -> Float[Tensor, ""]:
+def l1_loss(
+    generated: Float[Tensor, "b 3 h w"], real: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, ""]:
     """Mean absolute difference (eq. 2.5 of the thesis)."""
-    return (made - real).abs().mean()
+    return (generated - real).abs().mean()
 
 
 def valid_disparity(

@@ -109,7 +109,7 @@ def refine_pose(
     _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
     limits_m = _limits(config, surface.diameter_m)
-    pose = _slide(cloud, _doubled(initial), surface, limits_m, surface.nearest)
+    pose = _iterated(cloud, _doubled(initial), surface, limits_m, surface.nearest)
     end_m = config.end_distance_diameters * surface.diameter_m
     equations = _normal_equations(cloud, pose, surface, end_m, surface.nearest)
     return _result(points_m, pose, equations, _middle(cloud))
@@ -172,7 +172,7 @@ def refine_roughly(
     few = take_evenly(points_m.double(), _ROUGH_POINTS)
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _slide(few, starts, surface, limits_m, surface.boxes.look_up)
+    return _iterated(few, starts, surface, limits_m, surface.boxes.look_up)
 
 
 def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
@@ -183,7 +183,7 @@ def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
         )
 
 
-def _slide(
+def _iterated(
     cloud: Float[Tensor, "n 3"],
     pose: Rigid,
     surface: Surface,

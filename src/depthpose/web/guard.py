@@ -48,11 +48,11 @@ class Guard:
             await send(message)
 
         is_request = scope["type"] == "http"
-        refusal = refuse_stranger(Request(scope), self._hosts) if is_request else None
+        refusal = refuse_other_host(Request(scope), self._hosts) if is_request else None
         await (refusal or self._app)(scope, receive, send_safely)
 
 
-def refuse_stranger(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
+def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
     """Refuse a request under another name than ours, or sent by another web page."""
     host = request.headers.get("host", "")
     name = _host_name(host)

@@ -3,10 +3,10 @@
 import math
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class LabelOptions:
     """What matches the pairs, and what counts as known."""
 
@@ -54,7 +53,6 @@ class LabelOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class ExportOptions:
     """Whose files are written."""
 
@@ -77,10 +75,6 @@ class ExportOptions:
             )
         if self.images is not None and format != "colmap":
             raise InputError(f"--images {self.images} is for --format colmap; remove it")
-
-
-Labels = Annotated[LabelOptions, tyro.conf.OmitArgPrefixes]
-Exports = Annotated[ExportOptions, tyro.conf.OmitArgPrefixes]
 
 
 def check(
@@ -201,7 +195,7 @@ def _list_duplicates(rows: list[dict[str, Any]], out: Path | None) -> None:
 def label(
     path: tyro.conf.Positional[Path],
     out: Path,
-    labels: Labels = LabelOptions(),
+    labels: LabelOptions = LabelOptions(),
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
@@ -233,7 +227,7 @@ def export_depth(
     results: tyro.conf.Positional[Path],
     format: Literal["colmap", "nerfstudio"],
     out: Path,
-    export: Exports = ExportOptions(),
+    export: ExportOptions = ExportOptions(),
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
 

@@ -1,11 +1,9 @@
 """``depthpose data make ...``."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Any, Literal
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
@@ -20,7 +18,6 @@ if TYPE_CHECKING:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class StreetsOptions:
     """Which streets are rendered, and how."""
 
@@ -54,12 +51,11 @@ class StreetsOptions:
                 f"--number {self.number} --first {self.first} --seed {self.seed}: at least 1 "
                 "frame, from 0 on, and a seed of four digits at most"
             )
-        own = {k: v for k, v in asdict(self).items() if k not in ("number", "first")}
+        own = {k: v for k, v in vars(self).items() if k not in ("number", "first")}
         return StreetsConfig(**own)
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class ObjectsOptions:
     """Which frames are rendered, and how."""
 
@@ -93,11 +89,7 @@ class ObjectsOptions:
         )
 
 
-Streets = Annotated[StreetsOptions, tyro.conf.OmitArgPrefixes]
-Objects = Annotated[ObjectsOptions, tyro.conf.OmitArgPrefixes]
-
-
-def make_streets(out: Path, streets: Streets = StreetsOptions()) -> int:
+def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
     """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
     Existing frames are skipped, so an interrupted run can be resumed, and several
@@ -129,7 +121,7 @@ def make_streets(out: Path, streets: Streets = StreetsOptions()) -> int:
 def make_objects(
     cad: tuple[Path, ...],
     out: Path,
-    frames: Objects = ObjectsOptions(),
+    frames: ObjectsOptions = ObjectsOptions(),
 ) -> int:
     """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
 

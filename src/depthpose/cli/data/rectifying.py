@@ -1,9 +1,8 @@
 """``depthpose data rectify``."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -23,7 +22,6 @@ _ASK = "were the cameras moved since, or are the images scaled or cropped? Calib
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class RectifyOptions:
     """What the calibration says, and what is kept of the images."""
 
@@ -44,15 +42,12 @@ class RectifyOptions:
         return read_raw_pair(camera, unit_m=unit_m, is_fisheye=self.fisheye or None)
 
 
-Rectifying = Annotated[RectifyOptions, tyro.conf.OmitArgPrefixes]
-
-
 def rectify(
     left: tyro.conf.Positional[str],
     right: tyro.conf.Positional[str],
     camera: Path,
     out: Path,
-    rectifying: Rectifying = RectifyOptions(),
+    rectifying: RectifyOptions = RectifyOptions(),
 ) -> int:
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 

@@ -7,22 +7,14 @@ import tyro
 from depthpose.cli.depth.options import (
     ImageNetworks,
     MatcherOptions,
-    Matching,
-    MatchMatching,
     MatchOptions,
     MethodOptions,
-    Methods,
-    Networks,
-    Output,
-    PairMatching,
     PairNetworks,
     PairOptions,
-    Pairs,
     PredictOutput,
-    Protocol,
     ProtocolOptions,
 )
-from depthpose.cli.engine import Engine, EngineOptions, Weights
+from depthpose.cli.engine import EngineOptions, Weights
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
@@ -32,10 +24,10 @@ def predict(
     out: str,
     camera: Path | None = None,
     focal_px: float | None = None,
-    networks: Networks = ImageNetworks(),  # noqa: B008  frozen
-    matching: Matching = MatcherOptions(),  # noqa: B008
-    output: Output = PredictOutput(),  # noqa: B008
-    engine: Engine = EngineOptions(),  # noqa: B008
+    networks: ImageNetworks = ImageNetworks(),
+    matching: MatcherOptions = MatcherOptions(),
+    output: PredictOutput = PredictOutput(),
+    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Depth in metres from single images, by a synthesised right view.
 
@@ -109,9 +101,9 @@ def match(
     *,
     camera: Path,
     out: str,
-    pairs: Pairs = PairNetworks(),  # noqa: B008  frozen
-    matching: MatchMatching = MatchOptions(),  # noqa: B008
-    engine: Engine = EngineOptions(),  # noqa: B008
+    pairs: PairNetworks = PairNetworks(),
+    matching: MatchOptions = MatchOptions(),
+    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Match real stereo pairs to metric depth.
 
@@ -188,10 +180,10 @@ def evaluate(
     data: Path,
     out: Path,
     split: str | None = None,
-    methods: Methods = MethodOptions(),  # noqa: B008  frozen
-    comparison: Protocol = ProtocolOptions(),  # noqa: B008
-    matching: PairMatching = PairOptions(),  # noqa: B008
-    engine: Engine = EngineOptions(),  # noqa: B008
+    methods: MethodOptions = MethodOptions(),
+    comparison: ProtocolOptions = ProtocolOptions(),
+    matching: PairOptions = PairOptions(),
+    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.
 

@@ -17,7 +17,7 @@ from depthpose.cli.depth.matching import refuse_unrectified_pair, write_match
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
 from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
-from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
+from depthpose.cli.engine import EngineOptions, Inputs, Weights, run, say
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.engine import (
     Done,
@@ -136,7 +136,7 @@ def predict(
         **recipe.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
     }  # fmt: skip
     work = PredictWork(recipe=recipe, lens=lens, look=look)
-    return run(_job(work, inputs, out, settings, options), options, "depth maps")
+    return say(run(work, inputs, out, settings, options), out, "depth maps")
 
 
 def match(
@@ -158,25 +158,7 @@ def match(
     facts = {"K": rig.K.tolist(), "baseline_m": rig.baseline_m}
     work = MatchWork(recipe=recipe, rig=rig, with_cloud=with_cloud)
     settings = {**recipe.settings(), "camera": facts}
-    return run(_job(work, inputs, out, settings, options), options, "pairs")
-
-
-def _job(
-    work: PredictWork | MatchWork,
-    inputs: Inputs,
-    out: str,
-    settings: dict[str, Any],
-    options: EngineOptions,
-) -> Job:
-    return Job(
-        work=work,
-        items=inputs.items,
-        tars=inputs.tars,
-        out=out,
-        settings=settings,
-        form=options.shards,
-        block=options.block,
-    )
+    return say(run(work, inputs, out, settings, options), out, "pairs")
 
 
 def _predict(
@@ -243,9 +225,9 @@ def measure_shards(
         InputError: a prediction is missing or damaged, or no frame has truth.
     """
     items = result_items(predictions)
-    made = read_job_settings(predictions)
+    before = read_job_settings(predictions)
     settings = {
-        "predictions": made, "data": truth.data, "split": truth.split,
+        "predictions": before, "data": truth.data, "split": truth.split,
         "protocol": truth.protocol, "caps_m": list(truth.caps_m),
     }  # fmt: skip
     home = str(out / "measured" / stem(predictions.rstrip("/")))
@@ -259,7 +241,7 @@ def measure_shards(
                     dataset, index, Path(nothing), truth.protocol, truth.caps_m
                 )
     name = stem(predictions.rstrip("/"))
-    return signed(summarise(dataset, truth.protocol, found), name, made)
+    return signed(summarise(dataset, truth.protocol, found), name, before)
 
 
 def _gather(home: str, every: Sequence[Done], names: set[str]) -> dict[str, list[Measured] | str]:

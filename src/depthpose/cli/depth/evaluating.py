@@ -1,7 +1,7 @@
 """The work behind ``depthpose depth evaluate``."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -145,8 +145,9 @@ def measure_each(
 ) -> list[Evaluation]:
     """Measure folders of predictions one by one; each row says whose it is."""
     found: list[Evaluation] = []
+    show = partial(tqdm, unit=" frames", disable=None)
     for folder in folders:
-        result = evaluate(dataset, folder, protocol, caps_m, _show_progress)
+        result = evaluate(dataset, folder, protocol, caps_m, show)
         found.append(signed(result, folder.name, read_settings(folder)))
     return found
 
@@ -211,10 +212,6 @@ def say_skipped(measured: Evaluation) -> None:
     for name, why in measured.skipped.items():
         print(f"skipped: {name}: {why}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
-
-
-def _show_progress(frames: Sequence[int]) -> Iterable[int]:
-    return tqdm(frames, unit=" frames", disable=None)
 
 
 def describe_source(name: str, settings: dict[str, Any] | None) -> Source:

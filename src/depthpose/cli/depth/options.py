@@ -1,7 +1,7 @@
 """Options that several depth commands take: each is declared, and described, once."""
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,7 +16,6 @@ _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class MatcherOptions:
     """How the matcher of the weights runs."""
 
@@ -38,7 +37,6 @@ class MatcherOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PairOptions(MatcherOptions):
     """How the matcher of the weights runs on real pairs."""
 
@@ -53,7 +51,6 @@ class PairOptions(MatcherOptions):
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class MatchOptions(PairOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
@@ -72,7 +69,6 @@ class MatchOptions(PairOptions):
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PairNetworks:
     """What matches real pairs, whether the first is checked, and what is written."""
 
@@ -104,7 +100,6 @@ class PairNetworks:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class ImageNetworks:
     """Which networks answer depth of one image."""
 
@@ -139,7 +134,6 @@ class ImageNetworks:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PredictOutput:
     """What is written, and how many images go together."""
 
@@ -169,7 +163,6 @@ class PredictOutput:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class MethodOptions:
     """What is measured; several at once share the table."""
 
@@ -209,7 +202,6 @@ class MethodOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
     """How prediction and truth are compared."""
 
@@ -217,16 +209,6 @@ class ProtocolOptions:
     """name of the protocol; eigen-raw is the thesis's."""
     cap: tuple[float, ...] = (80.0, 50.0)
     """metres beyond which truth does not count; a row each."""
-
-
-Matching = Annotated[MatcherOptions, tyro.conf.OmitArgPrefixes]
-PairMatching = Annotated[PairOptions, tyro.conf.OmitArgPrefixes]
-MatchMatching = Annotated[MatchOptions, tyro.conf.OmitArgPrefixes]
-Pairs = Annotated[PairNetworks, tyro.conf.OmitArgPrefixes]
-Networks = Annotated[ImageNetworks, tyro.conf.OmitArgPrefixes]
-Output = Annotated[PredictOutput, tyro.conf.OmitArgPrefixes]
-Methods = Annotated[MethodOptions, tyro.conf.OmitArgPrefixes]
-Protocol = Annotated[ProtocolOptions, tyro.conf.OmitArgPrefixes]
 
 
 def parse_bytes(text: str | None) -> int | None:

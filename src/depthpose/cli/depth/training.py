@@ -1,14 +1,13 @@
 """``depthpose depth train view|select|stereo|adapt|finetune`` and ``depth calibrate``."""
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 from depthpose.cli.help import group
-from depthpose.cli.options import Device, Training, TrainingOptions, changed
+from depthpose.cli.options import Device, TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
@@ -18,7 +17,6 @@ _LOOKED_AT = 20
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class PairsOptions:
     """What a training learns from."""
 
@@ -52,7 +50,6 @@ class PairsOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class BeginningOptions:
     """Weights that a training begins with."""
 
@@ -82,17 +79,13 @@ class BeginningOptions:
         return changed(chosen, **vars(self))
 
 
-Pairs = Annotated[PairsOptions, tyro.conf.OmitArgPrefixes]
-Beginning = Annotated[BeginningOptions, tyro.conf.OmitArgPrefixes]
-
-
 def train(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
     out: Path,
     config: Path | None = None,
-    pairs: Pairs = PairsOptions(),
-    beginning: Beginning = BeginningOptions(),
-    training: Training = TrainingOptions(),  # noqa: B008  frozen
+    pairs: PairsOptions = PairsOptions(),
+    beginning: BeginningOptions = BeginningOptions(),
+    training: TrainingOptions = TrainingOptions(),
 ) -> int:
     """Train a generator, the matcher, or the first through the second, by stages.
 

@@ -4,16 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import Engine, EngineOptions, Weights
-from depthpose.cli.options import PoseMeasure, PoseMeasureOptions
+from depthpose.cli.engine import EngineOptions, Weights
+from depthpose.cli.options import PoseMeasureOptions
 from depthpose.cli.pose.options import (
-    DataSet,
     DataSetOptions,
     EstimateOptions,
-    Estimates,
-    OneObject,
     OneObjectOptions,
-    Register,
     RegisterOptions,
     refuse_mixture,
 )
@@ -24,12 +20,12 @@ from depthpose.pose.config import EstimateConfig, SymmetryRule
 def predict(
     out: str,
     weights: str = "parts",
-    inputs: OneObject = OneObjectOptions(),  # noqa: B008  frozen
-    dataset: DataSet = DataSetOptions(),  # noqa: B008
-    estimates: Estimates = EstimateOptions(),  # noqa: B008
-    register: Register = RegisterOptions(),  # noqa: B008
+    inputs: OneObjectOptions = OneObjectOptions(),
+    dataset: DataSetOptions = DataSetOptions(),
+    estimates: EstimateOptions = EstimateOptions(),
+    register: RegisterOptions = RegisterOptions(),
     view: str | None = None,
-    engine: Engine = EngineOptions(),  # noqa: B008
+    engine: EngineOptions = EngineOptions(),
 ) -> int:
     """The pose of known objects from clouds, depth images or a data set; or the reason for none.
 
@@ -157,7 +153,7 @@ def evaluate(
     predictions: tuple[Path, ...] = (),
     objects: tuple[str, ...] = (),
     adds: SymmetryRule = "declared",
-    estimates: PoseMeasure = PoseMeasureOptions(vsd=True),  # noqa: B008  frozen
+    estimates: PoseMeasureOptions = PoseMeasureOptions(vsd=True),
 ) -> int:
     """Measure poses on a BOP or Linemod_preprocessed data set, and write rows, a table and a page.
 

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import EngineOptions, Inputs, Weights, run
+from depthpose.cli.engine import EngineOptions, Inputs, Weights, run, say
 from depthpose.cli.pose.inputs import bop_jobs, input_job, known_objects, object_named
 from depthpose.cli.pose.masks import find_masks
 from depthpose.cli.pose.methods import PoseMethod, pose_methods
@@ -24,10 +24,8 @@ from depthpose.core.engine import (
     Files,
     Function,
     Item,
-    Job,
     Sample,
     is_url,
-    run_job,
     shard_results,
     stem,
 )
@@ -115,16 +113,8 @@ def predict(
         "unit": work.unit,
         **facts,
     }
-    job = Job(
-        work=replace(work, object=name, camera=known),
-        items=inputs.items,
-        tars=inputs.tars,
-        out=out,
-        settings=settings,
-        form=options.shards,
-        block=options.block,
-    )
-    return run(job, options, "inputs")
+    work = replace(work, object=name, camera=known)
+    return say(run(work, inputs, out, settings, options), out, "inputs")
 
 
 def _refuse_other_masks(words: Sequence[str], inputs: Inputs) -> None:
@@ -231,15 +221,8 @@ def predict_bop(
     settings = {**method.settings, "estimate": config_to_dict(config), **facts}
     settings = {**settings, **shown.settings, "shards": options.shards}
     claim_bop(Path(out), settings, dataset)
-    job = Job(
-        work=work,
-        items=[Item(one.name, ()) for one in jobs],
-        out=out,
-        settings=settings,
-        form=options.shards,
-        block=options.block,
-    )
-    predictions = _gather(run_job(job, options.build()), out, jobs)
+    inputs = Inputs(items=[Item(one.name, ()) for one in jobs], tars=(), files=NO_FILES)
+    predictions = _gather(run(work, inputs, out, settings, options), out, jobs)
     write_predictions(Path(out), predictions)
     write_bop_files(predictions, dataset, Path(out), method)
     write_pose_page(Path(out), predictions, jobs, method, dataset)

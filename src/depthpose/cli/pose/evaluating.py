@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
+from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.evaluate import (
     Evaluation,
     InstanceRow,
@@ -64,9 +65,10 @@ def measure_each(
 ) -> list[Evaluation]:
     """Measure folders or csv files of predictions one by one; each row says whose it is."""
     found: list[Evaluation] = []
+    show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
         _refuse_others(path, dataset)
-        found.append(evaluate(dataset, read_any(path), config, _show_progress).of(origin))
+        found.append(evaluate(dataset, read_any(path), config, show).of(origin))
     return found
 
 
@@ -189,7 +191,3 @@ def detail_sections(measured: Evaluation) -> list[Section]:
         Section(title="Each instance that is no success", rows=table_of(failed)),
     ]
     return [section for section in sections if section.rows]
-
-
-def _show_progress(instances: Sequence[Instance]) -> Iterable[Instance]:
-    return tqdm(instances, unit=" instances", disable=None)

@@ -1,10 +1,7 @@
 """Options that several pose commands take: each is declared, and described, once."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from depthpose.cli.help import group
 from depthpose.cli.options import Device, Voting, voting_config
@@ -13,7 +10,6 @@ from depthpose.pose.config import EstimateConfig, Unit
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class OneObjectOptions:
     """A cloud or a depth image of known objects, and what is known of it."""
 
@@ -36,7 +32,6 @@ class OneObjectOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class DataSetOptions:
     """A data set, in place of --cloud and --depth."""
 
@@ -50,7 +45,6 @@ class DataSetOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
     """How poses are estimated."""
 
@@ -80,7 +74,6 @@ class EstimateOptions:
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class RegisterOptions:
     """Poses by a CAD file alone, without training."""
 
@@ -91,12 +84,6 @@ class RegisterOptions:
     own models."""
     cad_unit: Unit | None = None
     """of the CAD files; as --unit by default."""
-
-
-OneObject = Annotated[OneObjectOptions, tyro.conf.OmitArgPrefixes]
-DataSet = Annotated[DataSetOptions, tyro.conf.OmitArgPrefixes]
-Register = Annotated[RegisterOptions, tyro.conf.OmitArgPrefixes]
-Estimates = Annotated[EstimateOptions, tyro.conf.OmitArgPrefixes]
 
 
 def refuse_mixture(given: OneObjectOptions, bop: Path | None) -> None:

@@ -1,10 +1,6 @@
 """``depthpose pose track``."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from depthpose.cli.help import group
 from depthpose.cli.options import Device
@@ -13,7 +9,6 @@ from depthpose.pose.config import EstimateConfig, Unit
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class SequenceOptions:
     """The frames, and what is followed in them."""
 
@@ -51,10 +46,7 @@ class SequenceOptions:
             raise InputError("a sequence is followed by one process; start one")
 
 
-Frames = Annotated[SequenceOptions, tyro.conf.OmitArgPrefixes]
-
-
-def track(out: Path, weights: str = "parts", frames: Frames = SequenceOptions()) -> int:
+def track(out: Path, weights: str = "parts", frames: SequenceOptions = SequenceOptions()) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
     Each frame starts from the pose of the one before and costs ICP alone. Where what was seen

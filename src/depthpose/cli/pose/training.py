@@ -1,15 +1,14 @@
 """``depthpose pose train`` and ``pose calibrate``."""
 
 import dataclasses
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from depthpose.cli.help import group
-from depthpose.cli.options import Training, TrainingOptions, changed
+from depthpose.cli.options import TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
 
@@ -24,7 +23,6 @@ _NOTHING = "nothing"
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class LearntOptions:
     """What is learnt, and from what."""
 
@@ -34,7 +32,7 @@ class LearntOptions:
     """of the numbers in the files."""
     symmetries: Literal["none", "found"] | None = None
     """found looks whether the part looks alike from several sides, and counts these poses as one;
-    without, you are told of what is found."""
+    without, what is found is printed."""
     data: str | None = None
     """folder of a data set; it takes the place of the config's, for models and frames."""
     what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
@@ -67,23 +65,20 @@ class LearntOptions:
         return changed(taken, with_found_symmetries=found)
 
 
-Learnt = Annotated[LearntOptions, tyro.conf.OmitArgPrefixes]
-
-
 def train(
     out: Path,
     config: Path | None = None,
-    learnt: Learnt = LearntOptions(),
+    learnt: LearntOptions = LearntOptions(),
     workers: int | None = None,
-    training: Training = TrainingOptions(),  # noqa: B008  frozen
+    training: TrainingOptions = TrainingOptions(),
 ) -> int:
     """Train a network on your CAD file, or by a config.
 
-    Views of the object are made while it trains: no photograph is needed. At the end the refusal
-    is calibrated and the whole is measured on held-out views; OUT holds the weights with
-    the model in them, their card, and all that led there. What stopped a training is made good by
-    --resume; --finish, or Ctrl-C twice, makes do with the steps so far. Without a terminal a line
-    is printed each minute.
+    Views of the object are rendered while it trains: no photograph is needed. At the end the
+    refusal is calibrated and the whole is measured on held-out views; OUT holds the weights with
+    the model in them, their card, and all that led there. A training that stopped goes on with
+    --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
+    line is printed each minute.
 
         depthpose pose train --cad part.stl --unit mm --out my_part
         depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
@@ -91,7 +86,7 @@ def train(
     Args:
         out: the run folder.
         config: YAML with what differs from the defaults.
-        workers: processes that make views beside the one that trains.
+        workers: processes that render views beside the one that trains.
     """
     from depthpose.core.config import read_config
     from depthpose.core.run import find_shard
@@ -116,7 +111,6 @@ def train(
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class CalibrationOptions:
     """How the refusal is chosen."""
 
@@ -138,23 +132,16 @@ class CalibrationOptions:
         from depthpose.pose.train import PoseTraining
 
         chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
-        limits = changed(
-            chosen.calibration,
-            max_wrong_share=self.max_wrong_share,
-            number=self.number,
-            negatives=self.negatives,
-            max_negative_share=self.max_negative_share,
-        )
-        return dataclasses.replace(chosen, calibration=limits)
-
-
-Calibration = Annotated[CalibrationOptions, tyro.conf.OmitArgPrefixes]
+        limits = {name: value for name, value in vars(self).items() if name != "config"}
+        return dataclasses.replace(chosen, calibration=changed(chosen.calibration, **limits))
 
 
 def calibrate(
-    weights: tyro.conf.Positional[str], out: Path, calibration: Calibration = CalibrationOptions()
+    weights: tyro.conf.Positional[str],
+    out: Path,
+    calibration: CalibrationOptions = CalibrationOptions(),
 ) -> int:
-    """Choose anew how much risk of a wrong pose is too much, on made views of the objects.
+    """Choose anew how much risk of a wrong pose is too much, on synthetic views of the objects.
 
     And of other things in their place: other objects, copies of another size, mirrored ones, boxes,
     balls, hands. A larger share of wrong answers buys more answers. The network stays as it is;

@@ -18,6 +18,7 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import Dataset, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
+from depthpose.report.choose import spread_evenly
 from depthpose.report.tables import (
     Picture,
     Section,
@@ -145,8 +146,7 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
     chosen = seen or pairs
     if not chosen:
         raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
-    count = min(max(1, number), len(chosen))
-    return [chosen[(2 * k + 1) * len(chosen) // (2 * count)] for k in range(count)]
+    return [chosen[place] for place in spread_evenly(len(chosen), max(1, number))]
 
 
 def write_figure(

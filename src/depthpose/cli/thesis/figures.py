@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from depthpose.cli.options import PoseData, PoseDataOptions
+from depthpose.cli.options import PoseDataOptions
 
 if TYPE_CHECKING:
     from depthpose.cli.thesis.views import Views
@@ -18,7 +18,7 @@ _FEATURES = (
 def figure_3_2(
     weights: str,
     out: Path,
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
     number: int = 4,
     perplexity: float = 40.0,
 ) -> int:
@@ -46,7 +46,7 @@ def figure_3_2(
 def figure_3_4(
     weights: str,
     out: Path,
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
     number: int = 20,
     keypoint: int | None = None,
 ) -> int:
@@ -75,7 +75,7 @@ def figure_3_4(
 def figure_3_5(
     weights: str,
     out: Path,
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
     number: int = 6,
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.

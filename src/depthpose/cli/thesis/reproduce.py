@@ -1,12 +1,11 @@
 """``depthpose reproduce`` and ``depthpose figure``."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from depthpose.cli.depth.options import MatcherOptions, Matching, Protocol, ProtocolOptions
+from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
@@ -20,7 +19,6 @@ FigureNumber = Literal["2-1", "2-5"]
 
 
 @group
-@dataclass(frozen=True, kw_only=True)
 class RowOptions:
     """The methods of a table, a row each."""
 
@@ -54,18 +52,15 @@ class RowOptions:
         return chosen
 
 
-Rows = Annotated[RowOptions, tyro.conf.OmitArgPrefixes]
-
-
 def reproduce(
     table: tyro.conf.Positional[TableNumber],
     kitti: Path,
     out: Path,
-    rows: Rows = RowOptions(),
+    rows: RowOptions = RowOptions(),
     split: str = "eigen-test",
     pictures: int = 3,
-    comparison: Protocol = ProtocolOptions(),  # noqa: B008  frozen
-    matching: Matching = MatcherOptions(),  # noqa: B008
+    comparison: ProtocolOptions = ProtocolOptions(),
+    matching: MatcherOptions = MatcherOptions(),
 ) -> int:
     """Reproduce a table of the thesis, from data on disk to published rows, ours and difference.
 
@@ -115,7 +110,7 @@ def figure(
     frames: tuple[str, ...] = (),
     number: int | None = None,
     split: str | None = None,
-    matching: Matching = MatcherOptions(),  # noqa: B008  frozen
+    matching: MatcherOptions = MatcherOptions(),
 ) -> int:
     """Draw a figure of the thesis from your frames and weights.
 

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from depthpose.cli.options import PoseData, PoseDataOptions, PoseTable, PoseTableOptions
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 
 def table_3_1(
     weights: tuple[str, ...],
     out: Path,
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
-    estimates: PoseTable = PoseTableOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
+    estimates: PoseTableOptions = PoseTableOptions(),
 ) -> int:
     """Reproduce table 3.1: the method beside its baselines, by object, on the same data.
 
@@ -39,8 +39,8 @@ def table_3_2(
     out: Path,
     weights: tuple[str, ...] = (),
     csv: tuple[Path, ...] = (),
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
-    estimates: PoseTable = PoseTableOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
+    estimates: PoseTableOptions = PoseTableOptions(),
 ) -> int:
     """Reproduce table 3.2: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
 
@@ -64,7 +64,7 @@ def table_3_2(
 def table_3_3(
     weights: str,
     out: Path,
-    data: PoseData = PoseDataOptions(),  # noqa: B008  frozen
+    data: PoseDataOptions = PoseDataOptions(),
     made: int = 40,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
 ) -> int:

@@ -20,7 +20,7 @@ from depthpose.pose.types import ViewSample
 from depthpose.report.choose import spread_evenly
 from depthpose.report.overlay import grey_depth
 
-MADE_SEED = 3303
+SYNTHETIC_SEED = 3303
 """Of synthetic views for tables and figures; no training uses it."""
 
 
@@ -69,10 +69,10 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
 
 
 def _synthetic_views(net: GeoPoseNet, number: int) -> Views:
-    config = ObjectsConfig(number=number, seed=MADE_SEED)
+    config = ObjectsConfig(number=number, seed=SYNTHETIC_SEED)
     objects = Objects(net.weights.models, config, net.weights.cloud)
     samples = [objects.view(i) for i in range(number)]
-    facts = {"frames": f"made, seed {MADE_SEED}"}
+    facts = {"frames": f"made, seed {SYNTHETIC_SEED}"}
     return Views(samples=samples, instances=[None] * number, facts=facts)
 
 

@@ -1,7 +1,7 @@
 """Is this pair of images rectified, and the right way round? Asked of the images alone.
 
 Corners of the left image are sought in the right one over a window that a rectified pair does not
-need: rows above and below, columns on both sides. Where they are found tells what was done to the
+need: rows above and below, columns on both sides. Where they are found shows what was done to the
 pair.
 
 Corners of one image are found in the other by zero-mean normalised cross-correlation, computed by

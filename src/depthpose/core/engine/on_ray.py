@@ -59,7 +59,7 @@ class RayEngine:
                     fn_constructor_args=(shipped, out, form),
                     compute=ray.data.ActorPoolStrategy(
                         min_size=1,
-                        max_size=min(self.workers or self._room(ray), len(lines)),
+                        max_size=min(self.workers or self._capacity(ray), len(lines)),
                         max_tasks_in_flight_per_actor=2,
                     ),
                     num_cpus=self.worker_cpus,
@@ -76,7 +76,7 @@ class RayEngine:
     def _cores_here(self) -> float | None:
         return None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
 
-    def _room(self, ray: Any) -> int:  # noqa: ANN401  Ray is loaded where it is used
+    def _capacity(self, ray: Any) -> int:  # noqa: ANN401  Ray is loaded where it is used
         """Say how many workers fit into the cluster."""
         there: Mapping[str, float] = ray.cluster_resources()
         asked = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}

@@ -88,7 +88,7 @@ def read_shard(
 
     Args:
         url: of the shard.
-        names: of the results in it, which a tar does not tell from the endings.
+        names: of the results in it, which a tar does not separate from the endings.
         endings: that their files may have.
 
     Raises:

@@ -140,7 +140,7 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
 def _finished(
     event: yaml.Event, sizes: dict[str, int], unfinished: list[tuple[str | None, int]]
 ) -> tuple[str | None, int]:
-    """Tell the name of what ends with an event, if it has one, and how many values it holds."""
+    """Give the name of what ends with an event, if it has one, and how many values it holds."""
     if isinstance(event, yaml.CollectionEndEvent):
         return unfinished.pop()
     if isinstance(event, yaml.AliasEvent):

@@ -210,7 +210,7 @@ class FakestereoNet:
             )
         if with_check:
             refuse_unrectified(pair)
-        match = self._match(pair.left, right, pair.camera)
+        match = self._match_many(pair.left[None], right[None], pair.camera)[0]
         depth_m = None
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)
@@ -310,9 +310,6 @@ class FakestereoNet:
         if answer == "own":
             return own
         return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
-
-    def _match(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
-        return self._match_many(left[None], right[None], camera)[0]
 
     def _match_many(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None

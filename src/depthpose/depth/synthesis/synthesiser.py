@@ -154,7 +154,7 @@ def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Te
     """Draw right views of any size, RGB in [0, 1], with gradients.
 
     Sides close to a multiple of what the network takes are resized to it, others padded by
-    reflection. Mirrored rows move the horizon's place in the image, which tells the ground's depth:
+    reflection. Mirrored rows move the horizon's place in the image, which gives the ground's depth:
     193 rows padded to 256, where 192 were trained, drew views of 15 % too little disparity.
     """
     if isinstance(generator, SelectionGenerator):

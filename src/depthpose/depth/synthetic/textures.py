@@ -4,6 +4,7 @@ A texture modulates a surface's colour, so its mean is about 1. They depend on n
 file: they are made once a process and shared by every scene.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -150,6 +151,18 @@ def _grey(plane: Plane) -> Picture:
     return np.repeat(plane[..., None], 3, 2)
 
 
+def _mottled(**shares: float) -> Callable[[_Noise, int], Picture]:
+    """Grey with noise of the named kinds, drawn in their order."""
+
+    def paint(noise: _Noise, _variant: int) -> Picture:
+        plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
+        for kind, share in shares.items():
+            plane = plane + share * getattr(noise, kind)()
+        return _grey(plane)
+
+    return paint
+
+
 def _road(noise: _Noise, variant: int) -> Picture:
     cracks = np.clip(1 - np.abs(noise.smooth(1.8, (2, 60))) / 0.035, 0, 1) * np.clip(
         noise.broad() - 0.4 * variant % 1, 0, 1
@@ -172,10 +185,6 @@ def _grass(noise: _Noise, variant: int) -> Picture:
     return np.stack([red, green, 1 + 0.3 * fine + 0.22 * rough], 2)
 
 
-def _dirt(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.2 * noise.rough() + 0.18 * noise.fine() + 0.12 * noise.broad())
-
-
 def _brick(noise: _Noise, variant: int) -> Picture:
     is_brick, shade, _ = noise.bricks(24, (8, 6, 10)[variant], 0.1, 0.16)
     wall = shade * _grey(1 + 0.1 * noise.fine() + 0.08 * noise.rough())
@@ -195,10 +204,6 @@ def _stone(noise: _Noise, variant: int) -> Picture:
     return shade * _grey(
         (1 + 0.09 * noise.fine() + 0.12 * noise.rough()) * (0.55 + 0.45 * is_stone)
     )
-
-
-def _concrete(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.07 * noise.fine() + 0.09 * noise.rough() + 0.08 * noise.broad())
 
 
 def _roof(noise: _Noise, variant: int) -> Picture:
@@ -227,10 +232,6 @@ def _metal(noise: _Noise, variant: int) -> Picture:
     return _grey(1 + 0.06 * noise.fine() + (0.08 + 0.1 * variant) * noise.broad())
 
 
-def _paint(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.03 * noise.broad() + 0.012 * noise.fine())
-
-
 def _side(noise: _Noise, variant: int) -> Picture:
     """A car's flank from rear (u = 0) to front, sill (v = 0) to roof: doors, handles, a strip."""
     y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
@@ -247,20 +248,12 @@ def _side(noise: _Noise, variant: int) -> Picture:
     return _grey(picture * (1 - 0.35 * dirt))
 
 
-def _glass(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.15 * noise.broad())
-
-
 def _pane(noise: _Noise, variant: int) -> Picture:
     """Curtains, blinds, or the dark of a room."""
     y, x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
     curtain = np.clip(np.abs(x - 0.5) * 2 - 0.55, 0, 1) * 2.5 * (1 + 0.3 * np.sin(x * 90))
     blind = 0.35 * np.sign(np.sin(y * np.pi * 40)) * (y > (0.2, 0.55, 2)[variant])
     return _grey(0.75 + 0.4 * y + 0.15 * noise.broad() + curtain * (variant != 1) + blind)
-
-
-def _tyre(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.2 * noise.fine() + 0.15 * noise.rough())
 
 
 def _wheel(_noise: _Noise, variant: int) -> Picture:
@@ -315,19 +308,20 @@ def _cloth(noise: _Noise, variant: int) -> Picture:
     return _grey(1 + 0.16 * folds + 0.07 * noise.fine() + stripes)
 
 
-def _skin(noise: _Noise, _variant: int) -> Picture:
-    return _grey(1 + 0.06 * noise.broad())
-
-
 def _hills(noise: _Noise, _variant: int) -> Picture:
     return _grey(1 + 0.4 * noise.smooth(1.0, (16, 128)) + 0.15 * noise.broad())
 
 
+_dirt = _mottled(rough=0.2, fine=0.18, broad=0.12)
 _PAINTERS = {
     "road": _road, "pavement": _pavement, "grass": _grass, "dirt": _dirt, "curb": _dirt,
-    "brick": _brick, "plaster": _plaster, "stone": _stone, "concrete": _concrete, "roof": _roof,
-    "bark": _bark, "leaf": _leaf, "wood": _wood, "metal": _metal, "paint": _paint, "side": _side,
-    "glass": _glass, "pane": _pane, "tyre": _tyre, "wheel": _wheel, "plate": _plate,
-    "lamp": _lamp, "sign": _sign, "poster": _poster, "cloth": _cloth, "skin": _skin,
-    "hills": _hills,
+    "brick": _brick, "plaster": _plaster, "stone": _stone, "roof": _roof, "bark": _bark,
+    "leaf": _leaf, "wood": _wood, "metal": _metal, "side": _side, "pane": _pane,
+    "wheel": _wheel, "plate": _plate, "lamp": _lamp, "sign": _sign, "poster": _poster,
+    "cloth": _cloth, "hills": _hills,
+    "concrete": _mottled(fine=0.07, rough=0.09, broad=0.08),
+    "paint": _mottled(broad=0.03, fine=0.012),
+    "glass": _mottled(broad=0.15),
+    "tyre": _mottled(fine=0.2, rough=0.15),
+    "skin": _mottled(broad=0.06),
 }  # fmt: skip

@@ -54,7 +54,7 @@ class CloudConfig:
     leaves the cloud as it is."""
 
     with_shape: bool = False
-    """Tell the network of each voxel where in it the points lie on average, how many they are, and
+    """Give the network for each voxel where in it the points lie on average, how many they are, and
     the normal and curvature there; the published method gives a constant 1."""
 
     max_points: int | None = 1500

@@ -26,7 +26,7 @@ synthetic views it was at most 0.004, where the mirror image is not nearly the m
 _UNREFINED = 0.1
 """Share of the largest risk that a pose without ICP may have, where the limit counts on signals
 that only ICP gives: at the whole limit a fifth of such answers was wrong at 20 % occlusion, at this
-share less than 1 % (``bench/made_linemod.py``)."""
+share less than 1 % (``bench/synthetic_linemod.py``)."""
 
 
 class Posed(NamedTuple):

@@ -85,7 +85,7 @@ def evaluate(
     """
     config = EvaluationConfig() if config is None else config
     found = match(dataset.instances, predictions, dataset.objects)
-    _refuse_strangers(dataset, predictions, found)
+    _refuse_unknown(dataset, predictions, found)
     rulers, stages = _rulers(dataset, config), _stages_of(predictions)
     rows = [
         _instance_row(one, found.get(one.name), rulers[one.object_id], stages)
@@ -162,7 +162,7 @@ def _conditions(dataset: BopDataset, config: EvaluationConfig) -> Conditions:
     )
 
 
-def _refuse_strangers(
+def _refuse_unknown(
     dataset: BopDataset, predictions: Sequence[Prediction], found: dict[str, PoseEstimate]
 ) -> None:
     """A file of another data set would be measured as all missing, and look like a bad method."""

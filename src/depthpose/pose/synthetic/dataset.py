@@ -65,7 +65,7 @@ class _Stored:
 
 
 class Objects:
-    """Made partial views, each a function of the seed and its index alone: no order, no state.
+    """Synthetic partial views, each a function of the seed and its index alone: no order, no state.
 
     Args:
         models: what is shown; sample i shows ``models[i % len(models)]``.
@@ -182,8 +182,8 @@ class Objects:
 
     def _stored(self, number: int, place: int) -> _Stored:
         if (number, place) not in self._views:
-            ticket = place * len(self.models) + number
-            R, distance_m, K = self._pose(sample_generator(ticket, self.config.seed + _BANK_SEED))
+            index = place * len(self.models) + number
+            R, distance_m, K = self._pose(sample_generator(index, self.config.seed + _BANK_SEED))
             shape = self._shape(number)
             middle = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             view = draw_view(shape, pose_of_middle(shape, R, middle), K)

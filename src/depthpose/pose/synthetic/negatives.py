@@ -110,7 +110,7 @@ def _bumps(points: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
 
 
 def _hand(size_m: float, generator: torch.Generator) -> Any:  # noqa: ANN401  trimesh's types
-    """Make a bunch of capsules: a palm and five fingers that bend."""
+    """Make a hand of capsules: a palm and five fingers that bend."""
     import trimesh
 
     palm = trimesh.creation.box((0.45 * size_m, 0.45 * size_m, 0.14 * size_m))

@@ -75,7 +75,7 @@ class TrainingClouds:
 
     Args:
         models: the objects; class k is ``models[k]``.
-        made: how synthetic views look; None: frames alone.
+        synthetic: how synthetic views look; None: frames alone.
         frames: real frames, and their share.
         cloud: points and voxels.
         seed: of the order of frames and of the choice of points.
@@ -88,7 +88,7 @@ class TrainingClouds:
     def __init__(
         self,
         models: Sequence[ObjectModel],
-        made: ObjectsConfig,
+        synthetic: ObjectsConfig,
         frames: FramesConfig | None,
         cloud: CloudConfig,
         seed: int,
@@ -96,14 +96,14 @@ class TrainingClouds:
     ) -> None:
         self.cloud, self.seed, self.frames = cloud, seed, frames
         self._first_alone = first_alone
-        self.made = Objects(models, made, cloud)
+        self.synthetic = Objects(models, synthetic, cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._real = None if frames is None else _open_frames(frames, models, cloud)
 
     def __len__(self) -> int:
-        """Tickets of an epoch: each frame comes once, or as many as views are made."""
+        """Samples of an epoch: each frame once, or as many as there are synthetic views."""
         if self._real is None or self.frames is None:
-            return len(self.made)
+            return len(self.synthetic)
         return max(1, round(len(self._real) / self.frames.share))
 
     def __getitem__(self, index: int) -> Cloud:
@@ -134,9 +134,9 @@ class TrainingClouds:
         # Sample i shows object i modulo their number.
         index = index * len(self._class_of) if index < self._first_alone else index
         if self._real is None or self.frames is None:
-            return self.made.sample(index)
+            return self.synthetic.sample(index)
         if float(torch.rand((), generator=generator)) >= self.frames.share:
-            return self.made.sample(index)
+            return self.synthetic.sample(index)
         sample = self._real[shuffled_index(index, len(self._real), self.seed)]
         angle = 2 * math.pi * float(torch.rand((), generator=generator))
         return _rolled(sample, angle) if self.frames.with_roll else sample

@@ -72,7 +72,7 @@ class TrainingCrops:
     ) -> None:
         self.config, self.seed = config, seed
         self.models = models
-        self.made = Objects(models, config.objects, config.cloud)
+        self.synthetic = Objects(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._real = None
         if config.frames is not None:
@@ -82,7 +82,7 @@ class TrainingCrops:
     def __len__(self) -> int:
         """Samples of an epoch: each frame once, or as many as there are synthetic views."""
         if self._real is None or self.config.frames is None:
-            return len(self.made)
+            return len(self.synthetic)
         return max(1, round(len(self._real) / self.config.frames.share))
 
     def __getitem__(self, index: int) -> CropSample:
@@ -106,10 +106,10 @@ class TrainingCrops:
 
     def _view(self, index: int) -> ViewSample:
         if self._real is None or self.config.frames is None:
-            return self.made.view(index)
+            return self.synthetic.view(index)
         generator = sample_generator(index, self.seed)
         if float(torch.rand((), generator=generator)) >= self.config.frames.share:
-            return self.made.view(index)
+            return self.synthetic.view(index)
         place = shuffled_index(index, len(self._real), self.seed)
         return self._real.view(self._real.instances[place])
 
@@ -166,8 +166,8 @@ class DepthImageTask:
     def _held_out(self, occlusion: float) -> list[ViewSample]:
         if occlusion not in self._views:
             c = self.config
-            made = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
-            self._views[occlusion] = [made.view(index) for index in range(len(made))]
+            synthetic = held_out_objects(self.models, c.objects, c.cloud, c.held_out, occlusion)
+            self._views[occlusion] = [synthetic.view(index) for index in range(len(synthetic))]
         return self._views[occlusion]
 
 
@@ -188,15 +188,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     crops = TrainingCrops(models, config, config.loop.seed)
     task = DepthImageTask(network, models, config)
-    seconds = train(
-        task,
-        crops,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
+    seconds = train(task, crops, config.loop, run.folder, **run.words)
     path = run.folder / "depth-image.safetensors"
     if find_shard().rank:
         return path

@@ -38,7 +38,7 @@ class HeldOut:
 
     Args:
         models: the objects; class k is ``models[k]``.
-        made: how the views of the training look.
+        synthetic: how the views of the training look.
         cloud: points and voxels.
         config: how many.
     """
@@ -46,13 +46,13 @@ class HeldOut:
     def __init__(
         self,
         models: Sequence[ObjectModel],
-        made: ObjectsConfig,
+        synthetic: ObjectsConfig,
         cloud: CloudConfig,
         config: HeldOutConfig,
     ) -> None:
         self.models, self.config = models, config
         self._surfaces = [sample_surface(model, _SURFACE)[0] for model in models]
-        self._made, self._cloud = made, cloud
+        self._synthetic, self._cloud = synthetic, cloud
         self._clouds: dict[float, list[Cloud]] = {}
 
     @torch.no_grad()
@@ -101,7 +101,9 @@ class HeldOut:
 
     def _of(self, occlusion: float) -> list[Cloud]:
         if occlusion not in self._clouds:
-            objects = held_out_objects(self.models, self._made, self._cloud, self.config, occlusion)
+            objects = held_out_objects(
+                self.models, self._synthetic, self._cloud, self.config, occlusion
+            )
             self._clouds[occlusion] = list(self._voxelised(objects))
         return self._clouds[occlusion]
 
@@ -116,16 +118,16 @@ class HeldOut:
 
 def held_out_objects(
     models: Sequence[ObjectModel],
-    made: ObjectsConfig,
+    synthetic: ObjectsConfig,
     cloud: CloudConfig,
     config: HeldOutConfig,
     occlusion: float,
 ) -> Objects:
     """Make the views that no training sees, all of one occlusion."""
     config_here = dataclasses.replace(
-        made,
+        synthetic,
         number=config.number * len(models),
-        seed=made.seed + HELD_OUT_SEED,
+        seed=synthetic.seed + HELD_OUT_SEED,
         views=None,
         resolution=(1.0, 1.0),
         occluded_share=1.0,
@@ -158,7 +160,9 @@ Table = Mapping[str, Mapping[str, float | None]]
 in diameters, None where there is no answer."""
 
 
-def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationConfig) -> PoseWeights:
+def calibrated(
+    weights: PoseWeights, synthetic: ObjectsConfig, config: CalibrationConfig
+) -> PoseWeights:
     """Choose when answers are withheld, on synthetic views from easy to hard and on negatives.
 
     Where not one view is answered there is nothing to choose by, and the weights stay as they are.
@@ -170,8 +174,8 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     opened = RefusalConfig(max_risk=1.0, **kept)
     open_weights = dataclasses.replace(weights, refusal=opened)
     views = dataclasses.replace(
-        made,
-        seed=made.seed + _CALIBRATION_SEED,
+        synthetic,
+        seed=synthetic.seed + _CALIBRATION_SEED,
         views=None,
         resolution=(1.0, 1.0),
         occluded_share=1.0,
@@ -199,7 +203,7 @@ def calibrated(weights: PoseWeights, made: ObjectsConfig, config: CalibrationCon
     return dataclasses.replace(weights, refusal=refusal)
 
 
-def _negatives(weights: PoseWeights, made: ObjectsConfig, number: int) -> list[PoseEstimate]:
+def _negatives(weights: PoseWeights, synthetic: ObjectsConfig, number: int) -> list[PoseEstimate]:
     """Estimate views of something else in the place of each object, kinds by turns."""
     shown: list[ObjectModel] = []
     for k in range(number):
@@ -208,18 +212,18 @@ def _negatives(weights: PoseWeights, made: ObjectsConfig, number: int) -> list[P
             generator = sample_generator(len(shown), _CALIBRATION_SEED)
             kind = kinds[k % len(kinds)]
             shown.append(negative_of(model, kind, weights.models, generator))
-    shown = [model for model in shown if model.diameter_m < made.distance_m[0]]
+    shown = [model for model in shown if model.diameter_m < synthetic.distance_m[0]]
     if not shown:
         return []
-    views = dataclasses.replace(made, number=len(shown), seed=made.seed + 1)
+    views = dataclasses.replace(synthetic, number=len(shown), seed=synthetic.seed + 1)
     return _posed(weights, Objects(shown, views, weights.cloud))[0]
 
 
-def score_held_out(weights: PoseWeights, made: ObjectsConfig, config: HeldOutConfig) -> Table:
+def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
     """Count right, wrong and refused answers of the whole estimator, by occlusion."""
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
-        objects = held_out_objects(weights.models, made, weights.cloud, config, occlusion)
+        objects = held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
         estimates, errors = _posed(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
         right = int(is_within_diameter(torch.tensor(answered)).sum())

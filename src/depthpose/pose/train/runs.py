@@ -55,20 +55,12 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         first_alone=config.first_alone,
     )
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
-    network = _made(config.network)
+    network = _network_of(config.network)
     if config.start is not None:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
-    seconds = train(
-        task,
-        clouds,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
+    seconds = train(task, clouds, config.loop, run.folder, **run.words)
     if run.tell is not None:
         run.tell("trained; now the refusal is calibrated and measured on synthetic views: minutes")
     if isinstance(network, PointNet):
@@ -146,7 +138,7 @@ def _as_written(weights: PoseWeights, *, with_half: bool) -> PoseWeights:
         return read_pose_weights(path)
 
 
-def _made(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
+def _network_of(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
     return PointNet(config) if isinstance(config, PointNetConfig) else ResUNet(config)
 
 

@@ -86,15 +86,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
-    seconds = train(
-        task,
-        samples,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
+    seconds = train(task, samples, config.loop, run.folder, **run.words)
     path = run.folder / "segmentation.safetensors"
     if find_shard().rank:
         return path

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
-from tests.pose.made_frames import draw_frame, made_models
+from tests.pose.synthetic_frames import draw_frame, frame_models
 
 from depthpose.core.files import write_depth_png, write_image
 from depthpose.pose.datasets import BopDataset, open_bop
@@ -22,7 +22,7 @@ def make_linemod(
 
     As published: models have no name and no symmetry.
     """
-    models = made_models() if models is None else models
+    models = frame_models() if models is None else models
     home = write_bop_models(folder, models)
     info = json.loads((home / "models_info.json").read_text())
     (home / "models_info.json").unlink()

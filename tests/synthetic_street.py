@@ -1,4 +1,4 @@
-"""A small made street whose disparity is known exactly: boxes, spheres and a ground plane.
+"""A small synthetic street whose disparity is known exactly: boxes, spheres and a ground plane.
 
 Each pixel's ray is cut with every solid in closed form, so depth is exact to rounding, and colour
 is a function of the surface point alone, so both views of the pair see the same surface. Frame:

@@ -1,9 +1,9 @@
 """Held-out synthetic views of known objects: success over occlusion, noise and resolution.
 
-    python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
+    python bench/synthetic_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
         --ours pose.safetensors --pointnet pointnet.safetensors \
         --depth-image depth-image.safetensors --open3d 100
-    python bench/made_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
+    python bench/synthetic_linemod.py --bop $DEPTHPOSE_DATA/pose/lm --objects 1 5 6 10 \
         --parts bracket connector mug --number 25 --register 25 --open3d 25 --sweep 0 \
         --occlusions 0 0.35
 
@@ -65,7 +65,7 @@ class Method(NamedTuple):
     limit: int
 
 
-def made_views(models: Sequence[ObjectModel], at: Condition, number: int) -> Objects:
+def synthetic_views(models: Sequence[ObjectModel], at: Condition, number: int) -> Objects:
     """Render ``number`` views of each object under a condition."""
     config = ObjectsConfig(
         number=number * len(models), seed=SEED, views=None,
@@ -147,7 +147,7 @@ def run_condition(
     methods: Sequence[Method], models: Sequence[ObjectModel], at: Condition, number: int
 ) -> tuple[list[Row], list[Row]]:
     """Give a row for each method and object and one for all objects together, and all views."""
-    objects = made_views(models, at, number)
+    objects = synthetic_views(models, at, number)
     surfaces = [sample_surface(model, POINTS)[0] for model in models]
     found: list[Row] = []
     for index in range(len(objects)):
@@ -255,7 +255,7 @@ def main() -> None:
         default=[],
         help="folders of earlier runs, of other methods on the same views",
     )
-    parser.add_argument("--out", type=Path, default=Path("out/made_linemod"))
+    parser.add_argument("--out", type=Path, default=Path("out/synthetic_linemod"))
     words = parser.parse_args()
     torch.set_num_threads(1)
     numbers = words.objects or sorted(read_models_info(models_folder(words.bop)))

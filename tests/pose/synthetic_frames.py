@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from tests.pose.made_object import bottle, bracket
+from tests.pose.synthetic_objects import bottle, bracket
 
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb
@@ -25,12 +25,12 @@ WIDTH, HEIGHT = 160, 120
 K = torch.tensor([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]], dtype=torch.float64)
 
 
-def made_models() -> list[ObjectModel]:
+def frame_models() -> list[ObjectModel]:
     """One that looks alike from no two sides, one that turns about an axis."""
     return [replace(bracket(), number=7), replace(bottle(), number=10)]
 
 
-def made_pose(x_m: float, seed: int) -> Rigid:
+def pose_in_frame(x_m: float, seed: int) -> Rigid:
     generator = torch.Generator().manual_seed(seed)
     motion = 0.6 * torch.randn(6, generator=generator).double()
     motion[3:] = 0
@@ -43,7 +43,7 @@ def draw_frame(number: int, models: Iterable[ObjectModel]) -> BopFrame:
     depth = torch.full((HEIGHT, WIDTH), 1.2)
     masks, poses = [], []
     for k, model in enumerate(models):
-        pose = made_pose(0.24 * k - 0.12, 10 * number + k)
+        pose = pose_in_frame(0.24 * k - 0.12, 10 * number + k)
         corners = pose.apply(model.vertices_m.double())[model.faces]
         seen = rasterize(corners, K, WIDTH, HEIGHT).depth_m.float()
         masks.append(seen.nan_to_num(9.0) < depth)
@@ -58,8 +58,8 @@ def draw_frame(number: int, models: Iterable[ObjectModel]) -> BopFrame:
 
 
 def make_dataset(folder: Path, frames: int = 3) -> BopDataset:
-    write_bop_models(folder, made_models())
-    write_bop_scene(folder, "test", 1, [draw_frame(i, made_models()) for i in range(frames)])
+    write_bop_models(folder, frame_models())
+    write_bop_scene(folder, "test", 1, [draw_frame(i, frame_models()) for i in range(frames)])
     return open_bop(folder)
 
 

@@ -7,7 +7,7 @@ from torch import nn
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 
-def with_lively_norms(network: NetworkT) -> NetworkT:
+def with_random_norms(network: NetworkT) -> NetworkT:
     """Give each batch norm random statistics and weights; eval mode."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
