@@ -9,6 +9,7 @@ an object that it deviates from by 3 % of the diameter at most is no negative: "
 Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
 themselves, four times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of
 the diameter. ``--seed`` draws other views.
+Each is a depth image with a mask; ``--clouds`` gives the points in the mask alone.
 ``--save`` writes all signals as JSON; then nothing is refused for its risk.
 """
 
@@ -30,7 +31,7 @@ from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
 from depthpose.pose.train.held_out import pose_error
-from depthpose.pose.types import CloudSample, ObjectModel
+from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.pose.weights import PoseWeights
 from depthpose.report.tables import markdown_table
 
@@ -40,14 +41,16 @@ ALIKE = "mirror image alike"
 Row = dict[str, Any]
 
 
-def seen(models: Sequence[ObjectModel], seed: int) -> Iterator[CloudSample]:
-    """Render each of some models once."""
+def seen(
+    models: Sequence[ObjectModel], seed: int, with_scene: bool
+) -> Iterator[CloudSample | ViewSample]:
+    """Render each of some models once: a depth image and a mask, or the cloud of the mask alone."""
     config = ObjectsConfig(
         number=len(models), seed=seed, views=None, resolution=(1.0, 1.0), occluded_share=0.5,
         occlusion=(0.0, 0.5),
     )  # fmt: skip
     objects = Objects(models, config)
-    return (objects[k] for k in range(len(models)))
+    return (objects.view(k) if with_scene else objects[k] for k in range(len(models)))
 
 
 def things(
@@ -74,11 +77,13 @@ def kinds() -> Iterator[str]:
             yield kind
 
 
-def measure(net: GeoPoseNet, kind: str, number: int, seed: int) -> list[Row]:
+def measure(
+    net: GeoPoseNet, kind: str, number: int, seed: int, with_scene: bool = True
+) -> list[Row]:
     """Estimate every negative of a kind, or the objects themselves."""
     models, asked = things(net.weights, kind, number, seed)
     rows = []
-    for sample, which in zip(seen(models, seed), asked, strict=True):
+    for sample, which in zip(seen(models, seed, with_scene), asked, strict=True):
         found = net.estimate_many([sample.input])[0]
         error = pose_error(found, sample.truth, net.weights.models[which])
         is_right = kind == ITSELF and error < 0.1
@@ -113,6 +118,7 @@ def main() -> None:
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--number", type=int, default=40)
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--clouds", action="store_true", help="clouds in place of depth images")
     parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
     words = parser.parse_args()
@@ -125,7 +131,7 @@ def main() -> None:
         began, rows = time.process_time(), []
         for kind in words.kinds or [ITSELF, *kinds()]:
             number = 4 * words.number if kind == ITSELF else words.number
-            some = groups(measure(net, kind, number, words.seed))
+            some = groups(measure(net, kind, number, words.seed, not words.clouds))
             print(*map(summary, some), sep="\n", flush=True)
             rows += some
         every = [row for some in rows for row in some if row["kind"] not in (ITSELF, ALIKE)]

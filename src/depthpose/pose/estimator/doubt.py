@@ -11,9 +11,10 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.evidence import LATE, observability
 from depthpose.pose.estimator.mirror import mirror_gain
-from depthpose.pose.estimator.prepare import Refusal
+from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.refusal import reason_of, risk_of
 from depthpose.pose.estimator.scale import Scale, scale_of
+from depthpose.pose.estimator.scene import seen_through
 from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel
@@ -32,7 +33,7 @@ share less than 1 % (``bench/synthetic_linemod.py``)."""
 class Posed(NamedTuple):
     """A cloud and the pose that was found for it; ``free``: the motions that symmetries allow."""
 
-    cloud_m: Float[Tensor, "n 3"]
+    cloud: Prepared
     pose: Rigid
     model: ObjectModel
     surface: Surface
@@ -44,7 +45,8 @@ def find_doubt(
 ) -> Refusal | None:
     """Say why a pose is withheld; None where nothing speaks against it.
 
-    Signals that take long are measured last, and added to ``signals``.
+    What a depth image shows about the object and signals that take long are measured here, and
+    added to ``signals``.
 
     Args:
         posed: the pose.
@@ -54,6 +56,8 @@ def find_doubt(
     """
     if not with_icp and not config.slopes.keys().isdisjoint(LATE):
         config = replace(config, max_risk=_UNREFINED * config.max_risk)
+    if posed.cloud.view is not None:
+        signals["through"] = seen_through(posed.cloud.view, posed.pose, posed.surface)
     least = {**signals, **dict.fromkeys(LATE, 0.0)}
     found = _too_risky(least, signals, config) or _not_observable(posed, config)
     if found is None and with_icp and config.max_scale_error < 1:
@@ -71,7 +75,7 @@ def _too_risky(
 
 
 def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
-    observable, motion = observability(posed.cloud_m, posed.pose, posed.surface, posed.free)
+    observable, motion = observability(posed.cloud.cloud_m, posed.pose, posed.surface, posed.free)
     if observable >= config.min_hold:
         return None
     turn = float(motion[:3].norm())
@@ -86,9 +90,9 @@ def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
 
 def _other_shape(posed: Posed, signals: dict[str, float], config: RefusalConfig) -> Refusal | None:
     """Fit another size and the mirror image, and name what fits better than the object itself."""
-    scale = scale_of(posed.cloud_m, posed.pose, posed.surface)
+    scale = scale_of(posed.cloud.cloud_m, posed.pose, posed.surface)
     is_alike = is_mirror_alike(posed.model)
-    mirror = 0.0 if is_alike else mirror_gain(posed.cloud_m, posed.pose, posed.surface)
+    mirror = 0.0 if is_alike else mirror_gain(posed.cloud.cloud_m, posed.pose, posed.surface)
     signals["scale"], signals["size"] = scale.times, scale.doubt
     signals["grown"], signals["mirror"] = max(0.0, scale.gain), max(0.0, mirror)
     reasons = [_other_size(scale, config), _mirrored(mirror)]

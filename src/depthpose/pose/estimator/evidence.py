@@ -33,6 +33,7 @@ SIGNALS: dict[str, str] = {
     "far": "{:.0%} of the points are nowhere near the posed surface",
     "front": "the posed surface would occlude {:.0%} of the points that were seen",
     "unseen": "{:.0%} of the posed surface that faces the camera has no point",
+    "through": "the camera saw through {:.0%} of the posed surface",
     "few": "the cloud fills few voxels: ten are {:.1%} of it",
     "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
     "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",

@@ -59,7 +59,7 @@ def pose_from_directions(
     answer = answer_of(model, found, vote)
     assert answer.free_motions is not None
     free = answer.free_motions.double()
-    posed = Posed(voted.cloud.cloud_m, found.pose, model, surface, free)
+    posed = Posed(voted.cloud, found.pose, model, surface, free)
     return checked(posed, found, answer, refusal, clock, with_icp=config.with_icp)
 
 

@@ -36,11 +36,13 @@ class Prepared:
         cloud_m: all usable points, what flies about left out.
         points_m: those that the network sees and that vote, one a voxel.
         voxels: of the network's grid.
+        view: what the cloud was lifted from; None where the cloud alone is known.
     """
 
     cloud_m: Float[Tensor, "n 3"]
     points_m: Float[Tensor, "m 3"]
     voxels: VoxelGrid
+    view: ViewInput | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +84,8 @@ def prepare_cloud(
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
     voxels = voxelise(sampled_m, cloud)
-    return Prepared(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels)
+    view = given if isinstance(given, ViewInput) else None
+    return Prepared(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels, view=view)
 
 
 def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:

@@ -189,7 +189,7 @@ def pose_from_proposals(
     answer = answer_of(model, found)
     assert answer.free_motions is not None
     free = answer.free_motions.double()
-    posed = Posed(cloud.cloud_m, found.pose, model, surface, free)
+    posed = Posed(cloud, found.pose, model, surface, free)
     return checked(posed, found, answer, refusal, clock)
 
 

@@ -256,7 +256,9 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
     net = GeoPoseNet(weights, EstimateConfig())
     estimates, errors = [], []
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
-        samples = [objects[i] for i in range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))]
+        samples = [
+            objects.view(i) for i in range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
+        ]
         found = net.estimate_many([sample.input for sample in samples])
         estimates += found
         for offset, (estimate, sample) in enumerate(zip(found, samples, strict=True)):
