@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.pose.made_object import K, Oracle, bracket, pose_at, tiny_weights, view_of
+from tests.pose.synthetic_objects import K, Oracle, bracket, pose_at, tiny_weights, view_of
 from torch import Tensor
 
 from depthpose.core.camera import back_project
