@@ -12,12 +12,14 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
+from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.methods import Method
 from depthpose.cli.thesis.depth_tables import Order, reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
+from depthpose.depth.evaluate import DecileRow, Evaluation
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.thesis.depth_tables import find_table
 
@@ -104,6 +106,18 @@ def test_table_2_2_is_made_by_one_command(
         assert "torch" in text
     assert "real right image" in page
     assert "## Settings" in markdown
+
+
+def test_rows_of_confidence_name_the_speed() -> None:
+    row = DecileRow(
+        protocol="p", dataset="d", cap_m=80.0, frames=1, confidence_decile=1, error={"abs_rel": 0.1}
+    )
+    given = Evaluation(rows=[], per_frame=[], deciles=[row], skipped={})
+    settings = {"matcher": "light", "weights": "default", "weights_sha256": 64 * "0"}
+    found = [
+        signed(given, speed, settings | {"speed": speed}).deciles[0] for speed in ("quick", "fine")
+    ]
+    assert [row.columns()["speed"] for row in found] == ["quick", "fine"]
 
 
 def test_the_old_name_of_the_option_baseline_still_works(street: Path, tmp_path: Path) -> None:

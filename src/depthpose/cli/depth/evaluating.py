@@ -161,7 +161,7 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
         settings: that made them, where they are ours.
     """
     source = describe_source(name, settings)
-    short = {"method": source.method, "sees": source.sees, "weights": source.weights}
+    short = {field: getattr(source, field) for field in ("method", "sees", "speed", "weights")}
     return Evaluation(
         rows=[replace(row, **asdict(source)) for row in result.rows],
         per_frame=[replace(row, **short) for row in result.per_frame],

@@ -85,6 +85,7 @@ class FrameRow(Row):
 
     method: str | None = None
     sees: str | None = None
+    speed: str | None = None
     weights: str | None = None
     protocol: str
     dataset: str
@@ -108,6 +109,7 @@ class DecileRow(Row):
 
     method: str | None = None
     sees: str | None = None
+    speed: str | None = None
     weights: str | None = None
     protocol: str
     dataset: str
