@@ -79,11 +79,11 @@ def refuse_beyond(rows: Iterable[Row]) -> None:
         InputError: the first such row.
     """
     for row in rows:
-        found, limit = row[f"{row['judged']} difference"], row["limit"]
+        found, limit = row[f"{row['limited']} difference"], row["limit"]
         if not found <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
             raise InputError(
                 f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
-                f"{found:.3g} ({row['judged']}), the limit is {limit:.3g}; nothing is written. "
+                f"{found:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is written. "
                 "Install other versions of onnxscript and onnxruntime, and report this."
             )
 
@@ -123,7 +123,7 @@ def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> 
         "output": output,
         "largest difference": float(difference.max()),
         "mean difference": float(difference.mean()),
-        "judged": limit.of,
+        "limited": limit.of,
         "limit": limit.value,
         "unit": "share" if limit.is_relative else "as the output",
         **flipped,

@@ -74,7 +74,7 @@ def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
 
 
 def _fits(
-    vote: Vote, model: ObjectModel, config: EstimateConfig, is_judged: bool
+    vote: Vote, model: ObjectModel, config: EstimateConfig, with_risk: bool
 ) -> PoseFit | Refusal:
     """Fit the keypoints that agree; where a risk decides, also all of them."""
     found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
@@ -86,10 +86,10 @@ def _fits(
             "are needed: too few points, or not the object that the mask promises",
         )
     strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if is_judged else strict)
+    limit_m = model.diameter_m * (rough if with_risk else strict)
     used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
     choices = [used] if int(used.sum()) >= _LEAST else []
-    if is_judged and (not choices or config.with_icp) and not torch.equal(used, found):
+    if with_risk and (not choices or config.with_icp) and not torch.equal(used, found):
         choices.append(found)
     if not choices:
         return Refusal(
