@@ -53,7 +53,8 @@ def test_the_street_is_the_same_every_time() -> None:
 def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> None:
     result = make_demo(tmp_path, scale=0.5)
     html = result.page.read_text()
-    assert html.count("data:image/") == 3 + 3 + 2 + 4 + 3 + 3 + 3 + 3
+    assert html.count("data:image/") == 4 + 4 + 2 + 4 + 3 + 3 + 3 + 3
+    assert html.index("data:image/") < html.index("<table"), "pictures come first"
     assert html.count(' height="') >= 24, "pictures have their sizes, so that nothing moves"
     assert len(html) < 9e6
     assert "://" not in html, "the page loads nothing"

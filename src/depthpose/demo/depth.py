@@ -81,11 +81,15 @@ def _try_all(
         pair = sample.input if sees == _FROM_PAIR else replace(sample.input, right=None)
         estimate = net.estimate_pair(pair)
         rows.append({"scene": name, "method": method, "sees": sees, **_measure(sample, estimate)})
-        folder = out / method.lower().replace(",", "").replace(" ", "-")
-        shown.append(
-            _show(folder, f"{name}: {method}, {sees}", replace(sample, input=pair), estimate)
-        )
-    return rows, [_opening(out / name, sample, text, rows), *shown]
+        title = f"{name}: {method}, {sees}"
+        shown.append(_show(out / _folder(method), title, replace(sample, input=pair), estimate))
+    method = next(iter(nets))
+    best = Picture(
+        path=out / _folder(method) / f"{name}.color.png",
+        caption=f"depth from both: {method}",
+        scale=depth_scale(*_range_m(sample)),
+    )
+    return rows, [_opening(out / name, sample, text, rows, best), *shown]
 
 
 def _write_pair(folder: Path, sample: StereoSample) -> None:
@@ -133,7 +137,13 @@ _MOTORCYCLE_TEXT = (
 )
 
 
-def _opening(folder: Path, sample: StereoSample, text: str, rows: list[dict[str, Any]]) -> Section:
+def _folder(method: str) -> str:
+    return method.lower().replace(",", "").replace(" ", "-")
+
+
+def _opening(
+    folder: Path, sample: StereoSample, text: str, rows: list[dict[str, Any]], best: Picture
+) -> Section:
     scale = depth_scale(*_range_m(sample))
     return Section(
         title=f"The {sample.input.name}",
@@ -142,6 +152,7 @@ def _opening(folder: Path, sample: StereoSample, text: str, rows: list[dict[str,
         pictures=[
             Picture(path=folder / "left.png", caption="left image"),
             Picture(path=folder / "right.png", caption="right image"),
+            best,
             Picture(path=folder / "depth.color.png", caption="true depth; grey: none", scale=scale),
         ],
     )

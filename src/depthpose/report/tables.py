@@ -78,18 +78,18 @@ class Section:
         title: its heading.
         text: a paragraph.
         facts: names and values.
+        pictures: beside each other.
         rows: a table that sorts.
         tables: small tables by what they show, rows of equal length.
-        pictures: beside each other.
         scenes: 3D views.
     """
 
     title: str
     text: str = ""
     facts: Sequence[tuple[str, str]] = ()
+    pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     rows: Sequence[Row] = ()
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
-    pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     scenes: Sequence[Scene] = field(default_factory=tuple)
 
 
