@@ -125,19 +125,16 @@ def test_predict_segments_by_weights_once(
     assert before == (out / "detections" / "halves.json").stat().st_mtime_ns
 
 
+def evaluation(data: BopDataset, weights: Path) -> list[str]:
+    given = ["--bop", str(data.folder), "--weights", str(weights), "--no-vsd"]
+    return ["pose", "evaluate", *given]
+
+
 def test_objects_asked_for_later_are_found_too(
     synthetic: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     masks, out = halves(tmp_path / "halves.safetensors"), tmp_path / "out"
-    words = [
-        "pose",
-        "evaluate",
-        "--bop",
-        str(synthetic.folder),
-        "--weights",
-        str(weights),
-        "--no-vsd",
-    ]
+    words = evaluation(synthetic, weights)
     words += ["--masks", str(masks), "--out", str(out)]
     assert main([*words, "--objects", "7"]) == 0
     assert len(statuses(out)) == 2
@@ -194,15 +191,7 @@ def test_masks_of_one_name_are_distinguished_by_their_folders(
         (tmp_path / folder).mkdir()
         found_by_truth(synthetic, tmp_path / folder / "found.json")
     files = [str(tmp_path / folder / "found.json") for folder in ("x", "y")]
-    words = [
-        "pose",
-        "evaluate",
-        "--bop",
-        str(synthetic.folder),
-        "--weights",
-        str(weights),
-        "--no-vsd",
-    ]
+    words = evaluation(synthetic, weights)
     words += ["--out", str(tmp_path / "out"), "--masks"]
     assert main([*words, *files]) == 0
     rows = json.loads((tmp_path / "out" / "rows.json").read_text())
