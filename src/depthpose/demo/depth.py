@@ -63,7 +63,7 @@ def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
     # The nearest surfaces of both scenes; OpenCV leaves that many columns unmatched.
     columns = 16 * math.ceil(sample.input.left.shape[2] / 16 / 10)
     sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
-    matched = {} if network.matcher is None else {"light matcher": (_FROM_PAIR, network)}
+    matched = {} if network.matcher is None else {"stereo network": (_FROM_PAIR, network)}
     filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
     pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
     is_street = sample.input.name == "street"

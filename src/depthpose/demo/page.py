@@ -12,7 +12,7 @@ from depthpose.report.tables import table_files, write_page, write_table
 
 _PAGE = "report.html"
 _FOLDERS = (
-    "street", "motorcycle", "selecting-generator", "light-matcher", "sgbm-holes-filled",
+    "street", "motorcycle", "selecting-generator", "stereo-network", "sgbm-holes-filled",
     "part", "parts", "geo-posenet",
 )  # fmt: skip
 

@@ -224,7 +224,11 @@ def split_pairs(
 
 
 def fine_focal_px(config: AdaptTraining, network: nn.Module) -> float:
-    """Give the focal length at which the first pair is matched at the fine speed [px]."""
+    """Give the focal length at which the first pair is matched at the fine speed [px].
+
+    Raises:
+        InputError: the first folder has fewer than two pairs with calibration.
+    """
     folder, split = config.pairs.folders[0], config.pairs.split
     dataset, back = split_pairs(folder, split, config.kept_back, config.pairs.exclude)
     camera = dataset.read_input(back[0]).camera
