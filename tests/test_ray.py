@@ -157,20 +157,20 @@ def test_ten_kills_at_random_moments_lose_nothing(
     choose = random.Random(int(os.environ.get("DEPTHPOSE_SEED", "0")))
     total, kills = int(os.environ.get("DEPTHPOSE_KILL_INPUTS", "300")), []
 
+    # Each moment is a number of shards, all in the first two thirds: work remains after the last.
+    moments = sorted(choose.sample(range(1, total // 5 * 2 // 3), 10))
+
     def kill_ten() -> None:
-        # A moment is a random number of shards later, so that a slow machine gets on in between.
-        shards, after = tmp_path / "out" / "shards", 1
-        until = time.monotonic() + PATIENCE_S
+        shards, until = tmp_path / "out" / "shards", time.monotonic() + PATIENCE_S
         while len(kills) < 10 and time.monotonic() < until:
-            time.sleep(choose.uniform(0.0, 1.0))
-            if len(list(shards.glob("*.json"))) < after:
+            time.sleep(choose.uniform(0.0, 0.3))
+            if len(list(shards.glob("*.json"))) < moments[len(kills)]:
                 continue
             if len(kills) % 3 == 2:
                 nodes.kill_node(choose)
                 kills.append("node")
             elif nodes.kill_worker(choose):
                 kills.append("worker")
-            after = len(list(shards.glob("*.json"))) + choose.randint(1, 3)
 
     words = [str(repeated(home, total)), "--address", nodes.address, "--block", "5"]
     start = time.monotonic()
