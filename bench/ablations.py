@@ -22,7 +22,7 @@ from view_quality import measure
 from depthpose.cli import main as depthpose
 from depthpose.core.checkpoint import bound_facts
 from depthpose.core.files import write_json
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.depth.config import (
     AugmentConfig,
     GeneratorConfig,
@@ -33,7 +33,7 @@ from depthpose.depth.config import (
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.synthetic import draw_street
-from depthpose.depth.train import STAGES, Run
+from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 from depthpose.report.tables import markdown_table, write_table

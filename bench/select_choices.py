@@ -23,7 +23,7 @@ import torch
 from depthpose.cli import main as depthpose
 from depthpose.core.checkpoint import bound_facts
 from depthpose.core.files import write_json
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.depth.config import (
     Answer,
     AugmentConfig,
@@ -39,7 +39,7 @@ from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import Drawn, SelectionGenerator
 from depthpose.depth.synthesis.selection import mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
-from depthpose.depth.train import STAGES, Run
+from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import SelectTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 from depthpose.report.tables import markdown_table, write_table

@@ -21,8 +21,9 @@ from matchers import make_nets, measure, samples
 
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.core.files import write_json
+from depthpose.core.loop import Run
 from depthpose.depth.config import AugmentConfig, PairsConfig
-from depthpose.depth.train import STAGES, Run
+from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import StereoTraining
 from depthpose.report.tables import markdown_table, write_table
 

@@ -3,6 +3,7 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import settings
 
 
@@ -29,3 +30,8 @@ def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # How long an example takes is the machine's, not the code's.
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
+
+# One thread each, as 'make test' has it: sums of several threads are added in another order, and a
+# short training may then end elsewhere. Programs that a test starts inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import pytest
@@ -13,6 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch import nn
 
 from depthpose.core.config import config_to_dict, read_config
+from depthpose.core.loop import Run
 from depthpose.depth.config import PairsConfig
 from depthpose.depth.datasets import read_split
 from depthpose.depth.stereo import PSMNet
@@ -21,19 +21,16 @@ from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.train import runs as depth_runs
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.runs import Run as DepthRun
 from depthpose.pose.train import STAGES as POSE_STAGES
-from depthpose.pose.train import Run as PoseRun
-from depthpose.pose.train import depth_image, runs, segmentation
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 OBJECTS = (1, 2, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 15)
 DEPTH = ("view", "stereo", "finetune")
 POSE = {
-    "thesis": ("pose", runs),
-    "thesis-pointnet": ("pointnet", runs),
-    "thesis-depth-image": ("depth-image", depth_image),
-    "thesis-masks": ("segmentation", segmentation),
+    "thesis": "pose",
+    "thesis-pointnet": "pointnet",
+    "thesis-depth-image": "depth-image",
+    "thesis-masks": "segmentation",
 }
 NO_WEIGHT_FOLLOWS = frozenset({
     # Given by words of the command: where the data lies, what a stage begins with.
@@ -96,7 +93,7 @@ class _NamedPairs(TrainingPairs):
 
 
 def begun(
-    monkeypatch: pytest.MonkeyPatch, where: ModuleType, name: str, begin: Callable[[], object]
+    monkeypatch: pytest.MonkeyPatch, where: object, name: str, begin: Callable[[], object]
 ) -> tuple[Any, ...]:
     """Run a training up to a function, and give what that is called with."""
     caught: list[tuple[Any, ...]] = []
@@ -115,7 +112,7 @@ def depth_training(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
     kind, run_stage = DEPTH_STAGES[name]
     config = read_config(CONFIGS / f"depth/{name}.yaml", kind)
     monkeypatch.setattr(depth_runs, "TrainingPairs", _NamedPairs)
-    run = DepthRun(folder=folder)
+    run = Run(folder=folder)
     task, pairs, config, _ = begun(monkeypatch, depth_runs, "_walk", lambda: run_stage(config, run))
     return Training(task, pairs, config)
 
@@ -132,8 +129,7 @@ def linemod(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pose_training(
     name: str, monkeypatch: pytest.MonkeyPatch, linemod: Path, folder: Path
 ) -> Training:
-    what, module = POSE[name]
-    kind, run_stage = POSE_STAGES[what]
+    kind, run_stage = POSE_STAGES[POSE[name]]
     config = read_config(CONFIGS / f"pose/{name}.yaml", kind)
     parts = {"models": "bop", "frames": "folder", "images": "folder"}
     there = {
@@ -142,8 +138,8 @@ def pose_training(
         if hasattr(config, part)
     }
     config = dataclasses.replace(config, **there)
-    run = PoseRun(folder=folder)
-    task, samples, *_ = begun(monkeypatch, module, "train", lambda: run_stage(config, run))
+    run = Run(folder=folder)
+    _, task, samples, *_ = begun(monkeypatch, Run, "train", lambda: run_stage(config, run))
     return Training(task, samples, task.config)
 
 
@@ -163,7 +159,7 @@ def settings(content: Mapping[str, Any], prefix: str = "") -> set[str]:
 @pytest.mark.parametrize(
     ("path", "kind"),
     [(f"depth/{name}.yaml", DEPTH_STAGES[name][0]) for name in DEPTH]
-    + [(f"pose/{name}.yaml", POSE_STAGES[what][0]) for name, (what, _) in POSE.items()],
+    + [(f"pose/{name}.yaml", POSE_STAGES[what][0]) for name, what in POSE.items()],
 )
 def test_no_default_is_relied_on(path: str, kind: type) -> None:
     """A default may change for other reasons, and a published setting may not change with it."""

@@ -12,6 +12,7 @@ MOVED = {
     "depth.figures": "thesis.depth_figures",
     "depth.floors": "depth.baselines",
     "depth.kitti": "depth.datasets",
+    "depth.lite0": "depth.encoder",
     "depth.sizes": "depth.disparity",
     "depth.streets": "depth.synthetic",
     "depth.tables": "thesis.depth_tables",

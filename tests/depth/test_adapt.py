@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import AugmentConfig, DegradeConfig, MatcherConfig, PairsConfig
 from depthpose.depth.config import PSMNetConfig as Config
@@ -21,7 +21,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.losses import photometric_error, smoothness_loss
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
-from depthpose.depth.train import Run, train_adapt
+from depthpose.depth.train import train_adapt
 from depthpose.depth.train.adapt import (
     AdaptMetrics,
     AdaptTask,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tests.depth.constant_selection import CONFIG, of_all_kinds
+from tests.depth.test_stereo_light import SMALL
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
@@ -18,7 +19,6 @@ from depthpose.core.files import write_image
 from depthpose.depth.config import (
     Answer,
     GeneratorConfig,
-    LightConfig,
     MatcherConfig,
     PSMNetConfig,
 )
@@ -112,10 +112,10 @@ def test_the_gathered_volume_is_the_concatenation_volume(width: int) -> None:
 @pytest.mark.slow
 def test_the_graph_of_the_light_network_takes_any_size() -> None:
     torch.manual_seed(0)
-    config = LightConfig(
-        max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.1
-    )
-    network = SizelessLight(LightStereo(config).eval()).eval()
+    light = LightStereo(dataclasses.replace(SMALL, encoder_width=0.1)).eval()
+    assert light.enlargement.agreement is not None
+    torch.nn.init.normal_(light.enlargement.agreement.weight)
+    network = SizelessLight(light).eval()
     model = network_model(network, [torch.rand(2, 3, 64, 96) for _ in range(2)], 32)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     pair = torch.randn(2, 3, 3, 32, 128).unbind()

@@ -10,10 +10,10 @@ from tests.depth.test_kitti_folders import make_object, make_raw, write
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, write_depth_png, write_disparity_png, write_image
-from depthpose.core.loop import LoopConfig
+from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
 from depthpose.depth.datasets import open_dataset
-from depthpose.depth.train import Run, TrainingPairs, train_stereo
+from depthpose.depth.train import TrainingPairs, train_stereo
 from depthpose.depth.train.config import StereoTraining
 
 FOCAL_PX, BASELINE_M = 100.0, 0.5
@@ -132,8 +132,9 @@ def test_the_record_of_a_run_says_the_truth_of_each_folder(tmp_path: Path) -> No
     path = train_stereo(config, Run(folder=tmp_path / "run"))
     record = read_json(tmp_path / "run" / "run.json")
     assert isinstance(record, dict)
-    assert record["settings"]["truth"] == ["made streets: disparity", "mine: scan"]
+    assert record["settings"]["truth"] == ["synthetic streets: disparity", "mine: scan"]
     assert (
-        "- **Truth**: made streets: disparity, mine: scan\n" in path.with_suffix(".md").read_text()
+        "- **Truth**: synthetic streets: disparity, mine: scan\n"
+        in path.with_suffix(".md").read_text()
     )
     assert config_to_dict(config)["pairs"]["truth"] is None

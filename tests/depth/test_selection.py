@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.depth.config import SelectionConfig
-from depthpose.depth.lite0 import Lite0Encoder, import_lite0, read_lite0
+from depthpose.depth.config import EncoderKind, SelectionConfig
+from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.synthesis.selection import (
     log_expectation,
@@ -45,9 +45,22 @@ def one_hot(classes: Tensor, count: int) -> Tensor:
 
 def test_parameters_are_those_of_lite0_without_its_classifier() -> None:
     """4,652,008 published, less 320 x 1280 + 2 x 1280 of the last layer, 1281 x 1000 of classes."""
-    counted = sum(p.numel() for p in Lite0Encoder().parameters())
+    counted = sum(p.numel() for p in LiteEncoder().parameters())
     assert counted == 4_652_008 - 320 * 1280 - 2 * 1280 - 1281 * 1000
-    assert Lite0Encoder().channels == [16, 24, 40, 112, 320]
+    assert LiteEncoder().channels == [16, 24, 40, 112, 320]
+
+
+def test_parameters_are_those_of_lite2_without_its_classifier() -> None:
+    """6,092,072 published, less 352 x 1280 + 2 x 1280 of the last layer, 1281 x 1000 of classes."""
+    encoder = LiteEncoder(kind="efficientnet-lite2")
+    counted = sum(p.numel() for p in encoder.parameters())
+    assert counted == 6_092_072 - 352 * 1280 - 2 * 1280 - 1281 * 1000
+    assert encoder.channels == [16, 24, 48, 120, 352]
+    assert len(encoder.blocks) == 21
+    encoder.freeze_early()
+    assert [all(not p.requires_grad for p in b.parameters()) for b in encoder.blocks].index(
+        False
+    ) == 4
 
 
 def test_features_and_logits_have_their_strides() -> None:
@@ -62,7 +75,7 @@ def test_features_and_logits_have_their_strides() -> None:
 
 def test_convolutions_of_stride_two_pad_below_and_to_the_right() -> None:
     """TensorFlow's SAME: of 4 pixels, a 3x3 kernel of stride 2 sees 0..2 and 2..4."""
-    first = Lite0Encoder(1 / 32).stem
+    first = LiteEncoder(1 / 32).stem
     torch.nn.init.ones_(first.conv.weight)
     image = torch.zeros(1, 3, 4, 4)
     image[..., 0, 0] = 1.0
@@ -141,7 +154,11 @@ def test_gradients_reach_the_right_view_through_the_drawn_one() -> None:
     assert float(head[TINY.planes + 1 :].abs().sum()) > 0
 
 
-def published_names(encoder: Lite0Encoder) -> dict[str, Tensor]:
+LITE0: EncoderKind = "efficientnet-lite0"
+LITE2: EncoderKind = "efficientnet-lite2"
+
+
+def published_names(encoder: LiteEncoder) -> dict[str, Tensor]:
     """State dict of the encoder under the names that its publisher uses, with a classifier."""
     state = {}
     for name, tensor in encoder.state_dict().items():
@@ -151,16 +168,21 @@ def published_names(encoder: Lite0Encoder) -> dict[str, Tensor]:
         _, number, part, kind, rest = re.split(r"\.", name, maxsplit=4)
         norm = {"expand": "_bn0", "depthwise": "_bn1", "project": "_bn2"}[part]
         state[f"_blocks.{number}.{f'_{part}_conv' if kind == 'conv' else norm}.{rest}"] = tensor
-    extra = {"_conv_head.weight": (1280, 320, 1, 1), "_bn1.weight": (1280,), "_fc.bias": (1000,)}
+    extra = {
+        "_conv_head.weight": (1280, encoder.channels[-1], 1, 1),
+        "_bn1.weight": (1280,),
+        "_fc.bias": (1000,),
+    }
     return state | {name: torch.zeros(shape) for name, shape in extra.items()}
 
 
-def test_the_published_encoder_is_imported_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [LITE0, LITE2])
+def test_the_published_encoder_is_imported_whole(tmp_path: Path, kind: EncoderKind) -> None:
     torch.manual_seed(1)
-    encoder = Lite0Encoder()
+    encoder = LiteEncoder(kind=kind)
     torch.save(published_names(encoder), tmp_path / "lite0.pth")
-    import_lite0(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
-    found = read_lite0(tmp_path / "lite0.safetensors").state_dict()
+    import_encoder(tmp_path / "lite0.pth", kind, tmp_path / "lite0.safetensors")
+    found = read_encoder(tmp_path / "lite0.safetensors", kind).state_dict()
     for name, tensor in encoder.state_dict().items():
         assert torch.equal(found[name], tensor), name
 
@@ -174,11 +196,11 @@ def test_the_published_encoder_is_imported_whole(tmp_path: Path) -> None:
     ],
 )
 def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) -> None:  # noqa: ANN001
-    state = published_names(Lite0Encoder())
+    state = published_names(LiteEncoder())
     change(state)
     torch.save(state, tmp_path / "lite0.pth")
     with pytest.raises(InputError, match=message):
-        import_lite0(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
+        import_encoder(tmp_path / "lite0.pth", LITE0, tmp_path / "lite0.safetensors")
     assert not (tmp_path / "lite0.safetensors").exists()
 
 

@@ -11,7 +11,7 @@ from tests.depth.random_norms import with_random_norms
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig
+from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     LightConfig,
@@ -20,9 +20,10 @@ from depthpose.depth.config import (
     PSMNetConfig,
     StreetsConfig,
 )
-from depthpose.depth.lite0 import KIND, Lite0Encoder, load_lite0
+from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
 from depthpose.depth.stereo.light import (
+    agreement_of_neighbours,
     confidence_near,
     correlation_volume,
     enlarge,
@@ -32,20 +33,29 @@ from depthpose.depth.stereo.light import (
 from depthpose.depth.stereo.matcher import CameraMatcher, TiledMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.stereo.plan import LightFootprint
-from depthpose.depth.train import Run, StereoTask
+from depthpose.depth.train import StereoTask
+from depthpose.depth.train.begin import make_matcher_network
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import train_stereo
 from depthpose.depth.weights import read_matcher, write_depth_weights
 
 SMALL = LightConfig(
-    max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.25
+    max_disparity_px=32,
+    groups=2,
+    width=8,
+    volume_widths=(4, 4, 4, 4),
+    encoder_width=0.25,
+    with_agreement=True,
 )
 
 
 def random_network(config: LightConfig = SMALL) -> LightStereo:
     """A network in eval mode whose batch norms do something."""
     torch.manual_seed(0)
-    return with_random_norms(LightStereo(config))
+    network = with_random_norms(LightStereo(config))
+    if network.enlargement.agreement is not None:
+        torch.nn.init.normal_(network.enlargement.agreement.weight)
+    return network
 
 
 def shifted_pair(height: int, width: int, shift: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -97,6 +107,39 @@ def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:
     found = enlarge(quarter, weights)
     assert found[0, 1, 1] == quarter[0, 0, 1]
     assert found[0, 0, 0] == 0
+
+
+def test_views_agree_under_the_disparity_that_is_right() -> None:
+    left, right = torch.randn(2, 1, 6, 8, 16, generator=torch.Generator().manual_seed(0)).unbind()
+    right[..., :-3] = left[..., 3:]
+    quarter_px = torch.full((1, 4, 8), 2.0)
+    quarter_px[:, :, 5:] = 6.0  # three pixels at half size
+    found = agreement_of_neighbours(left, right, quarter_px)
+    assert found.shape == (1, 9, 8, 16)
+    # Column 10 at half size lies in column 5 at a quarter: itself and its right neighbour fit.
+    torch.testing.assert_close(found[0, [1, 2, 4, 5, 7, 8], :, 10], torch.ones(6, 8))
+    assert float(found[0, [0, 3, 6], :, 10].max()) < 0.99
+    for k, shift in ((3, 1), (4, 3)):
+        expected = torch.cosine_similarity(left[..., 10], right[..., 10 - shift], dim=1)
+        torch.testing.assert_close(found[:, k, :, 10], expected)
+    assert float(found[..., 0].abs().max()) < 1e-6  # beyond the right image
+
+
+def test_weights_without_agreement_are_trained_on_with_it(tmp_path: Path) -> None:
+    plain = dataclasses.replace(SMALL, with_agreement=False)
+    start = tmp_path / "plain.safetensors"
+    network = random_network(plain)
+    facts = {"licence": "MIT", "trained_on": "nothing"}
+    write_depth_weights(start, matcher=network, facts=facts)
+    config = StereoTraining(light=SMALL, start=str(start))
+    found = make_matcher_network(config)
+    assert isinstance(found, LightStereo)
+    pair = torch.randn(2, 1, 3, 32, 64).unbind()
+    with torch.no_grad():
+        assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1])
+    write_depth_weights(start, matcher=found, facts=facts)
+    with pytest.raises(InputError, match="with_agreement = True, but the config says False"):
+        make_matcher_network(dataclasses.replace(config, light=plain))
 
 
 @pytest.mark.parametrize("size", [(32, 64), (70, 101)])
@@ -225,7 +268,12 @@ def test_it_learns_and_every_part_gets_gradients() -> None:
         if parameter.grad is None or not bool(parameter.grad.isfinite().all())
     ]
     assert not without
-    for part in ("features.encoder.stem.conv", "enlargement.weights", "describe"):
+    for part in (
+        "features.encoder.stem.conv",
+        "enlargement.weights",
+        "enlargement.agreement",
+        "describe",
+    ):
         gradient = network.get_parameter(f"{part}.weight").grad
         assert gradient is not None
         assert bool(gradient.any()), part
@@ -235,7 +283,7 @@ def test_it_learns_and_every_part_gets_gradients() -> None:
 def test_a_fixed_start_keeps_what_imagenet_taught() -> None:
     task = stereo_task()
     encoder = task.matcher.features.encoder
-    assert isinstance(encoder, Lite0Encoder)
+    assert isinstance(encoder, LiteEncoder)
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
     (turn,) = task.step(training_batch())
     turn.loss.backward()
@@ -250,17 +298,19 @@ def test_a_fixed_start_keeps_what_imagenet_taught() -> None:
 
 def test_an_encoder_takes_a_file_as_far_as_it_reaches(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    whole, path = Lite0Encoder(), tmp_path / "lite0.safetensors"
-    save_checkpoint(path, Checkpoint(kind=KIND, config={}, state=whole.state_dict(), facts={}))
-    short = Lite0Encoder(levels=4)
-    load_lite0(short, path)
+    whole, path = LiteEncoder(), tmp_path / "lite0.safetensors"
+    save_checkpoint(
+        path, Checkpoint(kind=whole.kind, config={}, state=whole.state_dict(), facts={})
+    )
+    short = LiteEncoder(levels=4)
+    load_encoder(short, path)
     image = torch.rand(1, 3, 32, 64)
     with torch.no_grad():
         expected, found = whole.eval()(image)[:4], short.eval()(image)
     assert len(found) == 4
     assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
     with pytest.raises(InputError, match="this encoder is narrower"):
-        load_lite0(Lite0Encoder(0.5, levels=4), path)
+        load_encoder(LiteEncoder(0.5, levels=4), path)
 
 
 def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:

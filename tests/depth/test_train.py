@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
+from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     AugmentConfig,
@@ -26,7 +26,6 @@ from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import (
     FinetuneTask,
-    Run,
     StereoTask,
     TrainingPairs,
     ViewTask,

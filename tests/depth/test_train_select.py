@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
+from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
 from depthpose.depth.config import (
     AugmentConfig,
     DegradeConfig,
@@ -21,12 +21,11 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.lite0 import KIND, Lite0Encoder
+from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.train import (
     FinetuneTask,
-    Run,
     SelectTask,
     TrainingPairs,
     train_finetune,
@@ -201,10 +200,12 @@ def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:
     torch.manual_seed(3)
-    encoder = Lite0Encoder()
+    encoder = LiteEncoder()
     file = tmp_path / "lite0.safetensors"
     facts = {"licence": "Apache-2.0"}
-    save_checkpoint(file, Checkpoint(kind=KIND, config={}, state=encoder.state_dict(), facts=facts))
+    save_checkpoint(
+        file, Checkpoint(kind=encoder.kind, config={}, state=encoder.state_dict(), facts=facts)
+    )
     still = AdamConfig(learning_rate=1e-30)
     loop = dataclasses.replace(LOOP, steps=1)
     full = dataclasses.replace(TINY, encoder_width=1.0)

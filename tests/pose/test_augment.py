@@ -1,5 +1,8 @@
 """Random changes that keep a pose true."""
 
+import dataclasses
+import math
+
 import pytest
 import torch
 
@@ -78,6 +81,7 @@ def test_structured_light_reads_whole_steps_of_disparity() -> None:
     [
         ("structured light", 0.0012 + 0.0019 * 0.36, 0.0012 + 0.0019 * 2.56),
         ("time of flight", 0.003, 0.009),
+        ("active stereo", 0.003, 0.012),
         ("laser", 0.0005, 0.0005),
     ],
 )
@@ -86,8 +90,35 @@ def test_noise_is_that_of_the_sensor(kind: str, at_1_m: float, at_2_m: float) ->
         wall_m = torch.full((200, 200), distance_m)
         # Fine steps of disparity, so that they add nothing to speak of.
         read_m = measure(wall_m, (572.0, 1e6), _sensor(kind), _generator(3))
-        assert abs(float(read_m.std()) / sigma_m - 1) < 0.03
-        assert abs(float(read_m.mean()) - distance_m) < 3 * sigma_m / 200
+        # Noise that neighbours share has fewer independent readings on the same wall.
+        own = 0.25 if kind == "active stereo" else 0.03
+        assert abs(float(read_m.std()) / sigma_m - 1) < own
+        assert abs(float(read_m.mean()) - distance_m) < own * sigma_m
+
+
+def test_noise_that_neighbours_share_falls_off_with_their_distance() -> None:
+    config = dataclasses.replace(_sensor("time of flight"), alike_px=(4.0, 4.0))
+    noise_m = measure(torch.full((400, 400), 1.0), (286.0, 572.0), config, _generator(1)) - 1
+    assert abs(float(noise_m.std()) / 0.003 - 1) < 0.1
+    for lag in (1, 2, 4):  # the window shows half as many pixels: 2 for 4
+        product = (noise_m[:, :-lag] * noise_m[:, lag:]).mean() / noise_m.var()
+        assert abs(float(product) - math.exp(-((lag / 2.0) ** 2) / 4)) < 0.08
+    alone = (
+        measure(torch.full((400, 400), 1.0), (286.0, 572.0), _sensor("laser"), _generator(1)) - 1
+    )
+    assert abs(float((alone[:, :-1] * alone[:, 1:]).mean() / alone.var())) < 0.02
+
+
+def test_active_stereo_moves_edges_and_shades_what_one_camera_sees() -> None:
+    depth_m = torch.full((60, 200), 1.0)
+    depth_m[:, 100:140] = 0.7
+    read_m = measure(depth_m, (572.0, 572.0), _sensor("active stereo", 0.0), _generator())
+    lost = read_m.isnan()
+    width = int(572.0 * 0.05 * (1 / 0.7 - 1))
+    assert bool(lost[:, 100 - width + 2 : 98].all())
+    assert not lost[:, 145:].any()
+    edge = read_m[:, 137:143] < 0.85
+    assert len({int(row.sum()) for row in edge}) > 2  # the edge is not straight any more
 
 
 def test_no_sensor_changes_nothing() -> None:
@@ -174,8 +205,12 @@ def test_bad_settings_of_objects_are_refused(values: dict, text: str) -> None:
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"kinds": ()}, "kinds is (); name one or more of structured light, time of flight"),
+        ({"kinds": ()}, "kinds is (); name one or more of structured light, active stereo, ti"),
         ({"noise": (2.0, 1.0)}, "noise is (2.0, 1.0), but it is a range within 0.0 to 20.0"),
+        (
+            {"alike_px": (-1.0, 2.0)},
+            "alike_px is (-1.0, 2.0), but it is a range within 0.0 to 30.0",
+        ),
         ({"missing": (0.0, 1.0)}, "missing is (0.0, 1.0), but it is a range within 0.0 to 0.9"),
     ],
 )

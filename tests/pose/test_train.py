@@ -15,7 +15,7 @@ from tests.pose.synthetic_objects import bottle, bracket, tiny_weights
 
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import (
     CloudConfig,
@@ -38,7 +38,6 @@ from depthpose.pose.train import (
     ModelsConfig,
     PoseTask,
     PoseTraining,
-    Run,
     TrainingClouds,
     read_models,
     train_pose,

@@ -18,7 +18,7 @@ from depthpose.core.checkpoint import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.core.loop import AdamConfig, LoopConfig, read_metrics
+from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
 from depthpose.pose.config import CloudConfig, ObjectsConfig
@@ -33,7 +33,6 @@ from depthpose.pose.train import (
     HeldOutConfig,
     ModelsConfig,
     PointNetTraining,
-    Run,
     SegmentationTraining,
 )
 from depthpose.pose.train.config import CalibrationConfig

@@ -71,7 +71,9 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
+    kind: tyro.conf.Positional[
+        Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0", "efficientnet-lite2"]
+    ],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -85,8 +87,8 @@ def import_weights(
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
             MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an encoder that
-            'depth train select' can start from.
+            can start from (.pth of tensors or .safetensors); efficientnet-lite0 or -lite2, an
+            encoder that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
@@ -109,9 +111,9 @@ def import_weights(
 
         import_resnet18(file, out)
     else:
-        from depthpose.depth.lite0 import import_lite0
+        from depthpose.depth.encoder import import_encoder
 
-        import_lite0(file, out)
+        import_encoder(file, kind, out)
     return show_weights(str(out))
 
 

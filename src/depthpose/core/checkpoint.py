@@ -167,17 +167,45 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def read_published(path: Path) -> Mapping[str, Any]:
-    """Read a foreign checkpoint by its suffix: safetensors, or else a PyTorch file.
+def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
+    """Read the tensors of a foreign checkpoint: safetensors by its suffix, or else a PyTorch file.
+
+    Args:
+        path: of the checkpoint.
+        network: what it should hold, for errors.
 
     Raises:
-        InputError: missing, damaged, or holding pickled code.
+        InputError: missing, damaged, holding pickled code, or no tensors by name.
     """
     path = Path(path)
-    if path.suffix != ".safetensors":
-        return read_torch_file(path)
-    with _opened_safetensors(path) as file:
-        return _tensors(file)
+    if path.suffix == ".safetensors":
+        with _opened_safetensors(path) as file:
+            return _tensors(file)
+    content = read_torch_file(path)
+    state = content.get("state_dict", content)
+    if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(
+            f"{path}: holds no tensors by name, so it is no {network}. Its entries are "
+            f"{', '.join(map(repr, list(content)[:5]))}."
+        )
+    return state
+
+
+def save_imported(
+    out: Path, kind: str, network: nn.Module, source: Path, facts: Mapping[str, str]
+) -> None:
+    """Write the weights of an imported network, with the checksum of the file that they are from.
+
+    Args:
+        out: the ``.safetensors`` file to write.
+        kind: of the checkpoint.
+        network: with the weights.
+        source: the published file.
+        facts: what the card says of them: ``trained_on``, ``licence``.
+    """
+    origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
+    state = network.state_dict()
+    save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
 
 
 def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:

@@ -17,6 +17,11 @@ Mask = Bool[Tensor, "h w"]
 
 _KINECT_BASELINE_M = 0.075
 _STEPS_A_PIXEL = 8
+_STEREO_BASELINE_M = 0.05
+_STEREO_STEPS_A_PIXEL = 32
+_STEREO_ALIKE_PX = (3.0, 6.0)
+_STEREO_WINDOW = 2
+"""Pixels by which active stereo displaces an edge at most."""
 _STEEPEST = math.tan(math.radians(80))
 """No sensor reads a surface that is turned farther away than 80 degrees."""
 _JUMP = 0.02
@@ -118,13 +123,22 @@ def measure(
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
     is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
-    white = torch.randn(depth_m.shape, generator=generator) * noise
+    alike_px = config.alike_px or (_STEREO_ALIKE_PX if kind == "active stereo" else None)
+    width_px = uniform(generator, *alike_px) * focal_px[0] / focal_px[1] if alike_px else 0.0
+    white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])
         read_m = _jittered(depth_m, generator)
         # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
         read_m = read_m + white * (0.0012 + 0.0019 * (read_m - 0.4).square())
         scale = _STEPS_A_PIXEL * focal_px[1] * _KINECT_BASELINE_M
+        read_m = scale / (scale / read_m).round()
+    elif kind == "active stereo":
+        is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
+        one, other = (_displaced(depth_m, generator) for _ in range(2))
+        read_m = torch.lerp(one, other, torch.rand(depth_m.shape, generator=generator))
+        read_m = read_m + white * 0.003 * read_m.square()
+        scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
         read_m = scale / (scale / read_m).round()
     elif kind == "time of flight":
         read_m = _mixed(depth_m, generator)
@@ -156,10 +170,28 @@ def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
     return is_steep
 
 
-def _is_shadowed(depth_m: Depth, focal_px: float) -> Mask:
+def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+    """Draw normal noise of deviation 1 that neighbours share: white noise under a Gaussian.
+
+    Args:
+        size: rows and columns.
+        width_px: deviation of the Gaussian; 0 gives each pixel its own noise.
+        generator: of the chance.
+    """
+    reach = math.ceil(3 * width_px)
+    white = torch.randn(size[0] + 2 * reach, size[1] + 2 * reach, generator=generator)
+    if reach == 0:
+        return white
+    weights = (-0.5 * (torch.arange(-reach, reach + 1) / width_px).square()).exp()
+    weights = weights / weights.norm()
+    along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
+    return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
+
+
+def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
     """Mark what the projector, beside the camera, cannot light: something nearer is in its way."""
     column = torch.arange(depth_m.shape[1])
-    lit = column + (focal_px * _KINECT_BASELINE_M / depth_m).nan_to_num(-torch.inf)
+    lit = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
     # The projector's columns ascend along a row, but for what lies behind an edge.
     return lit < lit.cummax(1).values - 1.5
 
@@ -184,6 +216,16 @@ def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
     index = torch.arange(height * width)
     index += moves[torch.randint(16, (height * width,), generator=generator)]
     return depth_m.reshape(-1)[index.clamp_(0, height * width - 1)].view(height, width)
+
+
+def _displaced(depth_m: Depth, generator: torch.Generator) -> Depth:
+    """Read each pixel some pixels away, by the same way as its neighbours: edges wander."""
+    height, width = depth_m.shape
+    ways = [1.2 * smooth_noise((height, width), 3.0, generator) for _ in range(2)]
+    dy, dx = (way.round().long().clamp(-_STEREO_WINDOW, _STEREO_WINDOW) for way in ways)
+    rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
+    columns = (torch.arange(width) + dx).clamp(0, width - 1)
+    return depth_m[rows, columns]
 
 
 def _mixed(depth_m: Depth, generator: torch.Generator) -> Depth:

@@ -9,11 +9,10 @@ from torch import Tensor, nn
 
 from depthpose.core.checkpoint import (
     Checkpoint,
-    file_sha256,
     load_weights,
     read_checkpoint,
     read_published,
-    save_checkpoint,
+    save_imported,
 )
 from depthpose.core.errors import InputError
 
@@ -114,24 +113,16 @@ def import_resnet18(file: Path, out: Path) -> None:
     Raises:
         InputError: not the weights of such a network.
     """
-    content = read_published(file)
-    state = content.get("state_dict", content)
-    if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(
-            f"{file}: holds no tensors by name, so it is no ResNet-18. Its entries are "
-            f"{', '.join(map(repr, list(content)[:5]))}."
-        )
+    state = read_published(file, "ResNet-18")
     try:
         network = resnet18_from_published(state)
     except InputError as error:
         raise InputError(f"{file}: not the published weights of a ResNet-18: {error}") from error
     facts = {
-        "origin": f"imported from a file with sha256 {file_sha256(file)}",
         "trained_on": "ImageNet, as its publisher says",
         "licence": "as published by its authors",
     }
-    state = network.state_dict()
-    save_checkpoint(out, Checkpoint(kind=KIND, config={}, state=state, facts=facts))
+    save_imported(out, KIND, network, file, facts)
 
 
 def read_encoder_state(path: Path) -> Mapping[str, Tensor]:

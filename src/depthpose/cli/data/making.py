@@ -69,7 +69,9 @@ class ObjectsOptions:
     """of the random frames."""
     distance: tuple[float, float] = (0.6, 1.1)
     """nearest and farthest view [m]."""
-    sensor: Literal["structured light", "time of flight", "laser", "none"] = "structured light"
+    sensor: Literal["structured light", "active stereo", "time of flight", "laser", "none"] = (
+        "structured light"
+    )
     """whose errors the depth has."""
     symmetries: Literal["none", "found"] = "none"
     """found: declare the symmetries that are found from a part's shape; none: only print them."""

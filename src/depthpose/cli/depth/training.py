@@ -111,8 +111,9 @@ def train(
         config: YAML with what differs from the thesis's settings.
     """
     from depthpose.core.config import read_config
+    from depthpose.core.loop import Run
     from depthpose.core.run import find_shard
-    from depthpose.depth.train import STAGES, Run
+    from depthpose.depth.train import STAGES
 
     kind, run_stage = STAGES[stage]
     chosen = kind() if config is None else read_config(config, kind)

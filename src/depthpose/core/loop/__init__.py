@@ -10,6 +10,7 @@ from depthpose.core.loop.journal import (
     run_files,
 )
 from depthpose.core.loop.loop import Interrupted, Progress, train
+from depthpose.core.loop.run import Run
 from depthpose.core.loop.task import (
     Evidence,
     Samples,
@@ -26,6 +27,7 @@ __all__ = [
     "Journal",
     "LoopConfig",
     "Progress",
+    "Run",
     "Samples",
     "Task",
     "Turn",

@@ -84,6 +84,10 @@ class LightConfig:
     encoder_width: float = 1.0
     """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
 
+    with_agreement: bool = False
+    """Whether the enlargement compares both views, at half size, under the disparities it chooses
+    from; weights without it can be trained on with it."""
+
     work_focal_px: float | None = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 

@@ -74,8 +74,9 @@ class SizelessLight(nn.Module):
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
         config = self.network.config
-        scores, weights = self.network.scores(left, right, config.max_disparity_px)
+        scores, seen = self.network.scores(left, right, config.max_disparity_px)
         quarter_px = mean_of_best(scores, config.candidates)
+        weights = self.network.enlargement(seen, quarter_px)
         return enlarge(quarter_px, weights), enlarge(confidence_near(scores, quarter_px), weights)
 
 

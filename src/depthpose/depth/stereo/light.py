@@ -5,7 +5,7 @@
 - Volume: cosines of groups of features (Guo et al., CVPR 2019), refined by one 3D hourglass that
   the image steers (Bangunharcana et al., CoEx, IROS 2021).
 - Disparity: the mean over the few best disparities (CoEx), enlarged by learned convex combinations
-  of nine neighbours (Teed and Deng, RAFT, ECCV 2020).
+  of nine neighbours (Teed and Deng, RAFT, ECCV 2020), whose disparities are compared at half size.
 """
 
 from itertools import pairwise, product
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
-from depthpose.depth.lite0 import Lite0Encoder
+from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
@@ -49,6 +49,18 @@ class Described(NamedTuple):
     levels: tuple[Features, ...]
 
 
+class Seen(NamedTuple):
+    """What the enlargement sees.
+
+    Attributes:
+        left: features of the left view.
+        right_half: of the right view at 1/2 of its sides, where both are compared.
+    """
+
+    left: Described
+    right_half: Features | None
+
+
 class LightFeatures(nn.Module):
     """One view to features at 1/2 to 1/32 of its sides."""
 
@@ -57,7 +69,7 @@ class LightFeatures(nn.Module):
         w = config.width
         self.stem = conv_norm_2d(3, _STEM, Shape(3, 2))
         self.quarter = nn.ModuleList([conv_norm_2d(_STEM, w, Shape(3, 2)), conv_norm_2d(w, w)])
-        self.encoder = Lite0Encoder(config.encoder_width, levels=4)
+        self.encoder = LiteEncoder(config.encoder_width, levels=4)
         self.top = conv_norm_2d(self.encoder.channels[3], _DEEP, Shape(1))
         quarter, eighth, sixteenth, _ = self.encoder.channels
         skips = (sixteenth, eighth, quarter + w)
@@ -150,27 +162,65 @@ class Aggregation(nn.Module):
 
 
 class Enlargement(nn.Module):
-    """Weights of the nine neighbours at 1/4 size, for each pixel of the image."""
+    """Weights of the nine neighbours at 1/4 size, for each pixel of the image.
 
-    def __init__(self, width: int) -> None:
+    With agreement, the weights also depend on how alike both views are under the disparity of each
+    neighbour: where two surfaces meet, this says which one a pixel belongs to. That part begins
+    without effect.
+    """
+
+    def __init__(self, width: int, *, with_agreement: bool) -> None:
         super().__init__()
         self.hidden = conv_norm_2d(_STEM + width, 32)
         self.weights = nn.Conv2d(32, 4 * 9, 1)
+        self.compared = conv_norm_2d(_STEM, _STEM) if with_agreement else None
+        self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False) if with_agreement else None
+        if self.agreement is not None:
+            nn.init.zeros_(self.agreement.weight)
 
-    def forward(self, described: Described) -> Float[Tensor, "b 9 4 h2 w2"]:
+    def forward(self, seen: Seen, quarter_px: Quarter) -> Float[Tensor, "b 9 4 h2 w2"]:
         """Answer weights that sum to one, for the four pixels of each one at half size."""
-        wide = F.interpolate(described.levels[0], scale_factor=2.0, mode="nearest")
-        x = F.relu(self.hidden(torch.cat([described.half, wide], 1)))
+        left, right_half = seen
+        wide = F.interpolate(left.levels[0], scale_factor=2.0, mode="nearest")
+        x = self.hidden(torch.cat([left.half, wide], 1))
+        if self.compared is not None and self.agreement is not None:
+            assert right_half is not None
+            both = self.compared(left.half), self.compared(right_half)
+            alike = agreement_of_neighbours(*both, quarter_px.detach())
+            x = x + self.agreement(alike.to(x))
+        x = F.relu(x)
         b, _, h, w = x.shape
         return self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
 
 
-def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
-    """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
+def agreement_of_neighbours(
+    left: Float[Tensor, "b c h2 w2"], right: Float[Tensor, "b c h2 w2"], quarter_px: Quarter
+) -> Float[Tensor, "b 9 h2 w2"]:
+    """Give the cosine of features at half size under the disparity of each of nine neighbours."""
+    h, w = left.shape[2:]
+    near, far = (F.normalize(x.float(), dim=1, eps=1e-3) for x in (left, right))
+    columns, lines = (torch.arange(n, device=left.device).float() for n in (w, h))
+    # The last index as a tensor: the exporter to ONNX takes no quotient of unknown sizes.
+    rows = (2 * lines / lines[-1:] - 1)[:, None]
+    found = []
+    for shift in (_neighbours(quarter_px) / 2).unbind(1):
+        x = 2 * (columns - shift) / columns[-1:] - 1
+        seen = F.grid_sample(far, torch.stack([x, rows.expand_as(x)], -1), align_corners=True)
+        found.append((near * seen).sum(1))
+    return torch.stack(found, 1)
+
+
+def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
+    """Give the nine neighbours at 1/4 of each pixel at half size."""
     h, w = quarter.shape[1:]
     padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
     near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]
-    wide = F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
+    return F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
+
+
+def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
+    """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
+    wide = _neighbours(quarter)
     return F.pixel_shuffle((weights * wide[:, :, None]).sum(1), 2)[:, 0]
 
 
@@ -212,7 +262,7 @@ class LightStereo(nn.Module):
         self.features = LightFeatures(self.config)
         self.describe = nn.Conv2d(self.config.width, self.config.width, 1, bias=False)
         self.aggregation = Aggregation(self.config, self.features.widths)
-        self.enlargement = Enlargement(self.config.width)
+        self.enlargement = Enlargement(self.config.width, with_agreement=self.config.with_agreement)
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
@@ -226,8 +276,9 @@ class LightStereo(nn.Module):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        scores, weights = self.scores(left, right, self.config.max_disparity_px)
-        found_px = enlarge(mean_of_best(scores, self.config.candidates), weights)
+        scores, seen = self.scores(left, right, self.config.max_disparity_px)
+        quarter_px = mean_of_best(scores, self.config.candidates)
+        found_px = enlarge(quarter_px, self.enlargement(seen, quarter_px))
         if not self.training:
             return (found_px,)
         coarse_px = mean_of_all(scores)[:, None]
@@ -238,17 +289,19 @@ class LightStereo(nn.Module):
         left: Float[Tensor, "b 3 h w"],
         right: Float[Tensor, "b 3 h w"],
         max_disparity_px: int,
-    ) -> tuple[Scores, Float[Tensor, "b 9 4 h2 w2"]]:
-        """Answer a score for each disparity at 1/4 size, and the weights that enlarge maps.
+    ) -> tuple[Scores, Seen]:
+        """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
 
         Scores are float32 at least: 8 bits would round the expectation to whole pixels.
         """
         self._check_size(left)
-        near, far = self.features(left), self.features(right).levels[0]
-        described = self.describe(near.levels[0]), self.describe(far)
+        near, far = self.features(left), self.features(right)
+        described = self.describe(near.levels[0]), self.describe(far.levels[0])
+        right_half = far.half if self.config.with_agreement else None
+        del far
         scores = self.aggregation(*described, max_disparity_px // _STEP_PX, near.levels)
         wide = torch.promote_types(scores.dtype, torch.float32)
-        return scores.to(wide), self.enlargement(near).to(wide)
+        return scores.to(wide), Seen(near, right_half)
 
     def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
         h, w = image.shape[-2:]

@@ -46,10 +46,11 @@ class LightMatcher(NetworkMatcher):
         height, width = left.shape[-2:]
         footprint = LightFootprint(config=network, height=height, width=width, dtype=self.dtype)
         footprint.refuse_more_than(self.config.max_memory_bytes)
-        scores, weights = self._network.scores(
+        scores, seen = self._network.scores(
             left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
         )
         quarter_px = mean_of_best(scores, network.candidates)
+        weights = self._network.enlargement(seen, quarter_px).to(scores.dtype)
         found_px = enlarge(quarter_px, weights)
         if not self.config.with_confidence:
             return [Match(disparity_px=one) for one in found_px]

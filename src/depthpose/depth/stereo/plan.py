@@ -145,7 +145,8 @@ class LightFootprint:
     def estimate_bytes(self) -> int:
         """Peak memory of activations of one pair [bytes], with margin for the allocator."""
         pixels = self.height * self.width // 16
-        kept = pixels * (4 * 16 + 3 * self.config.width) * self.dtype.itemsize
+        halves = 2 if self.config.with_agreement else 1
+        kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
         stages = (self._volume_bytes(pixels), self._weights_bytes(pixels))
         return int(MARGIN * (kept + max(stages))) + OVERHEAD_BYTES
 
@@ -157,7 +158,8 @@ class LightFootprint:
     def _weights_bytes(self, pixels: int) -> int:
         """Weights that enlarge maps, thrice, and what they are made of at half size."""
         joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
-        return pixels * (joined + 3 * 4 * 36 * 4)
+        compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
+        return pixels * (joined + compared + 3 * 4 * 36 * 4)
 
     def refuse_more_than(self, max_memory_bytes: int | None) -> None:
         """Refuse a bound that a match would exceed.

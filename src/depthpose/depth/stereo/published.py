@@ -76,13 +76,13 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
     wanted = network.state_dict()
     given = {_our_name(name): (name, value) for name, value in state.items()}
     optional = {name for name in wanted if name.endswith("num_batches_tracked")}
-    _refuse_strangers(wanted, given, optional)
+    _refuse_other_tensors(wanted, given, optional)
     # The count of batches steers nothing at inference; files older than 2018 do not hold it.
     network.load_state_dict({**wanted, **{name: value for name, (_, value) in given.items()}})
     return network.eval()
 
 
-def _refuse_strangers(
+def _refuse_other_tensors(
     wanted: Mapping[str, Tensor], given: Mapping[str, tuple[str, Tensor]], optional: set[str]
 ) -> None:
     missing = sorted(set(wanted) - set(given) - optional)

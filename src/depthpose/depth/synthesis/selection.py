@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.lite0 import Lite0Encoder
+from depthpose.depth.encoder import LiteEncoder
 
 Images = Float[Tensor, "b 3 h w"]
 Logits = Float[Tensor, "b classes rows columns"]
@@ -26,7 +26,7 @@ _SURE_RATIO = 1.15
 
 
 class SelectionGenerator(nn.Module):
-    """EfficientNet-Lite0, a decoder with skips, and two softmaxes over disparities and the sky.
+    """EfficientNet-Lite, a decoder with skips, and two softmaxes over disparities and the sky.
 
     Takes RGB in [0, 1], sides multiples of 32. Logits come at stride 2: class 0 is the sky, class
     k the disparity ``planes[k - 1]`` [px at the input's width].
@@ -37,7 +37,7 @@ class SelectionGenerator(nn.Module):
     def __init__(self, config: SelectionConfig | None = None) -> None:
         super().__init__()
         self.config = config or SelectionConfig()
-        self.encoder = Lite0Encoder(self.config.encoder_width)
+        self.encoder = LiteEncoder(self.config.encoder_width, kind=self.config.encoder_kind)
         widths, skips = self.config.widths, self.encoder.channels[-2::-1]
         self.top = nn.Conv2d(self.encoder.channels[-1], widths[0], 1)
         inputs = (widths[0], *widths[:-1])

@@ -5,6 +5,7 @@ thin, slanted, round, leafy, textureless, repetitive and mirroring things at eve
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -126,6 +127,35 @@ def _fence(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m:
         b.tube(*ends, (radius, radius), surface)
 
 
+def _wheel(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
+    """A rim with spokes: what lies behind is seen through the gaps."""
+    R = _rotation(rng) if rng.random() < 0.5 else np.eye(3)
+    surface = _surface(rng, size_m)
+    radius = size_m * rng.uniform(0.5, 1.2)
+    angles = np.linspace(0, 2 * np.pi, 25)
+    rim = centre + radius * (np.cos(angles)[:, None] * R[0] + np.sin(angles)[:, None] * R[1])
+    thick = radius * rng.uniform(0.03, 0.2)
+    for start, end in pairwise(rim):
+        b.tube(start, end, (thick, thick), surface, 6)
+    thin = radius * rng.uniform(0.01, 0.08)
+    for place in np.linspace(0, 24, int(rng.integers(3, 14)), endpoint=False).astype(int):
+        b.tube(centre, rim[place], (thin * rng.uniform(1, 2), thin), surface, 6)
+
+
+def _lattice(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
+    """Flat bars that cross, as shelves, window frames and the backs of benches do."""
+    R = _rotation(rng) if rng.random() < 0.3 else np.eye(3)
+    sides = size_m * rng.uniform(0.6, 2.5, 2)
+    surface, deep = _surface(rng, size_m), size_m * float(np.exp(rng.uniform(-4, 0)))
+    for axis in (0, 1):
+        count = int(rng.integers(2, 8))
+        wide = sides[axis] / count * rng.uniform(0.05, 0.4)
+        for share in np.linspace(-0.5, 0.5, count):
+            bar = np.array([*sides, deep])
+            bar[axis] = wide
+            b.box(centre + share * sides[axis] * R[:, axis], bar, surface, R)
+
+
 def _leaves(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m: float) -> None:
     radii = size_m * rng.uniform(0.4, 1.2, 3)
     leaves = int(rng.integers(100, 1200)), size_m * rng.uniform(0.03, 0.2)
@@ -133,7 +163,7 @@ def _leaves(b: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, size_m
 
 
 _SHAPES: tuple[Callable[[MeshBuilder, np.random.Generator, np.ndarray, float], None], ...] = (
-    _ball, _box, _box, _card, _pole, _pole, _fence, _leaves,
+    _ball, _box, _box, _card, _pole, _pole, _fence, _wheel, _lattice, _leaves,
 )  # fmt: skip
 
 

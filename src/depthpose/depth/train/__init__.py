@@ -3,7 +3,6 @@
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.runs import (
     STAGES,
-    Run,
     train_adapt,
     train_finetune,
     train_select,
@@ -16,7 +15,6 @@ from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 __all__ = [
     "STAGES",
     "FinetuneTask",
-    "Run",
     "SelectTask",
     "SelectionSamples",
     "StereoTask",

@@ -7,7 +7,7 @@ from torch import nn
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
-from depthpose.depth.lite0 import load_lite0
+from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import Generator
 from depthpose.depth.train.config import SelectTraining, StereoTraining
@@ -15,6 +15,8 @@ from depthpose.depth.weights import read_matcher
 
 _FREE_OF_WEIGHTS = ("max_disparity_px",)
 """Settings that no weight depends on: a matcher searches any disparities in the same way."""
+_CAN_BE_ADDED = ("with_agreement",)
+"""Parts that begin without effect, so weights without them can be trained on with them."""
 
 
 def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
@@ -30,6 +32,8 @@ def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
 def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
     """Copy weights whose config is the network's own, but for the range of disparities.
 
+    What the network has beyond them keeps its beginning, where that has no effect.
+
     Raises:
         InputError: another kind of network, or a setting differs, so the weights would mean
             something else.
@@ -41,12 +45,13 @@ def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, sour
         )
     wanted, given = config_to_dict(network.config), config_to_dict(cast("Any", found).config)
     for setting, value in wanted.items():
-        if given[setting] != value and setting not in _FREE_OF_WEIGHTS:
+        is_added = setting in _CAN_BE_ADDED and value and not given[setting]
+        if given[setting] != value and setting not in _FREE_OF_WEIGHTS and not is_added:
             raise InputError(
                 f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
-    network.load_state_dict(found.state_dict())
+    network.load_state_dict(network.state_dict() | found.state_dict())
 
 
 def read_network(name: str) -> PSMNet | LightStereo:
@@ -77,7 +82,7 @@ def make_matcher_network(config: StereoTraining) -> PSMNet | LightStereo:
         refuse_fixed_chance(config)
         matcher = LightStereo(config.light)
         if config.encoder is not None:
-            load_lite0(matcher.features.encoder, find_weights(config.encoder))
+            load_encoder(matcher.features.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(matcher, read_matcher(find_weights(config.start)), config.start)
     return matcher

@@ -235,7 +235,7 @@ def _choose_truth(
     return wanted or next(iter(counts), None)
 
 
-_STREETS = "made streets"
+_STREETS = "synthetic streets"
 """Synthetic streets, as the states of trainings name them: a resumed one compares the names."""
 
 

@@ -1,28 +1,25 @@
 """A config to a trained weights file: the three stages as commands run them."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
-from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
     LoopConfig,
-    Progress,
+    Run,
     Task,
     held_out_text,
     leave_card,
-    run_files,
-    train,
 )
-from depthpose.core.run import claim_folder, find_shard
+from depthpose.core.run import find_shard
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
-from depthpose.depth.lite0 import load_lite0
+from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.train.adapt import (
@@ -51,8 +48,6 @@ from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 from depthpose.depth.weights import read_generator, write_depth_weights
 
-_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
-"""Settings of the loop that change no weight: a resumed run may have others."""
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
 """Settings that may name weights."""
 _MEASURED = {
@@ -66,29 +61,6 @@ _MEASURED = {
     "mean error (px), and the share of pixels off by more than 3 px and 5 % (d1).",
 }
 """What the numbers of each stage's validation are."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """Where a training lives, and who watches.
-
-    Attributes:
-        folder: the run folder; the weights are ``generator.safetensors``,
-            ``matcher.safetensors`` or ``fakestereo.safetensors`` in it, and their card beside them.
-        resume: go on from its last state.
-        finish: make weights of its last state, without another step.
-        on_step: called after each optimiser step.
-    """
-
-    folder: Path
-    resume: bool = False
-    finish: bool = False
-    on_step: Callable[[Progress], None] | None = None
-
-    @property
-    def words(self) -> dict[str, Any]:
-        """The settings of the loop."""
-        return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
 def train_view(config: ViewTraining, run: Run) -> Path:
@@ -127,7 +99,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     samples = SelectionSamples(sources, config.more_share, config.degrade, config.loop.seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
-        load_lite0(generator.encoder, find_weights(config.encoder))
+        load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
     held_out = _held_out(config.held_out, needs_truth=True)
@@ -214,31 +186,20 @@ def _walk(
     run: Run,
 ) -> tuple[dict[str, str], float]:
     """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
-    settings = {"stage": type(config).__name__, **config_to_dict(config)}
-    decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
-    settings["loop"] = decisive | {"processes": find_shard().world}
     named = {
-        setting: name for setting in _BEGINS_WITH if isinstance(name := settings.get(setting), str)
+        setting: name
+        for setting in _BEGINS_WITH
+        if isinstance(name := getattr(config, setting, None), str)
     }
-    for setting, name in named.items():
-        settings[f"{setting}_sha256"] = file_sha256(find_weights(name))
+    more: dict[str, Any] = {
+        f"{setting}_sha256": file_sha256(find_weights(name)) for setting, name in named.items()
+    }
     if pairs.truths:
-        settings["truth"] = list(pairs.truths)
+        more["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
-    names = ("generator", "matcher", "fakestereo")
-    claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
-    write_config(run.folder / "config.yaml", config)
-    seconds = train(
-        task,
-        pairs,
-        config.loop,
-        run.folder,
-        resume=run.resume,
-        finish=run.finish,
-        on_step=run.on_step,
-    )
-    return facts, seconds
+    run.claim(config, ("generator", "matcher", "fakestereo"), more)
+    return facts, run.train(task, pairs, config.loop)
 
 
 def _facts(

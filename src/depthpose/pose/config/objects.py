@@ -1,11 +1,11 @@
 """Settings of synthetic views: how they look, and the errors of the sensor that sees them."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from depthpose.core.errors import InputError
 
-SensorKind = Literal["structured light", "time of flight", "laser", "none"]
+SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 """What measures depth, and so what its errors look like."""
 
 
@@ -15,21 +15,30 @@ class SensorConfig:
 
     kinds: tuple[SensorKind, ...] = ("structured light",)
     """One of these measures each sample. ``structured light``: disparity in steps of 1/8 px, noise
-    that grows with the squared distance (Nguyen et al. 2012), the projector's shadow. ``time of
-    flight``: mixed readings where depth jumps. ``laser``: little noise. ``none``: no error."""
+    that grows with the squared distance (Nguyen et al. 2012), the projector's shadow. ``active
+    stereo``: finer steps, edges displaced by the window that is matched, a shadow on the other
+    side. ``time of flight``: mixed readings where depth jumps. ``laser``: little noise. ``none``:
+    no error."""
 
     noise: tuple[float, float] = (0.5, 1.5)
     """Times the noise of the kind."""
+
+    alike_px: tuple[float, float] | None = None
+    """Deviation of the Gaussian by which neighbouring pixels have the same noise, in pixels of the
+    full image; None: 3 to 6 for ``active stereo``, else every pixel has its own. Measured on planes
+    by ``bench/sensors.py``: a Kinect 3, a RealSense 5."""
 
     missing: tuple[float, float] = (0.0, 0.1)
     """Share of readings lost beside those of shadows and grazing surfaces; half in patches."""
 
     def __post_init__(self) -> None:
         """Refuse unknown kinds and empty ranges."""
-        known = ("structured light", "time of flight", "laser", "none")
+        known = get_args(SensorKind)
         if not self.kinds or any(kind not in known for kind in self.kinds):
             raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
         _refuse_range("noise", self.noise, (0.0, 20.0), "(0.5, 1.5)")
+        if self.alike_px is not None:
+            _refuse_range("alike_px", self.alike_px, (0.0, 30.0), "(3, 6)")
         _refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
 
 

@@ -19,4 +19,3 @@ from depthpose.pose.train.runs import STAGES as STAGES
 from depthpose.pose.train.runs import recalibrate as recalibrate
 from depthpose.pose.train.runs import train_pose as train_pose
 from depthpose.pose.train.task import PoseTask as PoseTask
-from depthpose.pose.train.task import Run as Run

@@ -13,13 +13,13 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.loop import (
     Evidence,
+    Run,
     Turn,
     held_out_text,
     leave_card,
     make_adam,
     sample_generator,
     shuffled_index,
-    train,
 )
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_shard
@@ -34,7 +34,7 @@ from depthpose.pose.synthetic import Objects
 from depthpose.pose.train.clouds import read_models
 from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.train.other_configs import DepthImageTraining
-from depthpose.pose.train.task import Run, card_facts, claim_run, packed, train_words, with_classes
+from depthpose.pose.train.task import card_facts, claim_run, packed, train_words, with_classes
 from depthpose.pose.types import ObjectModel, ViewSample
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -188,7 +188,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     crops = TrainingCrops(models, config, config.loop.seed)
     task = DepthImageTask(network, models, config)
-    seconds = train(task, crops, config.loop, run.folder, **run.words)
+    seconds = run.train(task, crops, config.loop)
     path = run.folder / "depth-image.safetensors"
     if find_shard().rank:
         return path

@@ -10,7 +10,7 @@ from depthpose.core.checkpoint import find_weights, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
-from depthpose.core.loop import leave_card, train
+from depthpose.core.loop import Run, leave_card
 from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
@@ -27,7 +27,6 @@ from depthpose.pose.train.other_configs import (
 from depthpose.pose.train.segmentation import train_segmentation
 from depthpose.pose.train.task import (
     PoseTask,
-    Run,
     card_facts,
     claim_run,
     packed,
@@ -60,7 +59,7 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         _start_from(network, config.start, clouds)
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
-    seconds = train(task, clouds, config.loop, run.folder, **run.words)
+    seconds = run.train(task, clouds, config.loop)
     if run.tell is not None:
         run.tell("trained; now the refusal is calibrated and measured on synthetic views: minutes")
     if isinstance(network, PointNet):

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
-from depthpose.core.loop import Evidence, Turn, held_out_text, leave_card, make_adam, train
+from depthpose.core.loop import Evidence, Run, Turn, held_out_text, leave_card, make_adam
 from depthpose.core.run import find_shard
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.resnet import KIND, normalise_colors, read_encoder_state
@@ -25,7 +25,7 @@ from depthpose.pose.train.images import (
     TrainingImages,
 )
 from depthpose.pose.train.other_configs import SegmentationTraining
-from depthpose.pose.train.task import Run, claim_run, with_origin
+from depthpose.pose.train.task import claim_run, with_origin
 
 
 class SegmentationTask:
@@ -86,7 +86,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
-    seconds = train(task, samples, config.loop, run.folder, **run.words)
+    seconds = run.train(task, samples, config.loop)
     path = run.folder / "segmentation.safetensors"
     if find_shard().rank:
         return path

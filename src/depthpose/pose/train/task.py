@@ -2,8 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
-from depthpose.core.config import config_to_dict, write_config
-from depthpose.core.loop import Evidence, Progress, Turn, make_adam, run_files
-from depthpose.core.run import claim_folder, find_shard
+from depthpose.core.loop import Evidence, Run, Turn, make_adam
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
@@ -96,32 +93,6 @@ def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes cop
 
 _SAID = 3
 """Turns of an object that look nearly alike, on a card."""
-_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
-"""Settings of the loop that change no weight: a resumed run may have others."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """Folder of a training, and callbacks.
-
-    Attributes:
-        folder: the run folder; the weights lie in it, named after what was trained.
-        resume: go on from its last state.
-        finish: make weights of its last state, without another step.
-        on_step: called after each optimiser step.
-        tell: called with what a person should know before it begins.
-    """
-
-    folder: Path
-    resume: bool = False
-    finish: bool = False
-    on_step: Callable[[Progress], None] | None = None
-    tell: Callable[[str], None] | None = None
-
-    @property
-    def words(self) -> dict[str, Any]:
-        """Arguments of the loop."""
-        return {"resume": self.resume, "finish": self.finish, "on_step": self.on_step}
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
@@ -135,18 +106,12 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     Raises:
         InputError: the folder is another config's.
     """
-    settings = {"stage": type(config).__name__, **config_to_dict(config)}
-    settings["loop"] = {k: v for k, v in settings["loop"].items() if k not in _FREE}
-    settings["loop"]["processes"] = find_shard().world
-    for unrelated in ("held_out", "calibration"):  # no weight of the network follows from these
-        settings.pop(unrelated, None)
-    settings["sha256"] = [file_sha256(Path(path)) for path in files]
+    more: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
-        settings["start_sha256"] = file_sha256(find_weights(config.start))
+        more["start_sha256"] = file_sha256(find_weights(config.start))
         say_terms(bound_facts({}, [config.start]))
-    names = ("pose", "pointnet", "depth-image", "segmentation")
-    claim_folder(run.folder, settings, [file for name in names for file in run_files(name)])
-    write_config(run.folder / "config.yaml", config)
+    weights = ("pose", "pointnet", "depth-image", "segmentation")
+    run.claim(config, weights, more, without=("held_out", "calibration"))
 
 
 def train_words(what: str, config: Any) -> str:  # noqa: ANN401
