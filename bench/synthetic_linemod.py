@@ -21,14 +21,14 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import torch
 from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.baselines import FpfhEstimator
-from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
 from depthpose.pose.datasets.models import models_folder, read_bop_models, read_models_info
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.mesh import sample_surface
@@ -54,6 +54,7 @@ class Condition(NamedTuple):
     occlusion: float = 0.0
     noise: float = 1.0
     resolution: float = 1.0
+    sensor: SensorKind = "structured light"
 
 
 class Method(NamedTuple):
@@ -71,7 +72,7 @@ def synthetic_views(models: Sequence[ObjectModel], at: Condition, number: int) -
         number=number * len(models), seed=SEED, views=None,
         resolution=(at.resolution, at.resolution),
         occluded_share=1.0 if at.occlusion else 0.0, occlusion=(at.occlusion, at.occlusion),
-        sensor=dataclasses.replace(SensorConfig(), noise=(at.noise, at.noise)),
+        sensor=SensorConfig(kinds=(at.sensor,), noise=(at.noise, at.noise)),
     )  # fmt: skip
     return Objects(models, config)
 
@@ -191,6 +192,7 @@ def conditions(words: argparse.Namespace) -> Iterator[tuple[Condition, int]]:
     """List the conditions, each once."""
     for occlusion in words.occlusions:
         yield Condition(occlusion=occlusion), words.number
+    yield from ((Condition(sensor=kind), words.number) for kind in words.sensors)
     if words.sweep:
         yield from ((Condition(noise=n), words.sweep) for n in NOISES if n != 1)
         yield from ((Condition(resolution=r), words.sweep) for r in RESOLUTIONS if r != 1)
@@ -211,7 +213,7 @@ def draw(rows: Sequence[Row], out: Path) -> None:
                        ("resolution", "times 640 x 480")):  # fmt: skip
         curves: dict[str, list[tuple[float, float]]] = {}
         for row in rows:
-            others_usual = all(row[k] == v for k, v in usual.items() if k != setting)
+            others_usual = all(row.get(k, v) == v for k, v in usual.items() if k != setting)
             if row["object"] == "all" and others_usual:
                 curves.setdefault(row["method"], []).append((row[setting], row["success"]))
         if any(len(points) > 1 for points in curves.values()):
@@ -225,7 +227,9 @@ def draw_risks(views: Sequence[Row], out: Path) -> None:
     curves: dict[str, list[tuple[float, float]]] = {}
     for occlusion in OCCLUSIONS:
         at = Condition(occlusion=occlusion)._asdict()
-        own = [v for v in views if v["method"] == OPEN and all(v[k] == at[k] for k in at)]
+        own = [
+            v for v in views if v["method"] == OPEN and all(v.get(k, at[k]) == at[k] for k in at)
+        ]
         if own:
             found = risk_coverage(finite(own, "risk"), finite(own, "error") < 0.1)
             points = list(zip(*(x.tolist() for x in found), strict=True))
@@ -245,6 +249,9 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", default=[], choices=PARTS, help="models too")
     parser.add_argument("--register", type=int, default=0, help="views of each object; 0: not run")
     parser.add_argument("--occlusions", type=float, nargs="*", default=OCCLUSIONS)
+    parser.add_argument(
+        "--sensors", nargs="*", default=[], choices=get_args(SensorKind), help="others, unoccluded"
+    )
     parser.add_argument("--open3d", type=int, default=0, help="views of each object; 0: not run")
     parser.add_argument("--number", type=int, default=250, help="views of each object")
     parser.add_argument("--sweep", type=int, default=50, help="views at each noise and resolution")

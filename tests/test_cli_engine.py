@@ -28,7 +28,9 @@ from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
+from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_scene
+from depthpose.pose.synthetic import Objects, make_part, write_part
 from depthpose.pose.weights import write_pose_weights
 
 RIG = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], "baseline_m": 0.5}
@@ -227,6 +229,22 @@ def test_clouds_have_the_poses_of_the_plain_command(
     assert set(found) == set("012")
     for name, row in found.items():
         assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
+
+
+def test_a_cad_file_alone_is_registered_by_workers_too(
+    tmp_path: Path, double: InProcessEngine
+) -> None:
+    write_part("connector", tmp_path)
+    views = Objects([make_part("connector")], ObjectsConfig(views=None, occluded_share=0.0, seed=5))
+    write_cloud(tmp_path / "in" / "0.ply", Cloud(points=1000 * views[0].input.points_m))
+    words = ["pose", "predict", "--method", "register", "--cad", str(tmp_path / "connector.stl"),
+             "--unit", "mm", "--cloud", str(tmp_path / "in"), "--out"]  # fmt: skip
+    assert main([*words, str(tmp_path / "plain")]) == 0
+    assert main([*words, str(tmp_path / "big"), *RAY]) == 0
+    (wanted,) = without_seconds(tmp_path / "plain")
+    found = json.loads(unpacked(tmp_path / "big")["0"]["pose.json"])
+    assert wanted["status"] == "ok"
+    assert {**found, "seconds": 0} == {**wanted, "seconds": 0}
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from tests.pose.synthetic_frames import make_dataset
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.synthetic import Objects, make_part, write_part
 
@@ -68,6 +68,23 @@ def test_a_data_set_brings_its_models(tmp_path: Path) -> None:
     assert len(rows(tmp_path / "out")) == len(data)
 
 
+def test_a_cad_file_is_followed_through_frames(
+    cad: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = read_cloud(tmp_path / "scan.ply").points
+    for k in range(3):
+        moved = scan + torch.tensor([2.0 * k, 0.0, 0.0])
+        write_cloud(tmp_path / f"frames/{k}.ply", Cloud(points=moved))
+    words = ["--method", "register", "--cad", str(cad), "--unit", "mm"]
+    frames = ["--cloud", str(tmp_path / "frames"), "--out", str(tmp_path / "out")]
+    assert main(["pose", "track", *words, *frames]) == 0
+    assert "2 tracked, 1 found, 0 lost" in capsys.readouterr().out
+    places = [torch.tensor(row["camera_from_model"])[:3, 3] for row in rows(tmp_path / "out")]
+    torch.testing.assert_close(
+        places[2] - places[0], torch.tensor([0.004, 0, 0]), atol=1e-3, rtol=0
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -75,8 +92,6 @@ def test_a_data_set_brings_its_models(tmp_path: Path) -> None:
         ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
         ("--cad connector.stl --unit mm --cloud scan.ply", "add --method register"),
         ("--method register --cad connector.stl --bop .", "leave --cad away"),
-        ("--method register --cad connector.stl --unit mm --cloud scan.ply --engine ray",
-         "leave --engine away"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),
     ],
 )  # fmt: skip

@@ -10,8 +10,9 @@ import torch
 from depthpose.cli import main
 from depthpose.core.checkpoint import LicenceNotice, find_weights
 from depthpose.core.config import read_config
+from depthpose.core.loop import Run
 from depthpose.pose.synthetic import write_part
-from depthpose.pose.train import STAGES, PoseTraining, Run
+from depthpose.pose.train import STAGES, PoseTraining
 from depthpose.pose.weights import read_pose_weights, write_pose_weights
 
 _TINY = """

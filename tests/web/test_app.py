@@ -9,7 +9,6 @@ from base64 import b64decode
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +76,7 @@ def refusal(response: Response) -> tuple[int, str]:
 
 
 VIEW = {"depth": "depth.png", "mask": "mask.png", "camera": "view.json"}
+VIEW_ALONE = {"depth": "depth.png", "camera": "view.json"}
 
 
 def test_the_page_loads_nothing_from_elsewhere(page: TestClient) -> None:
@@ -371,8 +371,7 @@ def test_another_object_is_refused_in_words(page: TestClient, samples: Path, tru
 def test_a_depth_image_without_a_mask_is_searched(
     page: TestClient, samples: Path, truth: Rigid
 ) -> None:
-    files = {"depth": "depth.png", "camera": "view.json"}
-    found = ask(page, "pose", samples, files, object=PART).json()
+    found = ask(page, "pose", samples, VIEW_ALONE, object=PART).json()
     (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
     assert row["object"] == PART
     assert row["status"] == "ok", row["reason"]
@@ -405,36 +404,36 @@ def test_pose_refuses_with_a_remedy(
     assert said in text
 
 
-def test_an_unknown_cad_file_is_refused_where_open3d_is_missing(
-    samples: Path, truth: Rigid, monkeypatch: pytest.MonkeyPatch, page: TestClient
-) -> None:
-    monkeypatch.setattr(pose_tab, "has_registration", lambda: False)
-    (samples / "wide.obj").write_text(
-        "v 0 0 0\nv 0.3 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    )
-    files = VIEW | {"cad": "wide.obj"}
-    status, text = refusal(ask(page, "pose", samples, files, object="cad", cad_unit="m"))
-    assert status == 400
-    assert "wide.obj: the weights know" in text
-    assert "depthpose pose train --cad" in text
-    assert "pip install -e '.[open3d]'" in text
-
-
-@pytest.mark.skipif(find_spec("open3d") is None, reason="Open3D is not installed")
-def test_open3d_poses_a_cad_file_that_no_weights_know(
-    nets: tuple[FakestereoNet, GeoPoseNet],
+@pytest.mark.parametrize("files", [VIEW, VIEW_ALONE])
+def test_a_cad_file_that_no_weights_know_is_registered(
     samples: Path,
     truth: Rigid,
     monkeypatch: pytest.MonkeyPatch,
     page: TestClient,
+    files: dict[str, str],
 ) -> None:
     monkeypatch.setattr(pose_tab, "_is_same", lambda *_: False)
-    files = VIEW | {"cad": f"{PART}.stl"}
-    found = ask(page, "pose", samples, files, object="cad", cad_unit="mm").json()
-    assert dict(found["facts"])["by"].startswith("Open3D")
+    cad = {"cad": f"{PART}.stl"}
+    found = ask(page, "pose", samples, files | cad, object="cad", cad_unit="mm").json()
+    assert dict(found["facts"])["by"].startswith("registration of the CAD file")
     assert found["ok"], found["said"]
-    assert list(found["tables"]) == ["camera_from_model: R | t [m]"], "it has no covariance"
     assert found["terms"] == ""
+    (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
+    T = torch.tensor(row["camera_from_model"])
+    off_m = adds_m(Rigid(T[:3, :3], T[:3, 3]), truth, make_part(PART).vertices_m)
+    assert float(off_m) < 0.005
+
+
+def test_another_part_than_the_cad_file_is_refused(
+    samples: Path, truth: Rigid, page: TestClient
+) -> None:
+    (samples / "wide.obj").write_text(
+        "v 0 0 0\nv 0.3 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    files = VIEW | {"cad": "wide.obj"}
+    found = ask(page, "pose", samples, files, object="cad", cad_unit="m").json()
+    assert not found["ok"]
+    assert found["said"].startswith("Refused")
 
 
 def test_what_is_too_large_is_refused_before_it_is_read(

@@ -36,7 +36,7 @@ from depthpose.web.guard import (
     say_error,
     zip_files,
 )
-from depthpose.web.pose import answer_pose, has_registration
+from depthpose.web.pose import answer_pose
 from depthpose.web.queue import Queue, has_gone, paced
 
 TICKET = "x-ticket"
@@ -94,7 +94,6 @@ class Pages:
             limit_mb=limits.upload_bytes // 10**6,
             has_one_image=depth.synthesiser is not None,
             has_pair=depth.matcher is not None,
-            has_registration=has_registration(),
         )
         own = Path(__file__).parent
         self._assets = {

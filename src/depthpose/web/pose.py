@@ -1,7 +1,6 @@
 """The tab Pose: a depth image or cloud of a known object to its pose, or why there is none."""
 
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,15 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import InputError, install_words
+from depthpose.core.errors import InputError
 from depthpose.core.files import read_map, write_cloud, write_image
-from depthpose.pose.baselines import FpfhRegistration
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
-from depthpose.pose.estimator import GeoPoseNet, Voted
+from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
 from depthpose.pose.estimator.find import explained_mask
 from depthpose.pose.estimator.given import cloud_input, view_input
-from depthpose.pose.mesh import read_model, sample_surface
+from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
@@ -34,16 +32,11 @@ _SURFACE = 20_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Target:
-    """The object, and how it is posed: by the network where ``registration`` is None."""
+    """The object, what poses it, and what the page says of that."""
 
     model: ObjectModel
+    net: GeoPoseNet | Registration
     how: str
-    registration: FpfhRegistration | None = None
-
-
-def has_registration() -> bool:
-    """Whether a CAD file that no weights know can be posed here: whether Open3D is installed."""
-    return find_spec("open3d") is not None
 
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
@@ -56,15 +49,12 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     given = _input(form, target.model)
     found = voted = None
     if "depth" in form.files and "mask" not in form.files:
-        given, found = _found_alone(given, target, net)
+        given, found = _found_alone(given, target)
     points_m = object_points(given, target.model.diameter_m)
-    if found is not None:
-        terms = net.terms
-    elif target.registration is None:
-        (found, voted), terms = net.estimate_with_votes(given), net.terms
-    else:
-        cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
-        found, terms = target.registration.estimate(cloud), ""
+    if found is None and isinstance(target.net, GeoPoseNet):
+        found, voted = target.net.estimate_with_votes(given)
+    elif found is None:
+        found = target.net.estimate_many([given])[0]
     folder = form.results()
     return Answer(
         is_ok=found.is_ok,
@@ -73,23 +63,15 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         tables=pose_tables(found),
         pictures=_write(folder, given, points_m, found, target.model),
         scene=_scene(given, points_m, found, target.model, voted),
-        terms=terms,
+        terms=net.terms if target.net is net else "",
         files=read_files(folder),
     )
 
 
-def _found_alone(
-    given: CloudInput | ViewInput, target: _Target, net: GeoPoseNet
-) -> tuple[ViewInput, PoseEstimate]:
-    """Search a depth image without a mask; give the best pose, and the pixels that it explains.
-
-    Raises:
-        InputError: the network does not know the object.
-    """
+def _found_alone(given: CloudInput | ViewInput, target: _Target) -> tuple[ViewInput, PoseEstimate]:
+    """Search a depth image without a mask; give the best pose, and the pixels that it explains."""
     assert isinstance(given, ViewInput)
-    if target.registration is not None:
-        raise InputError("mask: no file; an object that the weights do not know needs its mask")
-    answers = net.find_in(given, [target.model.name])
+    answers = target.net.find_in(given, [target.model.name])
     if not answers:
         return given, PoseEstimate(
             name=given.name,
@@ -131,20 +113,15 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
         known = [model for model in models if model.name == name]
         if not known:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
-        return _Target(model=known[0], how="network, by the weights' own model")
+        return _Target(model=known[0], net=net, how="network, by the weights' own model")
     model = read_model(form.file("cad"), _unit(form, "cad_unit"))
     for own in models:
         if _is_same(own, model):
-            return _Target(model=own, how=f"network; the CAD file is the weights' {own.name!r}")
-    if not has_registration():
-        raise InputError(
-            f"{form.file('cad').name}: the weights know {', '.join(net.objects)}, and this is none "
-            "of them (is its unit right?). To train a network for a part from its CAD file alone: "
-            "depthpose pose train --cad FILE --unit mm --out my_part. Without training, "
-            f"{install_words('open3d')} poses any CAD file, less reliably"
-        )
-    how = "Open3D's FPFH features, RANSAC and ICP: untrained; it hardly ever refuses"
-    return _Target(model=model, how=how, registration=FpfhRegistration(model))
+            how = f"network; the CAD file is the weights' {own.name!r}"
+            return _Target(model=own, net=net, how=how)
+    model = with_found_symmetries(model, None, is_taken=True)
+    how = "registration of the CAD file, which no training has seen"
+    return _Target(model=model, net=Registration([model], net.config), how=how)
 
 
 def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
@@ -207,7 +184,7 @@ def _unit(form: Form, field: str) -> Unit:
 
 
 def _facts(found: PoseEstimate, target: _Target) -> list[tuple[str, str]]:
-    is_network = target.registration is None
+    is_network = isinstance(target.net, GeoPoseNet)
     agreeing = "votes that agree" if is_network else "points near the model"
     return pose_facts(found, target.model, target.how, agreeing)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import EngineOptions, Weights
+from depthpose.cli.engine import EngineOptions
 from depthpose.cli.options import PoseMeasureOptions
 from depthpose.cli.pose.options import (
     DataSetOptions,
@@ -14,7 +14,7 @@ from depthpose.cli.pose.options import (
     refuse_mixture,
 )
 from depthpose.core.errors import InputError
-from depthpose.pose.config import EstimateConfig, SymmetryRule
+from depthpose.pose.config import SymmetryRule
 
 
 def predict(
@@ -52,14 +52,15 @@ def predict(
     """
     from depthpose.cli.pose.finding import find_all
     from depthpose.cli.pose.inputs import object_named
+    from depthpose.cli.pose.methods import source_of
 
     refuse_mixture(inputs, dataset.bop)
     config = estimates.config
-    if engine.is_ray and register.method == "register":
-        raise InputError("--method register runs in this process alone; leave --engine away")
+    bop = None if dataset.bop is None else (dataset.bop, dataset.split)
+    source = source_of(weights, register, inputs.unit, bop, config)
     if engine.is_ray:
-        return _predict_on_ray(inputs, dataset, weights, config, estimates.batch, out, engine)
-    method = _method_of(weights, register, inputs, dataset, config)
+        return _predict_on_ray(inputs, dataset, source, estimates.batch, out, engine)
+    method = source.build()
     if dataset.bop is not None:
         return _predict_bop(method, dataset, Path(out), estimates.batch, config.device, view)
     if inputs.cloud is not None and not method.takes_clouds:
@@ -73,32 +74,6 @@ def predict(
         place = Path(inputs.depth)
         return find_all(method, place, inputs.camera, wanted, inputs.unit, Path(out))
     return _predict_here(method, inputs, Path(out), estimates.batch, view)
-
-
-def _method_of(
-    weights: str,
-    register: RegisterOptions,
-    given: OneObjectOptions,
-    dataset: DataSetOptions,
-    config: EstimateConfig,
-) -> Any:  # noqa: ANN401  a type of this would load torch for --help
-    """Build the estimator: of weights, or of models alone."""
-    from depthpose.cli.pose.methods import REGISTER, pose_methods, registration_of
-    from depthpose.pose.datasets import open_bop
-
-    if register.method == "network" and register.cad:
-        raise InputError(
-            "--cad: weights know their own objects; add --method register, or train weights of "
-            "this part by 'depthpose pose train --cad'"
-        )
-    if register.method == "network":
-        return pose_methods([weights], config)[0]
-    if register.cad and dataset.bop is not None:
-        raise InputError("--cad: the models of --bop are taken; leave --cad away")
-    if register.cad:
-        return registration_of(register.cad, register.cad_unit or given.unit, config)
-    models = () if dataset.bop is None else open_bop(dataset.bop, dataset.split).objects.values()
-    return pose_methods([REGISTER], config, tuple(models))[0]
 
 
 def _predict_here(
@@ -226,8 +201,7 @@ def _predict_bop(
 def _predict_on_ray(
     given: OneObjectOptions,
     dataset: DataSetOptions,
-    weights: str,
-    config: EstimateConfig,
+    source: Any,  # noqa: ANN401  a type of this would load torch for --help
     batch: int,
     out: str,
     on: EngineOptions,
@@ -236,13 +210,12 @@ def _predict_on_ray(
 
     if dataset.bop is not None:
         asked = (dataset.bop, dataset.split, dataset.masks)
-        return engine.predict_bop(asked, Weights.read(weights), config, batch, out, on)
+        return engine.predict_bop(asked, source.packed(), batch, out, on)
     if given.depth is not None and given.camera is None:
         raise InputError("--depth needs --camera beside it")
     files = engine.cloud_files() if given.depth is None else engine.VIEW_FILES
     work = engine.PoseWork(
-        weights=Weights.read(weights),
-        config=config,
+        source=source.packed(),
         object=given.object or "",
         unit=given.unit,
         camera=None,

@@ -11,10 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import EngineOptions, Inputs, Weights, run, say
+from depthpose.cli.engine import EngineOptions, Inputs, run, say
 from depthpose.cli.pose.inputs import bop_jobs, input_job, known_objects, object_named
 from depthpose.cli.pose.masks import find_masks
-from depthpose.cli.pose.methods import PoseMethod, pose_methods
+from depthpose.cli.pose.methods import MethodSource, PoseMethod
 from depthpose.cli.pose.page import write_pose_page
 from depthpose.cli.pose.predicting import claim_bop, estimate_jobs, say_result, write_bop_files
 from depthpose.core.camera import Camera, read_camera
@@ -32,7 +32,7 @@ from depthpose.core.engine import (
 from depthpose.core.errors import InputError
 from depthpose.core.files import cloud_suffixes, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.config import Unit
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
@@ -62,8 +62,7 @@ ENDING = "pose.json"
 class PoseWork:
     """Clouds, or depth images and masks, to poses or the reasons for none."""
 
-    weights: Weights
-    config: EstimateConfig
+    source: MethodSource
     object: str
     unit: Unit | None
     camera: Camera | None
@@ -72,10 +71,8 @@ class PoseWork:
     endings: Sequence[str] = (ENDING,)
 
     def start(self) -> Function:
-        """Build the network."""
-        with self.weights.unpacked() as path:
-            (method,) = pose_methods([path], self.config)
-        return partial(_predict, method, self)
+        """Build the estimator."""
+        return partial(_predict, self.source.build(), self)
 
 
 def predict(
@@ -98,8 +95,7 @@ def predict(
     """
     inputs = Inputs.find(words, files)
     _refuse_other_masks(words, inputs)
-    with work.weights.unpacked() as path:
-        (method,) = pose_methods([path], replace(work.config, device="cpu"))
+    method = work.source.build("cpu")
     name = object_named(work.object or None, method)
     known = None
     with inputs.first() as first:
@@ -108,7 +104,7 @@ def predict(
     facts = {} if known is None else {"K": known.K.tolist()}
     settings = {
         **method.settings,
-        "estimate": config_to_dict(work.config),
+        "estimate": config_to_dict(work.source.config),
         "object": name,
         "unit": work.unit,
         **facts,
@@ -155,11 +151,10 @@ class BopWork:
         folder: of the data set, which all workers see.
         split: of it.
         masks: ``truth``, ``predicted`` or a file of detections, which all workers see.
-        objects: numbers of the objects that the weights know.
+        objects: numbers of the objects that the estimator knows.
     """
 
-    weights: Weights
-    config: EstimateConfig
+    source: MethodSource
     folder: str
     split: str
     masks: str
@@ -169,9 +164,8 @@ class BopWork:
     endings: Sequence[str] = (ENDING,)
 
     def start(self) -> Function:
-        """Build the network and open the data set."""
-        with self.weights.unpacked() as path:
-            (method,) = pose_methods([path], self.config)
+        """Build the estimator and open the data set."""
+        method = self.source.build()
         jobs = bop_jobs(*self.open(), method)
         return partial(_predict_instances, method, {job.name: job for job in jobs})
 
@@ -183,8 +177,7 @@ class BopWork:
 
 def predict_bop(
     given: tuple[Path, str, str],
-    weights: Weights,
-    config: EstimateConfig,
+    source: MethodSource,
     batch: int,
     out: str,
     options: EngineOptions,
@@ -193,8 +186,7 @@ def predict_bop(
 
     Args:
         given: folder, split and masks of the data set.
-        weights: of a pose network.
-        config: of the estimator.
+        source: of the estimator, packed.
         batch: inputs in one call of the network.
         out: folder of the results.
         options: of the engine.
@@ -204,11 +196,9 @@ def predict_bop(
     """
     folder, split, masks = given
     _refuse_what_is_not_shared(masks, out)
-    with weights.unpacked() as path:
-        (method,) = pose_methods([path], replace(config, device="cpu"))
+    method = source.build("cpu")
     work = BopWork(
-        weights=weights,
-        config=config,
+        source=source,
         folder=str(folder.resolve()),
         split=split,
         masks=masks if masks in ("truth", "predicted") else str(Path(masks).resolve()),
@@ -218,7 +208,7 @@ def predict_bop(
     dataset, shown = work.open()
     jobs = bop_jobs(dataset, shown, method)
     facts = {"dataset": folder.resolve().name, "split": split, "masks": shown.name}
-    settings = {**method.settings, "estimate": config_to_dict(config), **facts}
+    settings = {**method.settings, "estimate": config_to_dict(source.config), **facts}
     settings = {**settings, **shown.settings, "shards": options.shards}
     claim_bop(Path(out), settings, dataset)
     inputs = Inputs(items=[Item(one.name, ()) for one in jobs], tars=(), files=NO_FILES)

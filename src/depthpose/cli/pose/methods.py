@@ -1,20 +1,22 @@
 """Pose methods by their names, and their predictions of a data set."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from depthpose.cli.engine import Weights
 from depthpose.cli.pose.masks import Masks, distinct_names, of_dataset
+from depthpose.cli.pose.options import RegisterOptions
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig, Unit
-from depthpose.pose.datasets import BopDataset
+from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import (
@@ -121,19 +123,80 @@ def _digest(model: ObjectModel) -> str:
     return digest.hexdigest()[:16]
 
 
-def registration_of(cad: Sequence[str], unit: Unit | None, config: EstimateConfig) -> PoseMethod:
-    """Build the registration of CAD files.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MethodSource:
+    """What an estimator is made from, in this process or by the workers of an engine.
+
+    Attributes:
+        config: of the estimator.
+        weights: of a network, by name or file, or packed to travel; None: ``models`` are registered
+            without training.
+        models: what registration looks for.
+    """
+
+    config: EstimateConfig
+    weights: str | Weights | None = None
+    models: Sequence[ObjectModel] = ()
+
+    def build(self, device: str | None = None) -> PoseMethod:
+        """Build the estimator, on a device or on that of the config.
+
+        Raises:
+            InputError: as :func:`pose_methods`.
+        """
+        config = self.config if device is None else replace(self.config, device=device)
+        if self.weights is None:
+            return _register(REGISTER, self.models, config)
+        if isinstance(self.weights, str):
+            return pose_methods([self.weights], config)[0]
+        with self.weights.unpacked() as path:
+            return pose_methods([path], config)[0]
+
+    def packed(self) -> "MethodSource":
+        """Give the same with the weights in memory."""
+        if not isinstance(self.weights, str):
+            return self
+        return replace(self, weights=Weights.read(self.weights))
+
+
+def source_of(
+    weights: str,
+    register: RegisterOptions,
+    unit: Unit | None,
+    bop: tuple[Path, str] | None,
+    config: EstimateConfig,
+) -> MethodSource:
+    """Say what the options of a command make an estimator from.
+
+    Args:
+        weights: of a network, by name or file.
+        register: whether CAD files alone are looked for, and which.
+        unit: of the CAD files, where ``register`` says none.
+        bop: folder and split of a data set, which has its own models.
+        config: of the estimator.
 
     Raises:
-        InputError: no unit, or a file that cannot be read or has no surface.
+        InputError: options that do not go together, no unit, or a CAD file that cannot be read.
     """
-    if unit is None:
+    if register.method == "network" and register.cad:
+        raise InputError(
+            "--cad: weights know their own objects; add --method register, or train weights of "
+            "this part by 'depthpose pose train --cad'"
+        )
+    if register.method == "network":
+        return MethodSource(config=config, weights=weights)
+    if register.cad and bop is not None:
+        raise InputError("--cad: the models of --bop are taken; leave --cad away")
+    if bop is not None:
+        return MethodSource(config=config, models=tuple(open_bop(*bop).objects.values()))
+    unit = register.cad_unit or unit
+    if register.cad and unit is None:
         raise InputError(
             "--cad without a unit: no file says its unit; give --unit mm, of CAD and clouds, or "
             "--cad-unit mm"
         )
-    models = Registration.load(*cad, unit=unit).models
-    return _register(REGISTER, models, config)
+    models = Registration.load(*register.cad, unit=unit).models if register.cad and unit else ()
+    return MethodSource(config=config, models=tuple(models))
 
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:

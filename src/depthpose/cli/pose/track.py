@@ -4,6 +4,7 @@ from pathlib import Path
 
 from depthpose.cli.help import group
 from depthpose.cli.options import Device
+from depthpose.cli.pose.options import RegisterOptions
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, Unit
 
@@ -46,7 +47,12 @@ class SequenceOptions:
             raise InputError("a sequence is followed by one process; start one")
 
 
-def track(out: Path, weights: str = "parts", frames: SequenceOptions = SequenceOptions()) -> int:
+def track(
+    out: Path,
+    weights: str = "parts",
+    frames: SequenceOptions = SequenceOptions(),
+    register: RegisterOptions = RegisterOptions(),
+) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
     Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
@@ -57,16 +63,19 @@ def track(out: Path, weights: str = "parts", frames: SequenceOptions = SequenceO
 
         depthpose pose track --depth frames --camera cam.json --object mug --out out
         depthpose pose track --bop lm --split test --weights linemod.safetensors --out out
+        depthpose pose track --method register --cad p.stl --cad-unit mm --cloud frames --out out
 
     Args:
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
     """
-    from depthpose.cli.pose.methods import pose_methods
+    from depthpose.cli.pose.methods import source_of
     from depthpose.cli.pose.tracking import track_bop, track_folder
 
     frames.refuse_unusable()
-    (method,) = pose_methods([weights], EstimateConfig(device=frames.device))
+    bop = None if frames.bop is None else (frames.bop, frames.split)
+    config = EstimateConfig(device=frames.device)
+    method = source_of(weights, register, frames.unit, bop, config).build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     if frames.bop is not None:

@@ -89,8 +89,9 @@ def train(
         workers: processes that render views beside the one that trains.
     """
     from depthpose.core.config import read_config
+    from depthpose.core.loop import Run
     from depthpose.core.run import find_shard
-    from depthpose.pose.train import STAGES, Run
+    from depthpose.pose.train import STAGES
 
     kind, run_stage = STAGES[learnt.what]
     chosen = kind() if config is None else read_config(config, kind)
