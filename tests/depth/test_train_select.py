@@ -221,6 +221,22 @@ def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     torch.testing.assert_close(second.head.weight, found.head.weight)
 
 
+def test_a_start_may_refuse_unlike_images_and_what_comes_of_it_does_not_yet(
+    pairs: PairsConfig, tmp_path: Path
+) -> None:
+    """``depth calibrate`` chooses that limit after a training: the start's says nothing of it."""
+    start = tmp_path / "start.safetensors"
+    careful = SelectionGenerator(dataclasses.replace(TINY, least_confidence=0.5))
+    write_depth_weights(start, generator=careful, facts={})
+    loop = dataclasses.replace(LOOP, steps=1)
+    config = SelectTraining(generator=TINY, start=str(start), pairs=pairs, loop=loop)
+    config = dataclasses.replace(config, adam=AdamConfig(learning_rate=1e-30))
+    found = read_depth_weights(train_select(config, Run(folder=tmp_path / "run"))).generator
+    assert isinstance(found, SelectionGenerator)
+    assert found.config == TINY
+    torch.testing.assert_close(found.head.weight, careful.head.weight)
+
+
 def test_it_is_tuned_through_the_matcher(pairs: PairsConfig, tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = SelectionGenerator(TINY)

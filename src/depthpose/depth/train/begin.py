@@ -13,8 +13,9 @@ from depthpose.depth.synthesis import Generator
 from depthpose.depth.train.config import SelectTraining, StereoTraining
 from depthpose.depth.weights import read_matcher
 
-_FREE_OF_WEIGHTS = ("max_disparity_px",)
-"""Settings that no weight depends on: a matcher searches any disparities in the same way."""
+_FREE_OF_WEIGHTS = ("max_disparity_px", "least_confidence")
+"""Settings that no weight depends on: a matcher searches any disparities in the same way, and below
+which confidence images are refused is chosen after a training, by ``depth calibrate``."""
 _CAN_BE_ADDED = ("with_agreement",)
 """Parts that begin without effect, so weights without them can be trained on with them."""
 
@@ -30,7 +31,7 @@ def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
 
 
 def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
-    """Copy weights whose config is the network's own, but for the range of disparities.
+    """Copy weights whose config is the network's own, but for what no weight depends on.
 
     What the network has beyond them keeps its beginning, where that has no effect.
 
