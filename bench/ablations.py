@@ -1,6 +1,6 @@
 """Effect of each choice of the training, by one small configuration and one number of steps.
 
-    python bench/ablations.py --made streets --real PAIRS/kitti2015_train_drives \
+    python bench/ablations.py --synthetic streets --real PAIRS/kitti2015_train_drives \
         --evaluate PAIRS/kitti2015_eval_drives --out out/ablations
 
 L1 alone against cGAN + L1, patch against pixel discriminator, batch norm's mode at test; and how
@@ -55,13 +55,13 @@ class Arm:
     """One training.
 
     Attributes:
-        made: number of synthetic pairs of both stages, where ``real`` is None.
+        synthetic: number of synthetic pairs of both stages, where ``real`` is None.
         real: number of real pairs of both stages, after training on the synthetic ones.
         discriminator: kind of discriminator of the generator; none: L1 alone.
         seed: of weights, order and augmentation.
     """
 
-    made: int = 1000
+    synthetic: int = 1000
     real: int | None = None
     discriminator: Literal["patch", "pixel", "none"] = "patch"
     seed: int = 0
@@ -69,7 +69,7 @@ class Arm:
     @property
     def name(self) -> str:
         """Of its folder."""
-        data = f"made{self.made}" if self.real is None else f"real{self.real}"
+        data = f"synthetic{self.synthetic}" if self.real is None else f"real{self.real}"
         return f"{data}-{self.discriminator}-{self.seed}"
 
 
@@ -79,7 +79,7 @@ def arms(real_pairs: tuple[int, ...], seeds: int) -> list[Arm]:
     for seed in range(seeds):
         found += [Arm(seed=seed), Arm(seed=seed, discriminator="none")]
         found += [Arm(seed=seed, real=number) for number in real_pairs]
-        found += [Arm(seed=seed, made=number) for number in (30, 100, 300)]
+        found += [Arm(seed=seed, synthetic=number) for number in (30, 100, 300)]
         found += [Arm(seed=seed, discriminator="pixel")]
     return found
 
@@ -92,9 +92,9 @@ class Bench:
 
     def pairs(self, arm: Arm) -> PairsConfig:
         """Give the training data of an arm."""
-        folder = self.options.made if arm.real is None else self.options.real
+        folder = self.options.synthetic if arm.real is None else self.options.real
         return PairsConfig(
-            folders=(str(folder),), limit=arm.made if arm.real is None else arm.real,
+            folders=(str(folder),), limit=arm.synthetic if arm.real is None else arm.real,
             focal_px=FOCAL_PX, with_cache=True, augment=AugmentConfig(crop_px=(96, 224)),
         )  # fmt: skip
 
@@ -164,14 +164,18 @@ class Bench:
             row = {name: row[name] for name in kept if name in row} | synthetic_quality(weights)
             write_json(folder / "row.json", row)
         found = json.loads((folder / "row.json").read_text())
-        facts = {"discriminator": arm.discriminator, "made": arm.made, "real": arm.real}
+        facts = {"discriminator": arm.discriminator, "synthetic": arm.synthetic, "real": arm.real}
         return facts | {"seed": arm.seed, "stage": stage} | found
 
     def rows_of(self, arm: Arm) -> list[dict[str, Any]]:
         """Train and measure one arm: apart, with batch norm's other mode, fine-tuned."""
         generator = self.apart(arm)
         home = self.out / arm.name
-        modes = ("running", "batch") if arm.real is None and arm.made == Arm.made else ("running",)
+        modes = (
+            ("running", "batch")
+            if arm.real is None and arm.synthetic == Arm.synthetic
+            else ("running",)
+        )
         rows = []
         for mode in modes:
             network = read_generator(generator)
@@ -196,21 +200,21 @@ def synthetic_quality(weights: Path) -> dict[str, float]:
 def draw_growth(path: Path, rows: list[dict[str, Any]]) -> None:
     """Plot AbsRel on the real pairs over the number of training pairs."""
     of = [row for row in rows if row["discriminator"] == "patch" and "batch" not in row["stage"]]
-    made, real = [{row["stage"]: list[tuple[float, float]]() for row in of} for _ in range(2)]
+    synthetic, real = [{row["stage"]: list[tuple[float, float]]() for row in of} for _ in range(2)]
     for row in of:
         if row["real"] is None:
-            made[row["stage"]].append((row["made"], row["abs_rel"]))
-        if row["made"] == Arm.made:  # without real pairs: the synthetic ones alone
+            synthetic[row["stage"]].append((row["synthetic"], row["abs_rel"]))
+        if row["synthetic"] == Arm.synthetic:  # without real pairs: the synthetic ones alone
             real[row["stage"]].append((row["real"] or 0, row["abs_rel"]))
     draw_curves(
-        path, {"synthetic pairs": made, "real pairs": real}, "AbsRel, 25 real pairs", log=True
+        path, {"synthetic pairs": synthetic, "real pairs": real}, "AbsRel, 25 real pairs", log=True
     )
 
 
 def main() -> None:
     """Train and measure all arms; write the table and the plot after each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--made", type=Path, required=True)
+    parser.add_argument("--synthetic", type=Path, required=True)
     parser.add_argument("--real", type=Path, required=True)
     parser.add_argument("--evaluate", type=Path, required=True)
     parser.add_argument("--pairs", type=int, nargs="+", default=[10, 30, 70])

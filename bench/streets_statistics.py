@@ -98,9 +98,9 @@ def main() -> None:
     words.out.mkdir(parents=True, exist_ok=True)
     for name in real:
         draw_curves(words.out / f"{name.split(' [')[0].replace(' ', '_')}.png", name,
-                    {"real": real[name], "made": synthetic[name]})  # fmt: skip
+                    {"real": real[name], "synthetic": synthetic[name]})  # fmt: skip
         print(f"{name:24s} real", np.round(real[name][::3], 3))
-        print(f"{'':24s} made", np.round(synthetic[name][::3], 3))
+        print(f"{'':24s} synthetic", np.round(synthetic[name][::3], 3))
     sky = np.mean([float(f.is_sky.float().mean()) for f in frames])
     road = np.mean([float(f.is_road.float().mean()) for f in frames])
     occluded = np.mean([float(f.occluded.float().mean()) for f in frames])
@@ -112,7 +112,7 @@ def main() -> None:
         kind: {
             name: [x if np.isfinite(x) else None for x in map(float, v)] for name, v in one.items()
         }
-        for kind, one in (("real", real), ("made", synthetic))
+        for kind, one in (("real", real), ("synthetic", synthetic))
     }
     write_json(words.out / "statistics.json", listed)
 

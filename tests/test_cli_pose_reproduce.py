@@ -92,7 +92,7 @@ def test_table_3_3_votes_on_frames_and_on_synthetic_views(
     words = ["reproduce", "3.3", "--weights", str(weights), "--points", "60"]
     real = ["--linemod", str(linemod.folder), "--out", str(tmp_path / "frames")]
     assert main([*words, *real]) == 0
-    assert main([*words, "--made", "2", "--out", str(tmp_path / "made")]) == 0
+    assert main([*words, "--synthetic", "2", "--out", str(tmp_path / "made")]) == 0
     for home, instances in (("frames", 4), ("made", 2)):
         rows = rows_of(tmp_path / home)
         assert len(rows) == 9

@@ -196,6 +196,25 @@ def test_it_learns_disparity_and_view(folder: Path, tmp_path: Path, pairs: Pairs
     assert "| abs_rel | " in card
 
 
+def test_held_out_pairs_are_measured_at_the_focal_length_of_the_generator(
+    pairs: PairsConfig, tmp_path: Path
+) -> None:
+    config = SelectTraining(
+        generator=TINY, with_fixed_start=False, pairs=pairs, loop=dataclasses.replace(LOOP, steps=1)
+    )
+    found = []
+    for focal_px in (130.0, None):
+        given = dataclasses.replace(pairs, focal_px=focal_px)
+        train_select(
+            dataclasses.replace(config, held_out=given), Run(folder=tmp_path / str(focal_px))
+        )
+        found.append(read_metrics(tmp_path / str(focal_px))[-1]["held_out/abs_rel"])
+    assert found[0] == found[1]
+    other = dataclasses.replace(config, held_out=dataclasses.replace(pairs, focal_px=200.0))
+    with pytest.raises(InputError, match=r"leave held_out\.focal_px out"):
+        train_select(other, Run(folder=tmp_path / "other"))
+
+
 def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:

@@ -112,7 +112,7 @@ COMMANDS: Sequence[Command] = (
         "reproduce 2.2 --kitti {home}/street --split all --weights {home}/m.safetensors "
         "--protocol eigen-raw-camera"
     ),
-    Command("reproduce 3.3 --weights {home}/p.safetensors --points 60 --made 1"),
+    Command("reproduce 3.3 --weights {home}/p.safetensors --points 60 --synthetic 1"),
     Command(
         "reproduce all --kitti {home}/kitti --configs {home}/configs --split all --device cpu "
         "--protocol eigen-raw-camera"

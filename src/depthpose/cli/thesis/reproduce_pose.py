@@ -65,7 +65,7 @@ def table_3_3(
     weights: str,
     out: Path,
     data: PoseDataOptions = PoseDataOptions(),
-    made: int = 40,
+    synthetic: int = 40,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
 ) -> int:
     """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
@@ -80,9 +80,9 @@ def table_3_3(
     Args:
         weights: file or name, of the sparse network.
         out: folder for rows.json, rows.csv, table.md and report.html.
-        made: number of synthetic views where no data set is given.
+        synthetic: number of synthetic views where no data set is given.
         points: at most so many votes of a cloud; a block of rows each.
     """
     from depthpose.cli.thesis.pose_tables import reproduce_voting
 
-    return reproduce_voting(weights, data, made, points, out)
+    return reproduce_voting(weights, data, synthetic, points, out)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -48,6 +48,7 @@ from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 from depthpose.depth.weights import read_generator, write_depth_weights
 
+_OfGenerator = TypeVar("_OfGenerator", ViewTraining, SelectTraining, FinetuneTraining)
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
 """Settings that may name weights."""
 _MEASURED = {
@@ -66,7 +67,7 @@ _MEASURED = {
 def train_view(config: ViewTraining, run: Run) -> Path:
     """Train the generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
-    config = replace(config, pairs=_at_virtual_focal(config.pairs, config.generator))
+    config = _at_virtual_focal(config, config.generator)
     rig_m = config.generator.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=False, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=False)
@@ -82,9 +83,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     refuse_fixed_chance(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
-    config = replace(config, pairs=_at_virtual_focal(config.pairs, rig))
-    if config.more is not None:
-        config = replace(config, more=_at_virtual_focal(config.more, rig))
+    config = _at_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
             pairs,
@@ -160,7 +159,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
             )
     generator = read_generator(find_weights(config.generator))
     matcher = read_network(config.matcher)
-    config = replace(config, pairs=_at_virtual_focal(config.pairs, generator.config))
+    config = _at_virtual_focal(config, generator.config)
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=True)
@@ -245,25 +244,31 @@ def _leave(
 
 
 def _at_virtual_focal(
-    pairs: PairsConfig, generator: GeneratorConfig | SelectionConfig
-) -> PairsConfig:
-    """Bring the pairs to the rig that the generator imitates, and refuse what would leave it.
+    config: _OfGenerator, generator: GeneratorConfig | SelectionConfig
+) -> _OfGenerator:
+    """Bring all pairs, those held out too, to the rig that the generator imitates.
 
     The generator that selects may see them larger: it answers pixels of the image before it, and
     these grow with the image. One that paints knows its own rig alone.
+
+    Raises:
+        InputError: pairs are to have another focal length or size.
     """
     focal_px = generator.virtual_focal_px
-    if pairs.focal_px not in (None, focal_px):
-        raise InputError(
-            f"pairs.focal_px is {pairs.focal_px}, but the generator imitates a rig of {focal_px} "
-            "px (virtual_focal_px); leave pairs.focal_px out"
-        )
-    if pairs.augment.scale != (1.0, 1.0) and not isinstance(generator, SelectionConfig):
-        raise InputError(
-            f"augment.scale is {pairs.augment.scale}: another size is another focal length, and "
-            "the generator imitates one; leave it out"
-        )
-    return replace(pairs, focal_px=focal_px)
+    sources = ("pairs", "more", "held_out")
+    there = {name: found for name in sources if (found := getattr(config, name, None)) is not None}
+    for name, pairs in there.items():
+        if pairs.focal_px not in (None, focal_px):
+            raise InputError(
+                f"{name}.focal_px is {pairs.focal_px}, but the generator imitates a rig of "
+                f"{focal_px} px (virtual_focal_px); leave {name}.focal_px out"
+            )
+        if pairs.augment.scale != (1.0, 1.0) and not isinstance(generator, SelectionConfig):
+            raise InputError(
+                f"augment.scale of {name} is {pairs.augment.scale}: another size is another focal "
+                "length, and the generator imitates one; leave it out"
+            )
+    return replace(config, **{n: replace(p, focal_px=focal_px) for n, p in there.items()})
 
 
 def _refuse_wrong_gradients(config: StereoTraining) -> None:
