@@ -86,6 +86,27 @@ def test_calibration_finds_what_makes_answers_wrong() -> None:
     assert all(slope >= 0 for slope in config.slopes.values())
 
 
+def test_a_rough_cloud_excuses_tilted_normals() -> None:
+    """Wrong where the tilt exceeds the noise of the sensor, which ``rough`` tells."""
+    generator = torch.Generator().manual_seed(0)
+    rough, excess = torch.rand(2, 2000, generator=generator)
+    answers = [
+        answer(rough=float(r), tilt=float(r * (0.2 + 0.8 * e)))
+        for r, e in zip(rough, excess, strict=True)
+    ]
+    is_right = (excess < 0.4).tolist()
+    config = calibrate_refusal(answers, is_right)
+    assert config.slopes["rough"] < -1
+    kept = [(risk_of(a.signals, config) or 0.0) <= config.max_risk for a in answers]
+    blind = calibrate_refusal(answers, is_right, without=("rough",))
+    assert "rough" not in blind.slopes
+    blindly = [(risk_of(a.signals, blind) or 0.0) <= blind.max_risk for a in answers]
+    assert sum(kept) > 2 * sum(blindly)
+    # Whatever it weighs, it is never the reason.
+    signals = answer(rough=0.0, tilt=0.9).signals
+    assert reason_of(signals, 0.9, config).startswith("the cloud's normals differ")
+
+
 def test_wrong_answers_stay_below_the_settled_share_on_other_data() -> None:
     config = calibrate_refusal(*labelled_answers(4000, 0), max_wrong_share=0.02)
     answers, is_right = labelled_answers(4000, 1)

@@ -445,7 +445,7 @@ def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPat
     assert calibrated(weights, _VIEWS, CalibrationConfig(number=0)) is weights
     _ = calibrated(weights, _VIEWS, CalibrationConfig(number=20, negatives=0))
     _ = score_held_out(weights, _VIEWS, HeldOutConfig(number=6, occlusions=(0.0,)))
-    calibration, held_out = (objects[0].input.points_m for objects in seen)
+    calibration, held_out = seen[0][0].input.points_m, seen[-1][0].input.points_m
     assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
 
 
@@ -465,11 +465,35 @@ def test_the_refusal_is_chosen_on_negatives_too(monkeypatch: pytest.MonkeyPatch)
     weights = tiny_weights(*_models())
     views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=16)
     config = calibrated(weights, _VIEWS, views).refusal
-    assert [len(models) for models in shown] == [2, 2, 32]
+    # Each at three noises: the first 50 views of an object, all, and the negatives.
+    assert [len(models) for models in shown] == [2] * 6 + [10, 12, 10]
     assert {model.name for model in shown[-1]} == {"bracket", "bottle"}
     right, negative = dict.fromkeys(SIGNALS, 0.0), {"far": 0.5, "size": 0.5}
     assert (risk_of(right | {"far": 0.5}, config) or 0.0) <= config.max_risk
     assert (risk_of(right | negative, config) or 0.0) > config.max_risk
+
+
+def test_the_refusal_is_chosen_at_several_noises(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Objects] = []
+
+    def posed(given: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+        seen.append(objects)
+        return _as_known(given, objects)
+
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
+    weights = tiny_weights(*_models())
+    config = CalibrationConfig(number=21, negatives=4, noises=(1.0, 30.0), without=("few",))
+    chosen = calibrated(weights, _VIEWS, config)
+    low, high = _VIEWS.sensor.noise
+    wanted = [(low, high), (min(20.0, 30 * low), 20.0)]
+    assert [objects.config.sensor.noise for objects in seen] == wanted * 2
+    assert [len(objects) for objects in seen] == [20, 22, 4, 4]
+    first, second = (objects[0].input.points_m for objects in seen[:2])
+    assert first.shape != second.shape or not torch.equal(first, second)
+    assert "far" in chosen.refusal.slopes
+    assert "few" not in chosen.refusal.slopes
+    with pytest.raises(InputError, match="noises is"):
+        CalibrationConfig(noises=())
 
 
 def test_a_network_that_is_never_right_is_not_looked_at_for_long(
@@ -485,7 +509,7 @@ def test_a_network_that_is_never_right_is_not_looked_at_for_long(
     monkeypatch.setattr("depthpose.pose.train.held_out._posed", wrong)
     weights = tiny_weights(*_models())
     refusal = calibrated(weights, _VIEWS, CalibrationConfig(number=600)).refusal
-    assert looked_at == [2 * 50]
+    assert looked_at == [34, 32, 34]
     assert refusal.max_risk == 0
 
 

@@ -1,4 +1,4 @@
-"""What speaks for and against a pose: signals that need no truth, each larger where it is worse."""
+"""What speaks for and against a pose: signals that need no truth, larger where it is worse."""
 
 import math
 
@@ -38,8 +38,12 @@ SIGNALS: dict[str, str] = {
     "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
     "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",
     "mirror": "the cloud fits the mirror image better (by {:.2g} limits of nearness)",
+    "rough": "the cloud is rough (curvature {:.2g}, a ball has 1)",
 }
 """Name of each signal, and what it says to people."""
+CONTEXT = ("rough",)
+"""Signals that neither speak for nor against a pose, but say how much others mean: under a noisy
+sensor the normals of a right pose differ from the cloud's as well."""
 LATE = ("size", "grown", "mirror")
 """Signals that are measured where nothing else refuses the pose; without ICP they are not."""
 
@@ -83,8 +87,10 @@ def surface_signals(
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
     alone = Rigid(pose.R[None], pose.t_m[None])
     front, unseen = look_along_rays(cloud_m.double(), alone, surface)
+    tilt, rough = _tilt_and_roughness(cloud_m.double(), pose, surface)
     return {
-        "tilt": _tilt(cloud_m.double(), pose, surface),
+        "tilt": tilt,
+        "rough": rough,
         "gap": gap_m / surface.diameter_m,
         "far": 1 - len(near_m) / len(distance_m),
         "front": float(front),
@@ -141,17 +147,23 @@ def without_motions(
     return (basis @ inner @ basis.T).to(covariance)
 
 
-def _tilt(cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
-    """Mean of 1 - |cosine| between normals of the cloud and of the posed surface near it."""
+def _tilt_and_roughness(
+    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
+) -> tuple[float, float]:
+    """Give the mean of 1 - |cosine| between normals of the cloud and of the posed surface near it.
+
+    And the median curvature of the cloud, which tells the sensor's noise.
+    """
     thinned_m = take_evenly(cloud_m, _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
+    normals, bend = local_planes(thinned_m, some_m)
+    rough = float(bend.median())
     distance_m, index = _nearest(some_m, pose, surface)
     near = distance_m < NEAR * surface.diameter_m
     if not bool(near.any()):
-        return 1.0
-    normals, _ = local_planes(thinned_m, some_m[near])
-    cosine = (normals * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
-    return float(1 - cosine.abs().mean())
+        return 1.0, rough
+    cosine = (normals[near] * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
+    return float(1 - cosine.abs().mean()), rough
 
 
 def _nearest(

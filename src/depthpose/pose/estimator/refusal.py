@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from depthpose.core.errors import InputError
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.estimator.evidence import SIGNALS, log_signal
+from depthpose.pose.estimator.evidence import CONTEXT, SIGNALS, log_signal
 from depthpose.pose.types import PoseEstimate
 
 _FOLDS = 5
@@ -56,7 +56,8 @@ def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) 
     def excess(name: str) -> float:
         return config.slopes[name] * (log_signal(signals[name]) - _usual(name, config))
 
-    worst = max((name for name in config.slopes if name in signals), key=excess)
+    named = (name for name in config.slopes if name in signals and name not in CONTEXT)
+    worst = max(named, key=excess)
     return (
         f"{SIGNALS[worst].format(signals[worst])}: the risk of a wrong pose is {risk:.2g}, above "
         f"the {config.max_risk:.2g} that was settled"
@@ -69,11 +70,13 @@ def calibrate_refusal(
     max_wrong_share: float = 0.01,
     negatives: Sequence[PoseEstimate] = (),
     max_negative_share: float = 0.01,
+    without: Sequence[str] = (),
 ) -> RefusalConfig:
     """Learn the risk from estimates whose truth is known, and choose its limit.
 
     The risk is a logistic regression on the logarithms of the signals but ``gap``; no slope is
-    negative (more of a bad sign is never better), and a ridge keeps them small. The limit is chosen
+    negative (more of a bad sign is never better) but that of ``rough``, which says how much tilted
+    normals mean, and a ridge keeps them small. The limit is chosen
     by risks that each fifth of the data got from the other four: the largest at which
     ``(wrong + 1) / (answered + 1)`` is still ``max_wrong_share`` at most; where the data are too
     few for that, the largest at which nothing is wrong. Negatives, clouds of something else, count
@@ -87,6 +90,7 @@ def calibrate_refusal(
         max_wrong_share: of the answers that are given.
         negatives: estimates, computed as those, for clouds that do not show the requested object.
         max_negative_share: of all negatives, also of those that were refused anyhow.
+        without: signals that do not count, because real clouds contradict what synthetic ones say.
 
     Raises:
         InputError: numbers that differ, a share that is none, or no answer at all.
@@ -109,16 +113,18 @@ def calibrate_refusal(
         )
     foreign = [e for e in negatives if e.is_ok]
     every = [e for e, _ in answered] + foreign
-    names = [name for name in _LEARNT if all(name in e.signals for e in every)]
+    names = [
+        name for name in _LEARNT if name not in without and all(name in e.signals for e in every)
+    ]
     x = np.array([[log_signal(e.signals[name]) for name in names] for e in every])
     wrong = np.array([not ok for _, ok in answered] + [True] * len(foreign), dtype=float)
     # Views go round the objects: in order, a fold would be an object.
     fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
     risks = np.empty(len(x))
     for k in range(_FOLDS):
-        bias, slopes = _fit(x[fold != k], wrong[fold != k])
+        bias, slopes = _fit(x[fold != k], wrong[fold != k], names)
         risks[fold == k] = _sigmoid(bias + x[fold == k] @ slopes)
-    bias, slopes = _fit(x, wrong)
+    bias, slopes = _fit(x, wrong, names)
     own = len(answered)
     limits = [_choose_limit(risks[:own], wrong[:own], max_wrong_share)]
     if foreign:
@@ -166,8 +172,8 @@ def fit_candidate_slopes(
     return dict(zip(names, found.x.tolist(), strict=True))
 
 
-def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
-    """Fit bias and slopes, the latter not negative, by penalised likelihood."""
+def _fit(x: np.ndarray, wrong: np.ndarray, names: Sequence[str]) -> tuple[float, np.ndarray]:
+    """Fit bias and slopes by penalised likelihood; only what is context may have a negative one."""
     if len(x) == 0:
         return 0.0, np.zeros(x.shape[1])
     middle, spread = x.mean(0), np.maximum(x.std(0), 1e-3)
@@ -181,7 +187,7 @@ def _fit(x: np.ndarray, wrong: np.ndarray) -> tuple[float, np.ndarray]:
         return value, np.concatenate([[pull.sum()], z.T @ pull + _RIDGE * theta[1:]])
 
     # A bias beyond e^-12 would need more answers than anybody calibrates with.
-    bounds = [(-12.0, 12.0), *[(0.0, None)] * z.shape[1]]
+    bounds = [(-12.0, 12.0), *((None if name in CONTEXT else 0.0, None) for name in names)]
     found = minimize(loss, np.zeros(1 + z.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B")
     slopes = found.x[1:] / spread
     return float(found.x[0] - middle @ slopes), slopes

@@ -110,6 +110,13 @@ class CalibrationConfig:
     max_negative_share: float = 0.01
     """Of these the share that may be answered."""
 
+    noises: tuple[float, ...] = (1.0, 1.0, 3.0)
+    """Times the training's noise: as many parts of the views and of the negatives, so that a
+    noisier sensor's right poses are answered and its wrong ones refused."""
+
+    without: tuple[str, ...] = ()
+    """Signals that do not count, where real clouds contradict what synthetic ones say."""
+
     def __post_init__(self) -> None:
         """Refuse too few views to choose by, and shares that are none."""
         if self.number and self.number < 20:
@@ -117,6 +124,8 @@ class CalibrationConfig:
                              "views: take 600, or 0 for no refusal")  # fmt: skip
         if self.negatives < 0:
             raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
+        if not self.noises or min(self.noises) <= 0:
+            raise InputError(f"noises is {self.noises}; give factors above 0, such as (1.0, 3.0)")
         for name in ("max_wrong_share", "max_negative_share"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(

@@ -152,6 +152,8 @@ def _share(found: Rigid, truth: Rigid, model: ObjectModel, points_m: Tensor) -> 
 _CALIBRATION_SEED = 0xCA11B
 _FIRST = 50
 _CLOUDS_AT_ONCE = 32
+_MOST_NOISE = 20.0
+"""That a sensor may have."""
 _KEPT = ("min_hold", "max_scale_error", "candidate_slopes")
 """Of a refusal: not chosen by calibration."""
 
@@ -184,9 +186,13 @@ def calibrated(
     estimates: list[PoseEstimate] = []
     is_right: list[bool] = []
     for number in dict.fromkeys((min(_FIRST, config.number), config.number)):
-        some = dataclasses.replace(views, number=number * len(weights.models))
-        estimates, errors = _posed(open_weights, Objects(weights.models, some, weights.cloud))
-        is_right = is_within_diameter(torch.tensor(errors)).tolist()
+        estimates, is_right = [], []
+        for here, some in _noisy(views, range(number), config.noises):
+            count = len(some) * len(weights.models)
+            shown = Objects(weights.models, dataclasses.replace(here, number=count), weights.cloud)
+            found, errors = _posed(open_weights, shown)
+            estimates += found
+            is_right += is_within_diameter(torch.tensor(errors)).tolist()
         if not any(is_right):
             break
     try:
@@ -194,8 +200,9 @@ def calibrated(
             estimates,
             is_right,
             config.max_wrong_share,
-            _negatives(open_weights, views, config.negatives) if any(is_right) else (),
+            _negatives(open_weights, views, config) if any(is_right) else (),
             config.max_negative_share,
+            config.without,
         )
     except InputError:
         return weights
@@ -203,20 +210,38 @@ def calibrated(
     return dataclasses.replace(weights, refusal=refusal)
 
 
-def _negatives(weights: PoseWeights, synthetic: ObjectsConfig, number: int) -> list[PoseEstimate]:
+def _negatives(
+    weights: PoseWeights, synthetic: ObjectsConfig, config: CalibrationConfig
+) -> list[PoseEstimate]:
     """Estimate views of something else in the place of each object, kinds by turns."""
-    shown: list[ObjectModel] = []
-    for k in range(number):
-        for model in weights.models:
-            kinds = negative_kinds(model)
-            generator = sample_generator(len(shown), _CALIBRATION_SEED)
-            kind = kinds[k % len(kinds)]
-            shown.append(negative_of(model, kind, weights.models, generator))
-    shown = [model for model in shown if model.diameter_m < synthetic.distance_m[0]]
-    if not shown:
-        return []
-    views = dataclasses.replace(synthetic, number=len(shown), seed=synthetic.seed + 1)
-    return _posed(weights, Objects(shown, views, weights.cloud))[0]
+    found: list[PoseEstimate] = []
+    for here, some in _noisy(synthetic, range(config.negatives), config.noises):
+        shown: list[ObjectModel] = []
+        for k in some:
+            for number, model in enumerate(weights.models):
+                kinds = negative_kinds(model)
+                generator = sample_generator(k * len(weights.models) + number, _CALIBRATION_SEED)
+                kind = kinds[k % len(kinds)]
+                shown.append(negative_of(model, kind, weights.models, generator))
+        shown = [model for model in shown if model.diameter_m < here.distance_m[0]]
+        if shown:
+            views = dataclasses.replace(here, number=len(shown), seed=here.seed + 1)
+            found += _posed(weights, Objects(shown, views, weights.cloud))[0]
+    return found
+
+
+def _noisy(
+    synthetic: ObjectsConfig, numbers: range, noises: Sequence[float]
+) -> Iterator[tuple[ObjectsConfig, range]]:
+    """Part some numbers by noise; views of each part are others and have its noise."""
+    ends = [round(len(numbers) * k / len(noises)) for k in range(len(noises) + 1)]
+    low, high = synthetic.sensor.noise
+    for part, (times, begin, end) in enumerate(zip(noises, ends[:-1], ends[1:], strict=True)):
+        noise = (min(times * low, _MOST_NOISE), min(times * high, _MOST_NOISE))
+        sensor = dataclasses.replace(synthetic.sensor, noise=noise)
+        here = dataclasses.replace(synthetic, sensor=sensor, seed=synthetic.seed + 2 * part)
+        if begin < end:
+            yield here, numbers[begin:end]
 
 
 def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
