@@ -36,6 +36,7 @@ from depthpose.pose.weights import PoseWeights
 from depthpose.report.tables import markdown_table
 
 SEED = 0x0DD
+TOGETHER = 32
 ITSELF = "itself"
 ALIKE = "mirror image alike"
 Row = dict[str, Any]
@@ -82,9 +83,12 @@ def measure(
 ) -> list[Row]:
     """Estimate every negative of a kind, or the objects themselves."""
     models, asked = things(net.weights, kind, number, seed)
+    samples = list(seen(models, seed, with_scene))
+    starts = range(0, len(samples), TOGETHER)
+    parts = ([sample.input for sample in samples[k : k + TOGETHER]] for k in starts)
+    estimates = [estimate for part in parts for estimate in net.estimate_many(part)]
     rows = []
-    for sample, which in zip(seen(models, seed, with_scene), asked, strict=True):
-        found = net.estimate_many([sample.input])[0]
+    for sample, which, found in zip(samples, asked, estimates, strict=True):
         error = pose_error(found, sample.truth, net.weights.models[which])
         is_right = kind == ITSELF and error < 0.1
         is_alike = kind == "mirrored" and is_mirror_alike(net.weights.models[which])

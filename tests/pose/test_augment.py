@@ -8,8 +8,8 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.pose.augment import (
+    grow_mask,
     measure,
-    misjudge_mask,
     occlude,
     random_levels,
     random_rotation,
@@ -56,12 +56,12 @@ def test_nothing_is_hidden_by_no_share() -> None:
 def test_a_mask_grows_and_shrinks_by_pixels() -> None:
     mask = torch.zeros(20, 20, dtype=torch.bool)
     mask[8:12, 8:12] = True
-    grown, shrunk = misjudge_mask(mask, 2), misjudge_mask(mask, -1)
+    grown, shrunk = grow_mask(mask, 2), grow_mask(mask, -1)
     assert int(grown.sum()) == 8 * 8
     assert bool(grown[6:14, 6:14].all())
     assert int(shrunk.sum()) == 2 * 2
     assert bool(shrunk[9:11, 9:11].all())
-    assert torch.equal(misjudge_mask(mask, 0), mask)
+    assert torch.equal(grow_mask(mask, 0), mask)
 
 
 def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SensorConfig:

@@ -1,4 +1,4 @@
-"""Training of the direction network: samples by ticket, truth, judgement, the run."""
+"""Training of the direction network: samples by ticket, truth, evaluation, the run."""
 
 import dataclasses
 import json

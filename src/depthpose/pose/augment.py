@@ -93,7 +93,7 @@ def occlude(
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
 
 
-def misjudge_mask(mask: Mask, grow_px: int) -> Mask:
+def grow_mask(mask: Mask, grow_px: int) -> Mask:
     """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
     if grow_px == 0:
         return mask

@@ -23,7 +23,7 @@ _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
 _ROUGH_POINTS = 100
 """Points of the cloud that refine and compare starts."""
-_ROUGH_JUDGED = 1000
+_OCCLUDING_POINTS = 1000
 """Points of the cloud that show what a pose would occlude."""
 _UNSEEN = 0.3
 """What a surface that should be seen and is not counts against a pose: something may occlude it."""
@@ -215,7 +215,7 @@ def _worth(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, " b"]]:
     """Give the share of points near each posed surface, and what speaks for the pose in all."""
-    cloud = take_evenly(points_m.double(), _ROUGH_JUDGED)
+    cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
     few = take_evenly(cloud, _ROUGH_POINTS)
     _, _, residual_m, weight = _normal_equations(
         few, poses, surface, limit_m, surface.boxes.look_up

@@ -36,11 +36,14 @@ class CloudInput:
         name: what the files of its results are called.
         points_m: the visible part of one object, in the camera frame (x right, y down, z forward).
         object: name of the object, as its :class:`ObjectModel` carries it.
+        view: the depth image that the points are of, where there is one: what the camera saw
+            through a pose speaks against it.
     """
 
     name: str
     points_m: Float[Tensor, "n 3"]
     object: str
+    view: "ViewInput | None" = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -157,11 +157,11 @@ def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
 
 def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
     """Ask every cloud for every object of its size; give the best answer of each cloud."""
-    inputs: list[tuple[int, CloudInput]] = []
+    view, inputs = scene.view, list[tuple[int, CloudInput]]()
     for k, cloud in enumerate(clouds):
         size_m = extent_m(cloud)
         inputs += [
-            (k, CloudInput(name=f"{scene.view.name}_{k}", points_m=cloud, object=name))
+            (k, CloudInput(name=f"{view.name}_{k}", points_m=cloud, object=name, view=view))
             for name, model in known.models.items()
             if _SMALLEST * model.diameter_m <= size_m <= _LARGEST * model.diameter_m
         ]

@@ -36,7 +36,7 @@ class Prepared:
         cloud_m: all usable points, what flies about left out.
         points_m: those that the network sees and that vote, one a voxel.
         voxels: of the network's grid.
-        view: what the cloud was lifted from; None where the cloud alone is known.
+        view: the depth image that shows the cloud; None where the cloud alone is known.
     """
 
     cloud_m: Float[Tensor, "n 3"]
@@ -76,7 +76,7 @@ def prepare_cloud(
     if (turned := frame_advice(points_m)) is not None:
         return Refusal(status="unusable input", reason=turned)
     kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
-    refusal = _judge_size(given, points_m, kept_m, model) or _judge_shape(
+    refusal = _size_refusal(given, points_m, kept_m, model) or _shape_refusal(
         given, kept_m, model, cloud
     )
     if refusal is not None:
@@ -84,7 +84,7 @@ def prepare_cloud(
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
     voxels = voxelise(sampled_m, cloud)
-    view = given if isinstance(given, ViewInput) else None
+    view = given if isinstance(given, ViewInput) else given.view
     return Prepared(cloud_m=kept_m, points_m=sampled_m[voxels.kept], voxels=voxels, view=view)
 
 
@@ -112,7 +112,7 @@ def _nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _judge_size(
+def _size_refusal(
     given: AnyInput,
     points_m: Float[Tensor, "n 3"],
     kept_m: Float[Tensor, "m 3"],
@@ -147,7 +147,7 @@ def _view_hint(view: ViewInput) -> str:
     )
 
 
-def _judge_shape(
+def _shape_refusal(
     given: AnyInput, points_m: Float[Tensor, "n 3"], model: ObjectModel, cloud: CloudConfig
 ) -> Refusal | None:
     if (reason := refusal_of(points_m, cloud)) is not None:

@@ -12,8 +12,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.augment import (
+    grow_mask,
     measure,
-    misjudge_mask,
     occlude,
     random_levels,
     random_rotation,
@@ -134,7 +134,7 @@ class Objects:
         grow_px = whole(generator, 2 * most + 1) - most
         # Pixels of the full image.
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]
-        mask = misjudge_mask(visible, round(grow_px * scale))
+        mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
         return self._as_sample(index, clean, measured_m, mask, visible)
