@@ -23,7 +23,7 @@ import torch
 from depthpose.core.loop import sample_generator
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import calibrate_refusal, risk_of
-from depthpose.pose.estimator.evidence import SIGNALS
+from depthpose.pose.estimator.evidence import CONTEXT, SIGNALS
 from depthpose.pose.estimator.register import CANDIDATE_SLOPES, Registration
 from depthpose.pose.synthetic import Objects, random_part
 from depthpose.pose.synthetic.negatives import NegativeKind, negative_of
@@ -75,7 +75,9 @@ def calibrated(rows: Sequence[Row]) -> RefusalConfig:
     answered = [row for row in rows if row["status"] == "ok" and row["kind"] not in NEAR]
     none = dict.fromkeys(SIGNALS, 0.0)
     estimates = [cast(PoseEstimate, Answer({**none, **row["signals"]})) for row in answered]
-    found = calibrate_refusal(estimates, [row["right"] for row in answered], MAX_WRONG)
+    found = calibrate_refusal(
+        estimates, [row["right"] for row in answered], MAX_WRONG, without=CONTEXT
+    )
     slopes = {name: round(k, 3) for name, k in found.slopes.items() if k > 1e-3}
     return dataclasses.replace(
         OPEN, max_risk=round(found.max_risk, 4), bias=round(found.bias, 3), slopes=slopes,

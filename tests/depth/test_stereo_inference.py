@@ -289,24 +289,37 @@ def test_unknown_device_is_refused() -> None:
         PSMNetMatcher(random_network(SMALL), MatcherConfig(device="toaster"))
 
 
+_PSMNET = """
+from depthpose.depth.stereo import Footprint, PSMNet, PSMNetMatcher as Matcher, Steps
+network = PSMNet().eval()
+footprint = Footprint(config=network.config, height=256, width=1024, dtype=torch.float32)
+least = footprint.estimate_bytes(Steps(rows=2))
+"""
+_LIGHT = """
+from depthpose.depth.config import LightConfig
+from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
+from depthpose.depth.stereo.plan import LightFootprint
+network = LightStereo(LightConfig(with_agreement=True)).eval()
+footprint = LightFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
+least = footprint.estimate_bytes()
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_peak_memory_of_a_bounded_run_stays_below_its_bound() -> None:
+@pytest.mark.parametrize("network", [_PSMNET, _LIGHT], ids=["psmnet", "light"])
+def test_peak_memory_of_a_bounded_run_stays_below_its_bound(network: str) -> None:
     """In a process of its own: memory that earlier tests left behind would hide the rise."""
-    code = """
+    code = f"""
 import torch
 from pathlib import Path
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.stereo import Footprint, PSMNet, PSMNetMatcher, Steps
-
+{network}
 def kilobytes(field):
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if field in line).split()[1])
 
-network = PSMNet().eval()
-footprint = Footprint(config=network.config, height=256, width=1024, dtype=torch.float32)
-least = footprint.estimate_bytes(Steps(rows=2))
-matcher = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least))
+matcher = Matcher(network, MatcherConfig(max_memory_bytes=least))
 pair = torch.rand(2, 3, 256, 1024)
 before = kilobytes("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")

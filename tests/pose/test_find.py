@@ -72,6 +72,25 @@ def test_two_instances_are_found_and_an_unknown_thing_is_not() -> None:
     assert max(errors) < 0.003
 
 
+def test_what_the_camera_saw_through_a_found_pose_counts() -> None:
+    depth_m = table(with_thing=False)
+    _, mask = view_of(bracket(), TRUTHS[0])
+    rows = mask.any(1).nonzero()[:, 0]
+    hole = mask & (torch.arange(240)[:, None] > int(rows.double().quantile(0.75)))
+    depth_m[hole] = 1.2
+    found = {}
+    for name in ("far", "through"):
+        refusal = replace(REFUSAL, bias=10.0, slopes={name: 3.0})
+        net = Oracle(tiny_weights(bracket(), refusal=refusal), TRUTHS)
+        found[name] = net.find(depth_m, CAMERA)
+    assert len(found["far"]) == 2
+    through = sorted(estimate.signals["through"] for estimate in found["far"])
+    assert through[0] < 0.01
+    assert 0.02 < through[1] < 0.2
+    assert len(found["through"]) == 1
+    assert found["through"][0].signals["through"] == through[0]
+
+
 def test_the_same_thing_is_found_once_however_it_is_parted() -> None:
     """Half of a bracket hides behind a bar: its two parts are one answer."""
     model = bracket()

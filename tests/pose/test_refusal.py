@@ -102,9 +102,14 @@ def test_a_rough_cloud_excuses_tilted_normals() -> None:
     assert "rough" not in blind.slopes
     blindly = [(risk_of(a.signals, blind) or 0.0) <= blind.max_risk for a in answers]
     assert sum(kept) > 2 * sum(blindly)
-    # Whatever it weighs, it is never the reason.
+    # Whatever it weighs, it is never the reason; what is as usual is none either.
     signals = answer(rough=0.0, tilt=0.9).signals
     assert reason_of(signals, 0.9, config).startswith("the cloud's normals differ")
+    alone = RefusalConfig(slopes={"rough": -1.0, "tilt": 1.0}, means={"tilt": math.log(0.01)})
+    for given in (answer().signals, {"rough": 0.1}):
+        assert reason_of(given, 0.9, alone).startswith("no single sign, but all of them together")
+    with pytest.raises(InputError, match="a signal in without is 'tlit'"):
+        calibrate_refusal(answers, is_right, without=("tlit",))
 
 
 def test_wrong_answers_stay_below_the_settled_share_on_other_data() -> None:

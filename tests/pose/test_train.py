@@ -492,8 +492,11 @@ def test_the_refusal_is_chosen_at_several_noises(monkeypatch: pytest.MonkeyPatch
     assert first.shape != second.shape or not torch.equal(first, second)
     assert "far" in chosen.refusal.slopes
     assert "few" not in chosen.refusal.slopes
-    with pytest.raises(InputError, match="noises is"):
-        CalibrationConfig(noises=())
+    for wrong in ((), (0.0,), (math.nan,), (math.inf,)):
+        with pytest.raises(InputError, match="noises is"):
+            CalibrationConfig(noises=wrong)
+    with pytest.raises(InputError, match="without is 'fwe'; did you mean 'few'"):
+        CalibrationConfig(without=("fwe",))
 
 
 def test_a_network_that_is_never_right_is_not_looked_at_for_long(

@@ -415,7 +415,7 @@ def test_a_cad_file_that_no_weights_know_is_registered(
     monkeypatch.setattr(pose_tab, "_is_same", lambda *_: False)
     cad = {"cad": f"{PART}.stl"}
     found = ask(page, "pose", samples, files | cad, object="cad", cad_unit="mm").json()
-    assert dict(found["facts"])["by"].startswith("registration of the CAD file")
+    assert dict(found["facts"])["by"].startswith("the CAD file alone")
     assert found["ok"], found["said"]
     assert found["terms"] == ""
     (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)

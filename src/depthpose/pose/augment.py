@@ -124,7 +124,8 @@ def measure(
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
     is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
     alike_px = config.alike_px or (_STEREO_ALIKE_PX if kind == "active stereo" else None)
-    width_px = uniform(generator, *alike_px) * focal_px[0] / focal_px[1] if alike_px else 0.0
+    of_full = focal_px[0] / focal_px[1]
+    width_px = of_full * uniform(generator, *alike_px) if alike_px else 0.0
     white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])
@@ -135,7 +136,7 @@ def measure(
         read_m = scale / (scale / read_m).round()
     elif kind == "active stereo":
         is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
-        one, other = (_displaced(depth_m, generator) for _ in range(2))
+        one, other = (_displaced(depth_m, of_full, generator) for _ in range(2))
         read_m = torch.lerp(one, other, torch.rand(depth_m.shape, generator=generator))
         read_m = read_m + white * 0.003 * read_m.square()
         scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
@@ -218,11 +219,18 @@ def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
     return depth_m.reshape(-1)[index.clamp_(0, height * width - 1)].view(height, width)
 
 
-def _displaced(depth_m: Depth, generator: torch.Generator) -> Depth:
-    """Read each pixel some pixels away, by the same way as its neighbours: edges wander."""
+def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
+    """Read each pixel some pixels away, by the same way as its neighbours: edges wander.
+
+    Args:
+        depth_m: of the window.
+        scale: its pixels for one of the sensor's full image.
+        generator: of the chance.
+    """
     height, width = depth_m.shape
-    ways = [1.2 * smooth_noise((height, width), 3.0, generator) for _ in range(2)]
-    dy, dx = (way.round().long().clamp(-_STEREO_WINDOW, _STEREO_WINDOW) for way in ways)
+    ways = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
+    farthest = _STEREO_WINDOW * scale
+    dy, dx = ((scale * way).clamp(-farthest, farthest).round().long() for way in ways)
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
     columns = (torch.arange(width) + dx).clamp(0, width - 1)
     return depth_m[rows, columns]

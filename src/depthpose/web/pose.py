@@ -13,7 +13,7 @@ from depthpose.core.files import read_map, write_cloud, write_image
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
-from depthpose.pose.estimator.find import explained_mask
+from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
@@ -43,7 +43,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """Pose what a form asks for.
 
     Raises:
-        InputError: a file that cannot be read, an object or a CAD file that is unknown.
+        InputError: a file that cannot be read, or an object that is unknown.
     """
     target = _target(form, net)
     given = _input(form, target.model)
@@ -73,12 +73,7 @@ def _found_alone(given: CloudInput | ViewInput, target: _Target) -> tuple[ViewIn
     assert isinstance(given, ViewInput)
     answers = target.net.find_in(given, [target.model.name])
     if not answers:
-        return given, PoseEstimate(
-            name=given.name,
-            object=target.model.name,
-            status="doubtful",
-            reason="no region of the image is certain enough to be the object; give its mask",
-        )
+        return given, nothing_found(given.name, target.model.name)
     best = replace(answers[0], name=given.name)
     assert best.camera_from_model is not None
     mask = explained_mask(given, best.camera_from_model, target.model)
@@ -120,7 +115,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
             how = f"network; the CAD file is the weights' {own.name!r}"
             return _Target(model=own, net=net, how=how)
     model = with_found_symmetries(model, None, is_taken=True)
-    how = "registration of the CAD file, which no training has seen"
+    how = "the CAD file alone, without training"
     return _Target(model=model, net=Registration([model], net.config), how=how)
 
 

@@ -36,10 +36,10 @@ def object_named(name: str | None, method: PoseMethod) -> str:
     """
     known = [model.name for model in method.models]
     if name is None and len(known) > 1:
-        raise InputError(f"the weights know {', '.join(known)}; say which by --object")
+        raise InputError(f"the {method.holder} know {', '.join(known)}; say which by --object")
     if name is not None and name not in known:
         raise InputError(
-            f"--object {name}: the weights do not know it; {nearest_name(name, known)}"
+            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
         )
     return known[0] if name is None else name
 
@@ -129,11 +129,11 @@ def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
     left = sorted(set(there) - set(known))
     if not known:
         raise InputError(
-            f"{dataset.folder}: holds objects {left}, but the weights know {', '.join(names)}; "
-            "give weights of its objects"
+            f"{dataset.folder}: holds objects {left}, but the {method.holder} know "
+            f"{', '.join(names)}; give {method.holder} of its objects"
         )
     if left:
-        print(f"left out, as the weights do not know them: objects {left}", file=sys.stderr)
+        print(f"left out, as the {method.holder} do not know them: objects {left}", file=sys.stderr)
     return known
 
 

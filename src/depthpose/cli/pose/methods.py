@@ -45,6 +45,7 @@ class PoseMethod:
         takes_clouds: whether it can do without a depth image.
         find: gives the poses of named objects in a view without a mask; None: it cannot.
         track: follows a named object through frames; None: it cannot.
+        holder: what knows the objects, in messages.
     """
 
     name: str
@@ -54,6 +55,7 @@ class PoseMethod:
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
     track: Callable[[Iterable[AnyInput], str], Iterator[PoseEstimate]] | None = None
+    holder: str = "weights"
 
 
 def pose_methods(
@@ -113,6 +115,7 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
         settings={"kind": REGISTER, "models": known, "estimate": config_to_dict(config)},
         find=net.find_in,
         track=net.track_in,
+        holder="models",
     )
 
 
@@ -183,10 +186,12 @@ def source_of(
             "--cad: weights know their own objects; add --method register, or train weights of "
             "this part by 'depthpose pose train --cad'"
         )
+    if register.cad_unit and not register.cad:
+        raise InputError("--cad-unit is the unit of --cad, and no CAD file is given; leave it out")
     if register.method == "network":
         return MethodSource(config=config, weights=weights)
     if register.cad and bop is not None:
-        raise InputError("--cad: the models of --bop are taken; leave --cad away")
+        raise InputError("--cad: the models of --bop are taken; leave --cad out")
     if bop is not None:
         return MethodSource(config=config, models=tuple(open_bop(*bop).objects.values()))
     unit = register.cad_unit or unit

@@ -22,11 +22,11 @@ class SequenceOptions:
     about it too. A lost object is found in clouds of it alone."""
     bop: Path | None = None
     """folder of a data set in BOP's layout; every object of each scene is followed that the weights
-    know, or --object alone."""
+    know (with --method register: that has a model there), or --object alone."""
     split: str = "test"
     """of the data set."""
     object: str | None = None
-    """which of the objects that the weights know."""
+    """which of the known objects."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
     device: Device = "cpu"

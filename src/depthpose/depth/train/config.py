@@ -71,7 +71,8 @@ class SelectTraining:
     """The network that is trained."""
 
     encoder: str | None = None
-    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0')."""
+    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0'; -lite2
+    where it is the generator's ``encoder_kind``)."""
 
     start: str | None = None
     """Weights of the whole generator to begin with (or a whole set)."""

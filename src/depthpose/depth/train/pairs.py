@@ -236,7 +236,7 @@ def _choose_truth(
 
 
 _STREETS = "synthetic streets"
-"""Synthetic streets, as the states of trainings name them: a resumed one compares the names."""
+"""As ``run.json`` names them: a resumed training compares the names."""
 
 
 def _name(source: Dataset | Streets) -> str:

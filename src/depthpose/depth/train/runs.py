@@ -158,6 +158,8 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
                 "'depth train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
+    if isinstance(generator, SelectionGenerator):  # the limit is chosen anew, by depth calibrate
+        generator.config = replace(generator.config, least_confidence=0.0)
     matcher = read_network(config.matcher)
     config = _at_virtual_focal(config, generator.config)
     rig_m = generator.config.virtual_baseline_m
@@ -197,7 +199,7 @@ def _walk(
         more["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     say_terms(facts)
-    run.claim(config, ("generator", "matcher", "fakestereo"), more)
+    run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
     return facts, run.train(task, pairs, config.loop)
 
 

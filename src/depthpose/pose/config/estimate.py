@@ -31,7 +31,7 @@ class RefusalConfig:
 
     slopes: dict[str, float] = field(default_factory=dict)
     """How much the logarithm of each signal adds to the log odds; none: no estimate is refused for
-    its risk."""
+    its risk. That of ``rough`` may be negative: it says how much tilted normals mean."""
 
     means: dict[str, float] = field(default_factory=dict)
     """Of each signal's logarithm over right answers: a refusal names the signal that lies farthest

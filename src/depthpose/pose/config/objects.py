@@ -7,6 +7,8 @@ from depthpose.core.errors import InputError
 
 SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 """What measures depth, and so what its errors look like."""
+MOST_NOISE = 20.0
+"""Times the noise of its kind that a sensor may have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,7 @@ class SensorConfig:
         known = get_args(SensorKind)
         if not self.kinds or any(kind not in known for kind in self.kinds):
             raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
-        _refuse_range("noise", self.noise, (0.0, 20.0), "(0.5, 1.5)")
+        _refuse_range("noise", self.noise, (0.0, MOST_NOISE), "(0.5, 1.5)")
         if self.alike_px is not None:
             _refuse_range("alike_px", self.alike_px, (0.0, 30.0), "(3, 6)")
         _refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")

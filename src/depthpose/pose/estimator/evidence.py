@@ -1,4 +1,7 @@
-"""What speaks for and against a pose: signals that need no truth, larger where it is worse."""
+"""What speaks for and against a pose: signals that need no truth.
+
+Each is larger where the pose is worse, but for those of :data:`CONTEXT`.
+"""
 
 import math
 
@@ -38,12 +41,14 @@ SIGNALS: dict[str, str] = {
     "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
     "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",
     "mirror": "the cloud fits the mirror image better (by {:.2g} limits of nearness)",
-    "rough": "the cloud is rough (curvature {:.2g}, a ball has 1)",
+    "rough": "the cloud has a curvature of {:.2g} in the median, where a ball has 1",
 }
 """Name of each signal, and what it says to people."""
 CONTEXT = ("rough",)
-"""Signals that neither speak for nor against a pose, but say how much others mean: under a noisy
-sensor the normals of a right pose differ from the cloud's as well."""
+"""Signals that speak neither for nor against a pose, but say how much others mean: under a noisy
+sensor the normals of a right pose differ from the cloud's as well. A refusal never names them."""
+_SMOOTH = 0.1
+"""Below this roughness a sensor counts as without noise: what is smoother says nothing more."""
 LATE = ("size", "grown", "mirror")
 """Signals that are measured where nothing else refuses the pose; without ICP they are not."""
 
@@ -152,12 +157,12 @@ def _tilt_and_roughness(
 ) -> tuple[float, float]:
     """Give the mean of 1 - |cosine| between normals of the cloud and of the posed surface near it.
 
-    And the median curvature of the cloud, which tells the sensor's noise.
+    And the median curvature of the cloud, which tells how noisy the sensor is.
     """
     thinned_m = take_evenly(cloud_m, _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
     normals, bend = local_planes(thinned_m, some_m)
-    rough = float(bend.median())
+    rough = max(_SMOOTH, float(bend.median()))
     distance_m, index = _nearest(some_m, pose, surface)
     near = distance_m < NEAR * surface.diameter_m
     if not bool(near.any()):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import minimize
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.evidence import CONTEXT, SIGNALS, log_signal
 from depthpose.pose.types import PoseEstimate
@@ -56,11 +56,18 @@ def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) 
     def excess(name: str) -> float:
         return config.slopes[name] * (log_signal(signals[name]) - _usual(name, config))
 
-    named = (name for name in config.slopes if name in signals and name not in CONTEXT)
-    worst = max(named, key=excess)
+    named = [
+        name
+        for name, slope in config.slopes.items()
+        if slope > 0 and name in signals and name not in CONTEXT
+    ]
+    worst = max(named, key=excess, default=None)
+    what = "no single sign, but all of them together speak against it"
+    if worst is not None and excess(worst) > 0:
+        what = SIGNALS[worst].format(signals[worst])
     return (
-        f"{SIGNALS[worst].format(signals[worst])}: the risk of a wrong pose is {risk:.2g}, above "
-        f"the {config.max_risk:.2g} that was settled"
+        f"{what}: the risk of a wrong pose is {risk:.2g}, above the {config.max_risk:.2g} that was "
+        "settled"
     )
 
 
@@ -93,8 +100,11 @@ def calibrate_refusal(
         without: signals that do not count, because real clouds contradict what synthetic ones say.
 
     Raises:
-        InputError: numbers that differ, a share that is none, or no answer at all.
+        InputError: numbers that differ, a share that is none, a signal that there is not, or no
+            answer at all.
     """
+    for name in without:
+        refuse_unknown("calibrate_refusal: a signal in without", name, SIGNALS)
     if not 0 < max_negative_share < 1:
         raise InputError(
             f"calibrate_refusal: max_negative_share is {max_negative_share}, but a share is "

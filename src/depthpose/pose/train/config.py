@@ -1,10 +1,12 @@
 """Settings of a training of the direction network."""
 
+import math
 from dataclasses import dataclass, field
 
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
+from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
 
@@ -111,11 +113,13 @@ class CalibrationConfig:
     """Of these the share that may be answered."""
 
     noises: tuple[float, ...] = (1.0, 1.0, 3.0)
-    """Times the training's noise: as many parts of the views and of the negatives, so that a
-    noisier sensor's right poses are answered and its wrong ones refused."""
+    """Factors on the training's noise, so that a noisier sensor's right poses are answered and its
+    wrong ones refused. Views and negatives are split into equal parts, one for each factor; a
+    factor that stands twice has twice as many. No noise is above 20, as everywhere."""
 
     without: tuple[str, ...] = ()
-    """Signals that do not count, where real clouds contradict what synthetic ones say."""
+    """Signals that do not count, where real clouds contradict what synthetic ones say; their names
+    are those of ``depthpose.pose.estimator.evidence.SIGNALS``."""
 
     def __post_init__(self) -> None:
         """Refuse too few views to choose by, and shares that are none."""
@@ -124,7 +128,9 @@ class CalibrationConfig:
                              "views: take 600, or 0 for no refusal")  # fmt: skip
         if self.negatives < 0:
             raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
-        if not self.noises or min(self.noises) <= 0:
+        for name in self.without:
+            refuse_unknown("a signal in calibration.without", name, SIGNALS)
+        if not self.noises or not all(0 < factor < math.inf for factor in self.noises):
             raise InputError(f"noises is {self.noises}; give factors above 0, such as (1.0, 3.0)")
         for name in ("max_wrong_share", "max_negative_share"):
             if not 0 < getattr(self, name) < 1:

@@ -13,6 +13,7 @@ from depthpose.core.loop import Evidence, sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig, RefusalConfig
+from depthpose.pose.config.objects import MOST_NOISE
 from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share, is_within_diameter
@@ -152,8 +153,6 @@ def _share(found: Rigid, truth: Rigid, model: ObjectModel, points_m: Tensor) -> 
 _CALIBRATION_SEED = 0xCA11B
 _FIRST = 50
 _CLOUDS_AT_ONCE = 32
-_MOST_NOISE = 20.0
-"""That a sensor may have."""
 _KEPT = ("min_hold", "max_scale_error", "candidate_slopes")
 """Of a refusal: not chosen by calibration."""
 
@@ -237,7 +236,7 @@ def _noisy(
     ends = [round(len(numbers) * k / len(noises)) for k in range(len(noises) + 1)]
     low, high = synthetic.sensor.noise
     for part, (times, begin, end) in enumerate(zip(noises, ends[:-1], ends[1:], strict=True)):
-        noise = (min(times * low, _MOST_NOISE), min(times * high, _MOST_NOISE))
+        noise = (min(times * low, MOST_NOISE), min(times * high, MOST_NOISE))
         sensor = dataclasses.replace(synthetic.sensor, noise=noise)
         here = dataclasses.replace(synthetic, sensor=sensor, seed=synthetic.seed + 2 * part)
         if begin < end:
