@@ -179,7 +179,10 @@ def test_it_is_a_matcher_of_cameras_and_tiles() -> None:
     assert isinstance(fine, CameraMatcher)
     assert isinstance(fine, TiledMatcher)
     assert quick.work_size(camera) == (32, 64)
-    assert fine.work_size(camera) == (64, 128)
+    assert fine.work_size(camera) == (96, 192), "small images are enlarged 1.5 times"
+    K = torch.tensor([[721.5, 0, 610], [0, 721.5, 173], [0, 0, 1]], dtype=torch.float64)
+    height, width = fine.work_size(Camera(width=1242, height=375, K=K))
+    assert 0.99 < height * width / 650_000 < 1.01, "KITTI's as far as the pixels go"
     for matcher in (quick, fine):
         one, other = matcher.match_many([(left, right), (right, left)], camera)
         assert one.disparity_px.shape == (64, 128)

@@ -139,9 +139,10 @@ class MatcherConfig:
 
     speed: Speed = "fine"
     """quick: pairs of a known camera are matched at the focal length that the weights were trained
-    at; fine: at up to 280,000 pixels (PSMNet) or 500,000 (light) where that is more, never enlarged
-    beyond it, and through up to 1.5 times the disparities: for KITTI 3 to 4 times the time. Weights
-    that match pairs as they are have one speed."""
+    at; fine, where that is more: at up to 280,000 pixels and never enlarged (PSMNet), or at up to
+    650,000 and 1.5 times the images' sides (light), and through up to 1.5 (PSMNet) or 1.75 times
+    the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one
+    speed."""
 
     max_memory_bytes: int | None = None
     """Bound on the memory of activations, exact (no tiles); None: no bound."""

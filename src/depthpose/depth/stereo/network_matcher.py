@@ -39,9 +39,6 @@ Views = Float[Tensor, "b 3 h w"]
 
 NetworkConfig = PSMNetConfig | LightConfig
 
-_MOST_REACH = 1.5
-"""Times the disparities of training that a fine match looks through at most."""
-
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
 
@@ -58,6 +55,10 @@ class NetworkMatcher(ABC):
 
     fine_pixels: ClassVar[int]
     """Pixels of a fine match at most."""
+    most_enlarged: ClassVar[float] = 1.0
+    """Times the size of the images at which a fine match may be."""
+    most_reach: ClassVar[float] = 1.5
+    """Times the disparities of training that a fine match looks through at most."""
 
     def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
         config = config or MatcherConfig()
@@ -129,13 +130,13 @@ class NetworkMatcher(ABC):
         if self.config.speed == "quick":
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
-        return max(trained_px, float(camera.K[0, 0]) * min(share, 1.0))
+        return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
 
     def _reaching(self, focal_px: float) -> NetworkConfig:
         """Give the network with the disparities that a larger size needs."""
         trained = self.network_config
         assert trained.work_focal_px is not None
-        larger = min(focal_px / trained.work_focal_px, _MOST_REACH)
+        larger = min(focal_px / trained.work_focal_px, self.most_reach)
         reach_px = round(trained.max_disparity_px * larger, 3)
         step_px = trained.step_px
         return replace(trained, max_disparity_px=step_px * math.ceil(reach_px / step_px))

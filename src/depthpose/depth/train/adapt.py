@@ -224,7 +224,7 @@ def split_pairs(
 
 
 def fine_focal_px(config: AdaptTraining, network: nn.Module) -> float:
-    """Give the focal length at which the first pair is matched at the fine speed [px].
+    """Give the focal length of a fine match of the first pair, not enlarged beyond the pair [px].
 
     Raises:
         InputError: the first folder has fewer than two pairs with calibration.
@@ -235,7 +235,8 @@ def fine_focal_px(config: AdaptTraining, network: nn.Module) -> float:
     assert camera is not None, "pairs with a calibration"
     matcher = make_matcher(network, MatcherConfig())
     assert isinstance(matcher, NetworkMatcher)
-    return matcher.work_focal_px(camera)
+    largest_px = max(float(camera.K[0, 0]), matcher.network_config.work_focal_px or 0.0)
+    return min(matcher.work_focal_px(camera), largest_px)
 
 
 def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
