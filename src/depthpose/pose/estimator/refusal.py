@@ -83,12 +83,12 @@ def calibrate_refusal(
 
     The risk is a logistic regression on the logarithms of the signals but ``gap``; no slope is
     negative (more of a bad sign is never better) but that of ``rough``, which says how much tilted
-    normals mean, and a ridge keeps them small. The limit is chosen
-    by risks that each fifth of the data got from the other four: the largest at which
-    ``(wrong + 1) / (answered + 1)`` is still ``max_wrong_share`` at most; where the data are too
-    few for that, the largest at which nothing is wrong. Negatives, clouds of something else, count
-    as wrong where the risk is learnt; of them the limit lets at most ``max_negative_share`` be
-    answered, by the same rule. The risk is then that of as many negatives among the objects.
+    normals mean, and a ridge keeps them small. The limit is chosen by risks that each fifth of the
+    data got from the other four: the largest at which ``(wrong + 1) / (answered + 1)`` is still
+    ``max_wrong_share`` at most; where the data are too few for that, the largest at which nothing
+    is wrong. Negatives, clouds of something else, count as wrong where the risk is learnt; of them
+    the limit lets at most ``max_negative_share`` be answered, by the same rule. The risk is then
+    that of as many negatives among the objects.
 
     Args:
         estimates: computed with ``RefusalConfig(max_risk=1.0)``, so that nothing was withheld for
