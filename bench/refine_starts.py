@@ -22,7 +22,7 @@ import torch
 from real_poses import RealCase, real_cases
 from torch import Tensor
 
-from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import is_flying
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.refine import refine_best, refine_pose
@@ -35,7 +35,7 @@ RIGHT = 0.05
 
 def turned(pose: Rigid, middle_m: Tensor, axis: Tensor, angle_rad: float) -> Rigid:
     """Turn a pose about a point of the camera frame."""
-    turn = torch.linalg.matrix_exp(cross_matrix(axis * angle_rad))
+    turn = rotation_by(axis * angle_rad)
     return Rigid(turn @ pose.R, turn @ (pose.t_m - middle_m) + middle_m)
 
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
-from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.augment import measure, random_rotation
 from depthpose.pose.config import SensorConfig
 from depthpose.pose.estimator import GeoPoseNet
@@ -67,7 +67,7 @@ def path(number: int, speed: float, generator: torch.Generator) -> Iterator[Rigi
         turn = math.radians(40) * speed / RATE
         yield Rigid(R, middle_m)
         way = torch.nn.functional.normalize(axis * math.cos(s) + other * math.sin(s), dim=-1)
-        R = torch.linalg.matrix_exp(cross_matrix(turn * way)) @ R
+        R = rotation_by(turn * way) @ R
 
 
 def background(generator: torch.Generator) -> Tensor:

@@ -115,6 +115,8 @@ def test_the_graph_of_the_light_network_takes_any_size() -> None:
     light = LightStereo(dataclasses.replace(SMALL, encoder_width=0.1)).eval()
     assert light.enlargement.agreement is not None
     torch.nn.init.normal_(light.enlargement.agreement.weight)
+    assert light.refinement is not None
+    torch.nn.init.normal_(light.refinement.correction.weight)
     network = SizelessLight(light).eval()
     model = network_model(network, [torch.rand(2, 3, 64, 96) for _ in range(2)], 32)
     session = onnxruntime.InferenceSession(model.SerializeToString())

@@ -299,7 +299,7 @@ _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
 from depthpose.depth.stereo.plan import LightFootprint
-network = LightStereo(LightConfig(with_agreement=True)).eval()
+network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
 footprint = LightFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
 least = footprint.estimate_bytes()
 """

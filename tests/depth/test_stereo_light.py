@@ -23,6 +23,10 @@ from depthpose.depth.config import (
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
 from depthpose.depth.stereo.light import (
+    Described,
+    Refinement,
+    Seen,
+    agreement_around,
     agreement_of_neighbours,
     confidence_near,
     correlation_volume,
@@ -46,6 +50,7 @@ SMALL = LightConfig(
     volume_widths=(4, 4, 4, 4),
     encoder_width=0.25,
     with_agreement=True,
+    with_refinement=True,
 )
 
 
@@ -55,6 +60,8 @@ def random_network(config: LightConfig = SMALL) -> LightStereo:
     network = with_random_norms(LightStereo(config))
     if network.enlargement.agreement is not None:
         torch.nn.init.normal_(network.enlargement.agreement.weight)
+    if network.refinement is not None:
+        torch.nn.init.normal_(network.refinement.correction.weight)
     return network
 
 
@@ -125,8 +132,9 @@ def test_views_agree_under_the_disparity_that_is_right() -> None:
     assert float(found[..., 0].abs().max()) < 1e-6  # beyond the right image
 
 
-def test_weights_without_agreement_are_trained_on_with_it(tmp_path: Path) -> None:
-    plain = dataclasses.replace(SMALL, with_agreement=False)
+@pytest.mark.parametrize("part", ["with_agreement", "with_refinement"])
+def test_weights_without_a_part_are_trained_on_with_it(part: str, tmp_path: Path) -> None:
+    plain = dataclasses.replace(SMALL, **{part: False})
     start = tmp_path / "plain.safetensors"
     network = random_network(plain)
     facts = {"licence": "MIT", "trained_on": "nothing"}
@@ -136,10 +144,42 @@ def test_weights_without_agreement_are_trained_on_with_it(tmp_path: Path) -> Non
     assert isinstance(found, LightStereo)
     pair = torch.randn(2, 1, 3, 32, 64).unbind()
     with torch.no_grad():
-        assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1])
+        assert torch.equal(found.eval()(*pair)[-1], network(*pair)[-1].clamp_min(0))
     write_depth_weights(start, matcher=found, facts=facts)
-    with pytest.raises(InputError, match="with_agreement = True, but the config says False"):
+    with pytest.raises(InputError, match=f"{part} = True, but the config says False"):
         make_matcher_network(dataclasses.replace(config, light=plain))
+
+
+def test_the_refinement_compares_the_views_around_a_disparity() -> None:
+    left = torch.randn(1, 6, 4, 16, generator=torch.Generator().manual_seed(0))
+    right = left.roll(-3, -1)  # right[x - 3] is left[x]
+    found = agreement_around(left, right, torch.full((1, 4, 16), 3.0), 2).unflatten(1, (5, 2))
+    inside = slice(5, -2)
+    for k, offset in enumerate((-2, -1, 0, 1, 2)):
+        groups = [view.unflatten(1, (2, 3)) for view in (left, right.roll(3 + offset, -1))]
+        expected = torch.cosine_similarity(*groups, dim=2)
+        torch.testing.assert_close(
+            found[:, k, ..., inside], expected[..., inside], atol=1e-4, rtol=0
+        )
+    torch.testing.assert_close(found[:, 2, ..., inside], torch.ones(1, 2, 4, 9), atol=1e-4, rtol=0)
+
+
+def test_what_the_refinement_corrects_learns_by_a_loss_of_its_own() -> None:
+    torch.manual_seed(0)
+    refinement = Refinement().train()
+    torch.nn.init.normal_(refinement.correction.weight)
+    half, level = torch.randn(2, 16, 16, 32), torch.zeros(2, 8, 8, 16)
+    seen = Seen(Described(half, (level,) * 4), half.flip(-1))
+    found_px = torch.rand(2, 32, 64, requires_grad=True)
+    refinement(seen, found_px).square().sum().backward()
+    assert found_px.grad is None
+    gradient = refinement.get_parameter("compared.conv.weight").grad
+    assert gradient is not None
+    assert bool(gradient.any())
+    with torch.no_grad():
+        corrected = refinement.eval()(seen, torch.zeros(2, 32, 64))
+    assert float(corrected.min()) == 0, "no disparity is negative"
+    assert float(corrected.max()) > 0
 
 
 @pytest.mark.parametrize("size", [(32, 64), (70, 101)])
@@ -275,6 +315,7 @@ def test_it_learns_and_every_part_gets_gradients() -> None:
         "features.encoder.stem.conv",
         "enlargement.weights",
         "enlargement.agreement",
+        "refinement.correction",
         "describe",
     ):
         gradient = network.get_parameter(f"{part}.weight").grad

@@ -8,7 +8,7 @@ from tests.pose.synthetic_objects import K, Oracle, bracket, pose_at, tiny_weigh
 
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.estimator.track import Followed, track
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import (
@@ -26,7 +26,7 @@ def moving(count: int, step_m: float = 0.008, step_deg: float = 2.0) -> list[Rig
     """A bracket that goes to the right and turns, frame after frame."""
     pose, poses = pose_at(-0.08, 0.7, seed=3), []
     axis = torch.nn.functional.normalize(torch.tensor([1.0, 2.0, 0.5]), dim=0)
-    turn = torch.linalg.matrix_exp(cross_matrix(math.radians(step_deg) * axis))
+    turn = rotation_by(math.radians(step_deg) * axis)
     for _ in range(count):
         poses.append(pose)
         pose = Rigid(turn @ pose.R, pose.t_m + torch.tensor([step_m, 0, 0]))

@@ -119,9 +119,18 @@ def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 
 def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
     """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
-    turn = torch.linalg.matrix_exp(cross_matrix(motion[..., :3]))
+    turn = rotation_by(motion[..., :3])
     moved_m = (turn @ pose.t_m[..., None]).squeeze(-1) + motion[..., 3:]
     return Rigid(turn @ pose.R, moved_m)
+
+
+def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Give the rotation by a rotation vector [rad]: Rodrigues' formula, exact down to no turn."""
+    angle = torch.linalg.vector_norm(vector, dim=-1)[..., None, None]
+    cross, eye = cross_matrix(vector), torch.eye(3, dtype=vector.dtype, device=vector.device)
+    # torch.sinc(x) is sin(pi x) / (pi x); (1 - cos a) / a^2 is half of the square of sinc(a / 2).
+    half = torch.sinc(angle / (2 * torch.pi))
+    return eye + torch.sinc(angle / torch.pi) * cross + half.square() / 2 * (cross @ cross)
 
 
 def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix, perturb
+from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, look_along_rays
 
@@ -206,7 +206,7 @@ def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
     middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
     axes = torch.eye(3, dtype=torch.float64)
     axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:count]
-    turns = torch.linalg.matrix_exp(cross_matrix(_TURN_RAD * axes))[:, None]
+    turns = rotation_by(_TURN_RAD * axes)[:, None]
     turned_m = (turns @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
     return Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
 

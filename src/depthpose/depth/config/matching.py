@@ -88,6 +88,10 @@ class LightConfig:
     """Whether the enlargement compares both views, at half size, under the disparities it chooses
     from; weights without it can be trained on with it."""
 
+    with_refinement: bool = False
+    """Whether both views are compared once more, at half size, around the disparity found, which
+    is corrected; weights without it can be trained on with it."""
+
     work_focal_px: float | None = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 

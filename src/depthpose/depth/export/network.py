@@ -77,7 +77,8 @@ class SizelessLight(nn.Module):
         scores, seen = self.network.scores(left, right, config.max_disparity_px)
         quarter_px = mean_of_best(scores, config.candidates)
         weights = self.network.enlargement(seen, quarter_px)
-        return enlarge(quarter_px, weights), enlarge(confidence_near(scores, quarter_px), weights)
+        found_px = self.network.refine(enlarge(quarter_px, weights), seen)
+        return found_px, enlarge(confidence_near(scores, quarter_px), weights)
 
 
 def sizeless(matcher: nn.Module) -> nn.Module:

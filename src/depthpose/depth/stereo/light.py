@@ -6,6 +6,8 @@
   the image steers (Bangunharcana et al., CoEx, IROS 2021).
 - Disparity: the mean over the few best disparities (CoEx), enlarged by learned convex combinations
   of nine neighbours (Teed and Deng, RAFT, ECCV 2020), whose disparities are compared at half size.
+- Refinement: both views are compared around that disparity at half size, and a few convolutions
+  correct it (Khamis et al., StereoNet, ECCV 2018; Tankovich et al., HITNet, CVPR 2021).
 """
 
 from itertools import pairwise, product
@@ -35,6 +37,10 @@ _STEM = 16
 """Channels at half size."""
 _DEEP = 96
 """Channels of the decoder at 1/32, twice those at 1/16 and 1/8."""
+_OFFSETS = (-2, -1, 0, 1, 2)
+"""Where the refinement compares the views: so many pixels at half size from the disparity."""
+_REFINED = 32
+"""Channels of the refinement at half size."""
 
 
 class Described(NamedTuple):
@@ -113,7 +119,9 @@ def correlation_volume(
     width = left.shape[-1]
     left, right = _unit(left, groups), F.pad(_unit(right, groups), (bins - 1, 0))
     firsts = (bins - 1 - d for d in range(bins))
-    return torch.stack([(left * right[..., k : k + width]).sum(2) for k in firsts], 2)
+    # Groups last, as convolutions of volumes want them: no copy is made.
+    cosines = [(left * right[..., k : k + width]).sum(2).permute(0, 2, 3, 1) for k in firsts]
+    return torch.stack(cosines, 1).permute(0, 4, 1, 2, 3)
 
 
 def _unit(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
@@ -149,16 +157,21 @@ class Aggregation(nn.Module):
             for guide, level in zip(self.guides, levels, strict=True)
         ]
         volume = correlation_volume(left, right, bins, self.config.groups)
-        volume = volume.contiguous(memory_format=torch.channels_last_3d)
-        volume = self.first(volume).relu_()
-        scales = [volume * guides[0]]
+        volume = self.first(volume.contiguous(memory_format=torch.channels_last_3d)).relu_()
+        scales = [_product(volume, guides[0])]
         del volume
         for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
-            scales.append(same(down(scales[-1]).relu_()).relu_() * guide)
+            scales.append(_product(same(down(scales[-1]).relu_()).relu_(), guide))
         x = scales.pop()
         for up, joined in zip(reversed(self.up), reversed(self.joined), strict=True):
-            x = joined((up(x) + scales.pop()).relu_()).relu_()
+            x = up(x).add_(scales.pop()).relu_()
+            x = joined(x).relu_()
         return self.score(x)[:, 0]
+
+
+def _product(volume: Volume, guide: Volume) -> Volume:
+    """Weigh a volume by what the image says, in place where no gradient needs what it was."""
+    return volume * guide if torch.is_grad_enabled() else volume.mul_(guide)
 
 
 class Enlargement(nn.Module):
@@ -197,17 +210,71 @@ def agreement_of_neighbours(
     left: Float[Tensor, "b c h2 w2"], right: Float[Tensor, "b c h2 w2"], quarter_px: Quarter
 ) -> Float[Tensor, "b 9 h2 w2"]:
     """Give the cosine of features at half size under the disparity of each of nine neighbours."""
-    h, w = left.shape[2:]
     near, far = (F.normalize(x.float(), dim=1, eps=1e-3) for x in (left, right))
-    columns, lines = (torch.arange(n, device=left.device).float() for n in (w, h))
+    shifts = (_neighbours(quarter_px) / 2).unbind(1)
+    return torch.stack([(near * _moved(far, shift)).sum(1) for shift in shifts], 1)
+
+
+def agreement_around(
+    left: Float[Tensor, "b c h2 w2"],
+    right: Float[Tensor, "b c h2 w2"],
+    half_px: Float[Tensor, "b h2 w2"],
+    groups: int,
+) -> Float[Tensor, "b _ h2 w2"]:
+    """Give the cosine of each group of features at half size at five disparities about one [px]."""
+    near, far = _unit(left, groups), _unit(right, groups).flatten(1, 2)
+    moved = (_moved(far, half_px + offset) for offset in _OFFSETS)
+    return torch.cat([(near * m.unflatten(1, near.shape[1:3])).sum(2) for m in moved], 1)
+
+
+def _moved(
+    right: Float[Tensor, "b c h2 w2"], shift: Float[Tensor, "b h2 w2"]
+) -> Float[Tensor, "b c h2 w2"]:
+    """Give each pixel of the left view what lies ``shift`` to the left of it in the right one."""
+    h, w = right.shape[2:]
+    columns, lines = (torch.arange(n, device=right.device).float() for n in (w, h))
     # The last index as a tensor: the exporter to ONNX takes no quotient of unknown sizes.
     rows = (2 * lines / lines[-1:] - 1)[:, None]
-    found = []
-    for shift in (_neighbours(quarter_px) / 2).unbind(1):
-        x = 2 * (columns - shift) / columns[-1:] - 1
-        seen = F.grid_sample(far, torch.stack([x, rows.expand_as(x)], -1), align_corners=True)
-        found.append((near * seen).sum(1))
-    return torch.stack(found, 1)
+    x = 2 * (columns - shift) / columns[-1:] - 1
+    return F.grid_sample(right, torch.stack([x, rows.expand_as(x)], -1), align_corners=True)
+
+
+class Refinement(nn.Module):
+    """A correction of the disparity of each pixel, from both views compared around it.
+
+    It begins without effect.
+    """
+
+    def __init__(self, groups: int = 4) -> None:
+        super().__init__()
+        self.groups = groups
+        self.compared = conv_norm_2d(_STEM, _STEM)
+        seen = groups * len(_OFFSETS) + _STEM + 4
+        self.layers = nn.ModuleList(
+            [
+                conv_norm_2d(seen, _REFINED),
+                conv_norm_2d(_REFINED, _REFINED, Shape(dilation=2)),
+                conv_norm_2d(_REFINED, _REFINED),
+            ]
+        )
+        self.correction = nn.Conv2d(_REFINED, 4, 1)
+        nn.init.zeros_(self.correction.weight)
+        assert self.correction.bias is not None
+        nn.init.zeros_(self.correction.bias)
+
+    def forward(self, seen: Seen, found_px: Maps) -> Maps:
+        """Correct a disparity of the left view [px]."""
+        assert seen.right_half is not None
+        four = F.pixel_unshuffle(found_px.detach()[:, None], 2) / 2
+        middle = four.mean(1)
+        left, right = self.compared(seen.left.half), self.compared(seen.right_half)
+        alike = agreement_around(left.float(), right.float(), middle, self.groups)
+        x = torch.cat([alike, seen.left.half.float(), four - middle[:, None]], 1).to(left)
+        for layer in self.layers:
+            x = F.relu(layer(x))
+        correction_px = F.pixel_shuffle(self.correction(x).to(found_px), 2)[:, 0]
+        corrected = found_px.detach() + correction_px
+        return corrected if self.training else corrected.clamp_min(0.0)
 
 
 def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
@@ -263,6 +330,7 @@ class LightStereo(nn.Module):
         self.describe = nn.Conv2d(self.config.width, self.config.width, 1, bias=False)
         self.aggregation = Aggregation(self.config, self.features.widths)
         self.enlargement = Enlargement(self.config.width, with_agreement=self.config.with_agreement)
+        self.refinement = Refinement() if self.config.with_refinement else None
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
@@ -271,7 +339,8 @@ class LightStereo(nn.Module):
 
         Returns:
             Disparity of the left view [px], while training that of all scores, enlarged without
-            the image, then the answer; in eval mode the answer alone.
+            the image, then that before the refinement, then the answer; in eval mode the answer
+            alone.
 
         Raises:
             InputError: the images' size does not suit the network.
@@ -279,10 +348,17 @@ class LightStereo(nn.Module):
         scores, seen = self.scores(left, right, self.config.max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
         found_px = enlarge(quarter_px, self.enlargement(seen, quarter_px))
+        heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
         if not self.training:
-            return (found_px,)
+            return heads[-1:]
         coarse_px = mean_of_all(scores)[:, None]
-        return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], found_px
+        return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], *heads
+
+    def refine(self, found_px: Maps, seen: Seen) -> Maps:
+        """Correct an enlarged disparity, where the network has that part."""
+        if self.refinement is None:
+            return found_px
+        return self.refinement(seen, found_px)
 
     def scores(
         self,
@@ -297,7 +373,8 @@ class LightStereo(nn.Module):
         self._check_size(left)
         near, far = self.features(left), self.features(right)
         described = self.describe(near.levels[0]), self.describe(far.levels[0])
-        right_half = far.half if self.config.with_agreement else None
+        compares = self.config.with_agreement or self.config.with_refinement
+        right_half = far.half if compares else None
         del far
         scores = self.aggregation(*described, max_disparity_px // _STEP_PX, near.levels)
         wide = torch.promote_types(scores.dtype, torch.float32)

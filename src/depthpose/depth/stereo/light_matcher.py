@@ -53,7 +53,7 @@ class LightMatcher(NetworkMatcher):
         )
         quarter_px = mean_of_best(scores, network.candidates)
         weights = self._network.enlargement(seen, quarter_px).to(scores.dtype)
-        found_px = enlarge(quarter_px, weights)
+        found_px = self._network.refine(enlarge(quarter_px, weights), seen)
         if not self.config.with_confidence:
             return [Match(disparity_px=one) for one in found_px]
         rows = zip(scores.split(_ROWS, 2), quarter_px.split(_ROWS, 1), strict=True)

@@ -145,18 +145,21 @@ class LightFootprint:
     def estimate_bytes(self) -> int:
         """Peak memory of activations of one pair [bytes], with margin for the allocator."""
         pixels = self.height * self.width // 16
-        halves = 2 if self.config.with_agreement else 1
+        halves = 2 if self.config.with_agreement or self.config.with_refinement else 1
         kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
         stages = (self._volume_bytes(pixels), self._weights_bytes(pixels))
         return int(MARGIN * (kept + max(stages))) + OVERHEAD_BYTES
 
     def _volume_bytes(self, pixels: int) -> int:
-        """Three volumes at quarter size: on the way down, coming up, and their sum."""
+        """Two volumes at quarter size, going in and out of a layer, and the smaller ones kept."""
         widest = max(self.config.groups, self.config.volume_widths[0])
-        return 3 * widest * self.config.max_disparity_px // 4 * pixels * self.dtype.itemsize
+        return 5 * widest * self.config.max_disparity_px // 8 * pixels * self.dtype.itemsize
 
     def _weights_bytes(self, pixels: int) -> int:
-        """Weights that enlarge maps, thrice, and what they are made of at half size."""
+        """Weights that enlarge maps, thrice, and what they are made of at half size.
+
+        The refinement takes less.
+        """
         joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
         compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
         return pixels * (joined + compared + 3 * 4 * 36 * 4)

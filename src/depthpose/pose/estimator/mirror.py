@@ -16,6 +16,9 @@ from depthpose.pose.surface import Surface
 
 _PLANES = 24
 """Planes across which the posed model is mirrored for a start."""
+_CLEAR = 0.05
+"""Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
+steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
 
 
@@ -41,6 +44,9 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     tried = refine_roughly(mirrored_m, _mirrored(middle_m), surface, config)
     few_m = take_evenly(mirrored_m, 100).expand(len(tried.R), -1, -1)
     rough = distance_to(tried.inverse().apply(few_m), surface, surface.boxes.look_up)
+    own = distance_to(take_evenly(local_m, 100), surface, surface.boxes.look_up)
+    if float(rough.min() - own) > _CLEAR:
+        return float(own - rough.min())
     nearest = rough.argmin()[None]  # one is enough: three found no other gain in 24 views
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
     found = refine_pose(mirrored_m, Rigid(tried.R[nearest], tried.t_m[nearest]), surface, config)

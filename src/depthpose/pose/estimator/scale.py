@@ -7,7 +7,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, cross_matrix
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.refine import Nearest
 from depthpose.pose.surface import NEAR, Surface
 
@@ -70,80 +70,83 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
-    few_m = take_evenly(local_m, _ROUGH_POINTS)
-    costs = []
-    for start in _STARTS:
-        times, turned_m, _ = _grow(few_m, start, middle_m, surface, surface.boxes.look_up)
-        costs.append(_distance(turned_m, times, middle_m, surface, surface.boxes.look_up) ** 2)
+    starts = torch.tensor(_STARTS, dtype=torch.float64)
+    few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
+    times, turned_m, _ = _grow(few_m, starts, middle_m, surface, surface.boxes.look_up)
+    costs = _distance(turned_m, times, middle_m, surface, surface.boxes.look_up).square()
     costs[0] -= _TRUST
-    start = _STARTS[min(range(len(costs)), key=costs.__getitem__)]
-    times, turned_m, sigma = _grow(local_m, start, middle_m, surface, surface.nearest)
+    start = starts[costs.argmin()][None]
+    times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, surface.nearest)
     reached = _distance(turned_m, times, middle_m, surface, surface.nearest)
-    gain = _distance(local_m, 1.0, middle_m, surface, surface.nearest) - reached
-    return Scale(times, sigma, gain)
+    gain = distance_to(local_m, surface, surface.nearest) - reached[0]
+    return Scale(float(times), float(sigma), float(gain))
 
 
 def _grow(
-    local_m: Float64[Tensor, "n 3"],
-    times: float,
+    local_m: Float64[Tensor, "b n 3"],
+    times: Float64[Tensor, " b"],
     middle_m: Float64[Tensor, "3"],
     surface: Surface,
     nearest: Nearest,
-) -> tuple[float, Float64[Tensor, "n 3"], float]:
+) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"], Float64[Tensor, " b"]]:
     """Step by step to the scale and place that fit; give also the moved points and the spread."""
-    sigma, limit_m = 1.0, NEAR * surface.diameter_m
+    sigma, limit_m = torch.ones_like(times), NEAR * surface.diameter_m
     for step in range(_STEPS):
         near_m = limit_m * (1 + (_WIDE - 1) * max(0.0, 1 - 2 * step / _STEPS))
-        motion, covariance = _similar_step(local_m, times, (middle_m, near_m), surface, nearest)
-        times = min(max(times * (1 + float(motion[6].clamp(-0.1, 0.1))), 0.5), 2.0)
-        sigma = float(covariance[6, 6].clamp(min=0).sqrt())
-        turn = torch.linalg.matrix_exp(cross_matrix(motion[:3]))
-        local_m = (local_m - middle_m - motion[3:6]) @ turn + middle_m
-        if float(motion[[0, 1, 2, 6]].abs().max()) < _CONVERGED:
+        motion, variance = _similar_step(local_m, times, (middle_m, near_m), surface, nearest)
+        times = (times * (1 + motion[:, 6].clamp(-0.1, 0.1))).clamp(0.5, 2.0)
+        sigma = variance.clamp(min=0).sqrt()
+        turn = rotation_by(motion[:, :3])
+        local_m = (local_m - middle_m - motion[:, None, 3:6]) @ turn + middle_m
+        if float(motion[:, [0, 1, 2, 6]].abs().max()) < _CONVERGED:
             break
     return times, local_m, sigma
 
 
 def _similar_step(
-    local_m: Float64[Tensor, "n 3"],
-    times: float,
+    local_m: Float64[Tensor, "b n 3"],
+    times: Float64[Tensor, " b"],
     about: tuple[Float64[Tensor, "3"], float],
     surface: Surface,
     nearest: Nearest,
-) -> tuple[Float64[Tensor, "7"], Float64[Tensor, "7 7"]]:
-    """One step of turn, shift and growth about the middle, with a limit; and their covariance."""
+) -> tuple[Float64[Tensor, "b 7"], Float64[Tensor, " b"]]:
+    """One step of turn, shift and growth about the middle, with a limit; the growth's variance."""
     middle_m, limit_m = about
-    index = nearest((local_m - middle_m) / times + middle_m)
+    index = nearest((local_m - middle_m) / times[:, None, None] + middle_m)
     normal = surface.normals[index]
-    arm_m = times * (surface.points_m[index] - middle_m)
+    arm_m = times[:, None, None] * (surface.points_m[index] - middle_m)
     gap_m = local_m - middle_m - arm_m
     residual_m = (normal * gap_m).sum(-1)
     weight = (1 - gap_m.square().sum(-1) / limit_m**2).clamp(min=0).square()
-    J = torch.cat(
-        [torch.linalg.cross(arm_m, normal), normal, (normal * arm_m).sum(-1, keepdim=True)], -1
-    )
-    H = (J.mT * weight) @ J
-    H = H + 1e-9 * H.diagonal().max().clamp(min=1e-9) * torch.eye(7, dtype=torch.float64)
-    motion = torch.linalg.solve(H, (J.mT * weight) @ residual_m)
-    left_m = residual_m - J @ motion
-    variance = (weight * left_m.square()).sum() / (weight.sum() - 7).clamp(min=1)
-    return motion, _INDEPENDENT * variance * torch.linalg.inv(H)
+    growth_m = (normal * arm_m).sum(-1, keepdim=True)
+    J = torch.cat([torch.linalg.cross(arm_m, normal), normal, growth_m], -1)
+    weighted = J.mT * weight[:, None]
+    H = weighted @ J
+    size = H.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None].clamp(min=1e-9)
+    inverse = torch.linalg.inv(H + 1e-9 * size * torch.eye(7, dtype=torch.float64))
+    motion = (inverse @ (weighted @ residual_m[..., None])).squeeze(-1)
+    left_m = residual_m - (J @ motion[..., None]).squeeze(-1)
+    variance = (weight * left_m.square()).sum(-1) / (weight.sum(-1) - 7).clamp(min=1)
+    return motion, _INDEPENDENT * variance * inverse[:, 6, 6]
 
 
 def _distance(
-    local_m: Float64[Tensor, "n 3"],
-    times: float,
+    local_m: Float64[Tensor, "b n 3"],
+    times: Float64[Tensor, " b"],
     middle_m: Float64[Tensor, "3"],
     surface: Surface,
     nearest: Nearest,
-) -> float:
+) -> Float64[Tensor, " b"]:
     """Distance to the surface so many times as large."""
-    own_m = (local_m - middle_m) / times + middle_m
-    return float(distance_to(own_m, surface, nearest, times))
+    own_m = (local_m - middle_m) / times[:, None, None] + middle_m
+    return distance_to(own_m, surface, nearest, times)
 
 
 def distance_to(
-    local_m: Float64[Tensor, "*batch n 3"], surface: Surface, nearest: Nearest, times: float = 1.0
+    local_m: Float64[Tensor, "*batch n 3"],
+    surface: Surface,
+    nearest: Nearest,
+    times: Float64[Tensor, "*batch"] | None = None,
 ) -> Float64[Tensor, "*batch"]:
     """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
 
@@ -151,7 +154,9 @@ def distance_to(
         local_m: in the model frame, where the surface has its own size.
         surface: of the model.
         nearest: finds its points.
-        times: by which all lengths are measured.
+        times: by which all lengths are measured; None: 1.
     """
-    gap_m = times * (local_m - surface.points_m[nearest(local_m)]).norm(dim=-1)
+    gap_m = (local_m - surface.points_m[nearest(local_m)]).norm(dim=-1)
+    if times is not None:
+        gap_m = times[..., None] * gap_m
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
