@@ -113,6 +113,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--out", type=Path, default=Path("out/stereo_choices"))
+    parser.add_argument("--only", nargs="*", help="names of arms; none: all")
     parser.add_argument("--arm", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.arm is not None:
@@ -120,6 +121,8 @@ def main() -> None:
         return
     rows = []
     for number, arm in enumerate(ARMS):
+        if options.only and arm.name not in options.only:
+            continue
         done = options.out / f"{arm.name.replace(' ', '_')}-{arm.seed}" / "done.json"
         if not done.exists():
             subprocess.run([sys.executable, *sys.argv, "--arm", str(number)], check=True)

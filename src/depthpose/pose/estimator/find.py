@@ -252,25 +252,22 @@ def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Ten
 
 def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
     """Whether the camera saw enough of the surface, not through it, and no plane before it."""
-    pose = estimate.camera_from_model
+    pose, signals = estimate.camera_from_model, estimate.signals
     assert pose is not None
-    if estimate.signals["unseen"] > _HIDDEN:
+    if signals["unseen"] > _HIDDEN or signals["through"] > _SEEN_THROUGH:
         return False
     surface = known.surface_of(estimate.object)
     posed_m = Rigid(pose.R.double(), pose.t_m.double()).apply(surface.points_m)
     u, v = project(posed_m, scene.view.K.double()).round().long().unbind(-1)
     height, width = scene.view.depth_m.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (posed_m[:, 2] > 0)
-    u, v = u[inside], v[inside]
-    behind_m = scene.view.depth_m.double()[v, u] - posed_m[inside, 2]
-    behind_m = torch.where(scene.view.depth_m[v, u] > 0, behind_m, torch.nan)
-    read = behind_m.isfinite()
-    if not bool(read.any()):
+    seen_m = scene.view.depth_m.double()[v[inside], u[inside]]
+    is_read = seen_m.isfinite() & (seen_m > 0)
+    if not bool(is_read.any()):
         return False
-    limit_m = NEAR * surface.diameter_m
-    through = (behind_m > limit_m)[read].double().mean()
-    sunk = (scene.is_plane[v, u] & (behind_m < -limit_m))[read].double().mean()
-    return float(through) <= _SEEN_THROUGH and float(sunk) <= _SUNK
+    is_before = seen_m < posed_m[inside, 2] - NEAR * surface.diameter_m
+    is_sunk = is_before & scene.is_plane[v[inside], u[inside]]
+    return float(is_sunk[is_read].double().mean()) <= _SUNK
 
 
 def _without_overlap(answers: Sequence[_Answer], known: Known) -> list[_Answer]:
