@@ -11,6 +11,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.evidence import LATE, observability
 from depthpose.pose.estimator.mirror import mirror_gain
+from depthpose.pose.estimator.outline import overhang, shortfall
 from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.estimator.refusal import reason_of, risk_of
 from depthpose.pose.estimator.scale import Scale, scale_of
@@ -89,12 +90,19 @@ def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
 
 
 def _other_shape(posed: Posed, signals: dict[str, float], config: RefusalConfig) -> Refusal | None:
-    """Fit another size and the mirror image, and name what fits better than the object itself."""
+    """Fit another size and the mirror image, and name what fits better than the object itself.
+
+    How far cloud and silhouette reach beyond each other is measured for the risk.
+    """
     scale = scale_of(posed.cloud.cloud_m, posed.pose, posed.surface)
     is_alike = is_mirror_alike(posed.model)
     mirror = 0.0 if is_alike else mirror_gain(posed.cloud.cloud_m, posed.pose, posed.surface)
     signals["scale"], signals["size"] = scale.times, scale.doubt
     signals["grown"], signals["mirror"] = max(0.0, scale.gain), max(0.0, mirror)
+    seen = (posed.cloud.cloud_m, posed.pose, posed.surface)
+    signals["overhang"] = overhang(*seen)
+    if posed.cloud.view is not None:
+        signals["shortfall"] = shortfall(posed.cloud.view, *seen)
     reasons = [_other_size(scale, config), _mirrored(mirror)]
     if mirror > scale.gain:
         reasons.reverse()

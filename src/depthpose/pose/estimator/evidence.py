@@ -41,6 +41,9 @@ SIGNALS: dict[str, str] = {
     "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
     "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",
     "mirror": "the cloud fits the mirror image better (by {:.2g} limits of nearness)",
+    "overhang": "the points reach {:.1%} of the diameter beyond the posed silhouette",
+    "shortfall": "the posed silhouette reaches {:.1%} of the diameter beyond the points, where the "
+    "camera saw what lies behind",
     "rough": "the cloud has a curvature of {:.2g} in the median, where a ball has 1",
 }
 """Name of each signal, and what it says to people."""
@@ -49,7 +52,7 @@ CONTEXT = ("rough",)
 sensor the normals of a right pose differ from the cloud's as well. A refusal never names them."""
 _SMOOTH = 0.1
 """Below this roughness a sensor counts as without noise: what is smoother says nothing more."""
-LATE = ("size", "grown", "mirror")
+LATE = ("size", "grown", "mirror", "overhang", "shortfall")
 """Signals that are measured where nothing else refuses the pose; without ICP they are not."""
 
 
