@@ -34,8 +34,7 @@ def overhang(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> fl
         surface: of the model.
     """
     cloud, posed, _ = _across(cloud_m, pose, surface)
-    apart = KDTree(posed.numpy()).query(cloud.numpy(), workers=1)[0]
-    return float(torch.from_numpy(apart).quantile(_OVER))
+    return float(_distances(posed, cloud).quantile(_OVER))
 
 
 def shortfall(
@@ -59,12 +58,19 @@ def shortfall(
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     seen_m = view.depth_m.double()[v.clamp(0, height - 1), u.clamp(0, width - 1)]
     is_behind = inside & (seen_m > posed_m[:, 2] + NEAR * surface.diameter_m)
-    apart = torch.from_numpy(KDTree(cloud.numpy()).query(posed.numpy(), workers=1)[0])
+    apart = posed.new_zeros(len(posed))
+    apart[is_behind] = _distances(cloud, posed[is_behind])
     cell = (posed / _CELL).floor().long()
     _, number = (cell[:, 0] * _CELLS + cell[:, 1]).unique(return_inverse=True)
-    farthest = apart.new_zeros(int(number.max()) + 1)
-    farthest.scatter_reduce_(0, number, torch.where(is_behind, apart, 0.0), "amax")
+    farthest = apart.new_zeros(int(number.max()) + 1).scatter_reduce_(0, number, apart, "amax")
     return float(farthest.quantile(_SHORT))
+
+
+def _distances(
+    them: Float64[Tensor, "n 2"], points: Float64[Tensor, "m 2"]
+) -> Float64[Tensor, " m"]:
+    """Give the distance of points to the nearest of others."""
+    return torch.from_numpy(KDTree(them.numpy()).query(points.numpy(), workers=1)[0])
 
 
 def _across(
