@@ -39,6 +39,8 @@ _DEEP = 96
 """Channels of the decoder at 1/32, twice those at 1/16 and 1/8."""
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
+_LEAST_PX = 0.01
+"""Of a corrected disparity in use: depth stays finite, some tens of kilometres in the sky."""
 _REFINED = 32
 """Channels of the refinement at half size."""
 
@@ -274,7 +276,7 @@ class Refinement(nn.Module):
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(found_px), 2)[:, 0]
         corrected = found_px.detach() + correction_px
-        return corrected if self.training else corrected.clamp_min(0.0)
+        return corrected if self.training else corrected.clamp_min(_LEAST_PX)
 
 
 def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
