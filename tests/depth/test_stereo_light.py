@@ -22,15 +22,17 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
-from depthpose.depth.stereo.light import (
+from depthpose.depth.stereo.enlargement import (
     Described,
     Refinement,
     Seen,
     agreement_around,
     agreement_of_neighbours,
+    enlarge,
+)
+from depthpose.depth.stereo.light import (
     confidence_near,
     correlation_volume,
-    enlarge,
     mean_of_all,
     mean_of_best,
 )

@@ -19,7 +19,8 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
-from depthpose.depth.stereo.light import LightStereo, confidence_near, enlarge, mean_of_best
+from depthpose.depth.stereo.enlargement import enlarge
+from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator

@@ -5,8 +5,9 @@ import copy
 import torch
 
 from depthpose.depth.config import LightConfig, MatcherConfig
+from depthpose.depth.stereo.enlargement import enlarge
 from depthpose.depth.stereo.folding import fold_features, fold_volumes
-from depthpose.depth.stereo.light import LightStereo, confidence_near, enlarge, mean_of_best
+from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
 from depthpose.depth.stereo.network_matcher import NetworkMatcher, Views
 from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.types import Match
