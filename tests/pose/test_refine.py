@@ -150,6 +150,21 @@ def test_what_a_start_won_is_not_lost_on_the_way() -> None:
     assert float(add_m(found, truth, model.vertices_m)) < 0.01 * model.diameter_m
 
 
+def test_exact_steps_end_no_worse_than_rough_ones() -> None:
+    """From here exact steps end beside the bottle's pose with its points near, rough ones at it."""
+    body, cap = trimesh.creation.capsule(0.1, 0.03), trimesh.creation.cylinder(0.012, 0.05)
+    body.apply_scale([1.5, 1, 1])
+    cap.apply_translation([0.01, 0, 0.15])
+    mesh = trimesh.util.concatenate([body, cap])
+    model = make_model(torch.tensor(mesh.vertices), torch.tensor(mesh.faces), name="bottle")
+    truth = pose_at(seed=0)
+    start = pose_near(
+        Rigid(truth.R.double(), truth.t_m.double()), 155, math.radians(50), 0.12 * model.diameter_m
+    )
+    found = refine_best(cloud_of(model, truth), start, prepare_surface(model)).refined
+    assert float(add_m(found.camera_from_model, truth, model.vertices_m)) < 1e-3 * model.diameter_m
+
+
 def test_one_step_is_checked_by_the_last_limit(stone: ObjectModel, surface: Surface) -> None:
     cloud = seen_half(stone, TRUE)
     noise = torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0)).double()

@@ -27,16 +27,14 @@ _OCCLUDING_POINTS = 1000
 """Points of the cloud that show what a pose would occlude."""
 _UNSEEN = 0.3
 """What a surface that should be seen and is not counts against a pose: something may occlude it."""
-_LOST = 0.1
-"""A given pose that leaves by so many points less near than its own start did was lost on the way:
-it began farther off than exact steps reach."""
 _OTHER = 0.1
 """Mean distance between the points of two poses, in diameters, from which they are two."""
 _MOST_OTHERS = 3
 """Poses beside the best at which starts ended, that are kept."""
 _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
-to be believed: a plane fits many places, and noise would choose among them."""
+to be believed: a plane fits many places, and noise would choose among them. Where a start ended
+roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
 
 
 Nearest = Callable[[Float64[Tensor, "*batch n 3"]], Int64[Tensor, "*batch n"]]
@@ -144,13 +142,16 @@ def refine_best(
     starts = _starts(_doubled(given), surface, config.starts)
     tried = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
-    near, worth = _worth(points_m, tried, surface, end_m)
+    worth = _worth(points_m, tried, surface, end_m)
     best = int(worth.argmax())
     short = replace(config, iterations=(config.iterations + 1) // 2)
     refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
         refined = refine_pose(points_m, Rigid(given.R[best], given.t_m[best]), surface, short)
-    if refined is None or float(refined.inlier_share) < float(near[best]) - _LOST:
+        both = _both(_doubled(refined.camera_from_model), _one(tried, best))
+        if float(_worth(points_m, both, surface, end_m).diff()) > 0:
+            refined = None  # it began farther off than exact steps reach
+    if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, Rigid(tried.R[best], tried.t_m[best]), surface, short)
     away = _distances(tried, _doubled(refined.camera_from_model), surface) > _OTHER
@@ -213,8 +214,11 @@ def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
 
 def _worth(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
-) -> tuple[Float64[Tensor, " b"], Float64[Tensor, " b"]]:
-    """Give the share of points near each posed surface, and what speaks for the pose in all."""
+) -> Float64[Tensor, " b"]:
+    """Say what speaks for each pose: the share of points near the surface, less what contradicts.
+
+    The first pose is trusted by ``_TRUST`` more.
+    """
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
     few = take_evenly(cloud, _ROUGH_POINTS)
     _, _, residual_m, weight = _normal_equations(
@@ -225,7 +229,7 @@ def _worth(
     # Of equals, the nearer one.
     worth = near - _spread_m(residual_m, weight) / surface.diameter_m - front - _UNSEEN * unseen
     worth[0] += _TRUST
-    return near, worth
+    return worth
 
 
 def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
@@ -255,6 +259,10 @@ def _pick(poses: Rigid, numbers: list[int]) -> Rigid:
 
 def _one(poses: Rigid, number: int) -> Rigid:
     return Rigid(poses.R[number], poses.t_m[number])
+
+
+def _both(first: Rigid, second: Rigid) -> Rigid:
+    return Rigid(torch.stack([first.R, second.R]), torch.stack([first.t_m, second.t_m]))
 
 
 def _doubled(pose: Rigid) -> Rigid:
