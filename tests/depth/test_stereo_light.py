@@ -241,6 +241,19 @@ def test_batches_say_what_single_pairs_say() -> None:
         assert float((difference > 1e-2).float().mean()) < 0.01
 
 
+def test_some_rows_at_a_time_give_the_same_numbers() -> None:
+    network = random_network()
+    pair = torch.randn(2, 2, 3, 96, 64, generator=torch.Generator().manual_seed(0)).unbind()
+    with torch.no_grad():
+        scores, _ = network.scores(*pair, 32)
+        found = network(*pair)[-1]
+        for rows in (2, 6, 16, 24, 100):
+            network.rows = rows
+            torch.testing.assert_close(network.scores(*pair, 32)[0], scores, atol=1e-4, rtol=1e-4)
+            difference = (network(*pair)[-1] - found).abs()  # equal scores may change places
+            assert float((difference > 1e-2).float().mean()) < 0.01
+
+
 def test_a_bound_on_memory_is_met_or_refused() -> None:
     left, right = shifted_pair(64, 96, 5)
     network = random_network()

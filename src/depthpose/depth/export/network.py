@@ -19,7 +19,6 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
-from depthpose.depth.stereo.enlargement import enlarge
 from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
@@ -77,9 +76,9 @@ class SizelessLight(nn.Module):
         config = self.network.config
         scores, seen = self.network.scores(left, right, config.max_disparity_px)
         quarter_px = mean_of_best(scores, config.candidates)
-        weights = self.network.enlargement(seen, quarter_px)
-        found_px = self.network.refine(enlarge(quarter_px, weights), seen)
-        return found_px, enlarge(confidence_near(scores, quarter_px), weights)
+        quarters = torch.stack([quarter_px, confidence_near(scores, quarter_px)], 1)
+        found_px, sure = self.network.enlarge(quarters, seen).unbind(1)
+        return self.network.refine(found_px, seen), sure
 
 
 def sizeless(matcher: nn.Module) -> nn.Module:

@@ -10,6 +10,7 @@
   correct it (Khamis et al., StereoNet, ECCV 2018; Tankovich et al., HITNet, CVPR 2021).
 """
 
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -34,7 +35,12 @@ from depthpose.depth.stereo.enlargement import (
 )
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
-from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
+from depthpose.depth.stereo.volume import (
+    WINDOW_PX,
+    by_rows,
+    interpolation_matrix,
+    linear_taps,
+)
 
 Volume = Float[Tensor, "b _ _ _ _"]
 Scores = Float[Tensor, "b d h4 w4"]
@@ -120,24 +126,42 @@ class Aggregation(nn.Module):
         self.score = nn.Conv3d(v[0], 1, 3, 1, 1, bias=False)
 
     def forward(
-        self, left: Features, right: Features, bins: int, levels: tuple[Features, ...]
+        self,
+        left: Features,
+        right: Features,
+        bins: int,
+        levels: tuple[Features, ...],
+        rows: int | None = None,
     ) -> Scores:
-        """Score each disparity by the descriptions of both views; more is likelier."""
+        """Score each disparity by the descriptions of both views; more is likelier.
+
+        With ``rows``, and no gradient, one volume of the largest size is held, instead of four.
+        """
         guides = [
             torch.sigmoid(guide(level))[:, :, None]
             for guide, level in zip(self.guides, levels, strict=True)
         ]
-        volume = correlation_volume(left, right, bins, self.config.groups)
-        volume = self.first(volume.contiguous(memory_format=torch.channels_last_3d)).relu_()
-        scales = [_product(volume, guides[0])]
-        del volume
+
+        def begin(left: Features, right: Features, guide: Volume) -> Volume:
+            volume = correlation_volume(left, right, bins, self.config.groups)
+            volume = volume.contiguous(memory_format=torch.channels_last_3d)
+            return _product(self.first(volume).relu_(), guide)
+
+        def raised(up: nn.Module, volume: Volume, larger: Volume) -> Volume:
+            return up(volume).add_(larger).relu_()
+
+        def end(volume: Volume) -> Volume:
+            return self.score(self.joined[0](volume).relu_())
+
+        scales = [by_rows(begin, (left, right, guides[0]), halo=1, rows=rows)]
         for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
             scales.append(_product(same(down(scales[-1]).relu_()).relu_(), guide))
         x = scales.pop()
-        for up, joined in zip(reversed(self.up), reversed(self.joined), strict=True):
-            x = up(x).add_(scales.pop()).relu_()
-            x = joined(x).relu_()
-        return self.score(x)[:, 0]
+        for up, joined in zip(self.up[:0:-1], self.joined[:0:-1], strict=True):
+            x = joined(raised(up, x, scales.pop())).relu_()
+        largest, half = scales.pop(), None if rows is None else rows // 2
+        x = by_rows(partial(raised, self.up[0]), (x, largest), halo=1, rows=half, into=largest)
+        return by_rows(end, (x,), halo=2, rows=rows)[:, 0]
 
 
 def _product(volume: Volume, guide: Volume) -> Volume:
@@ -175,7 +199,13 @@ class LightStereo(nn.Module):
     """Rectified pair to disparity at a fraction of PSMNet's operations.
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 32.
+
+    Attributes:
+        rows: at 1/4 size, an even number, that are computed at a time where something large would
+            be held, with no gradient; None, as in training and in exported graphs: all.
     """
+
+    rows: int | None = None
 
     def __init__(self, config: LightConfig | None = None) -> None:
         super().__init__()
@@ -201,18 +231,38 @@ class LightStereo(nn.Module):
         """
         scores, seen = self.scores(left, right, self.config.max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
-        found_px = enlarge(quarter_px, self.enlargement(seen, quarter_px))
+        found_px = self.enlarge(quarter_px[:, None], seen)[:, 0]
         heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
         if not self.training:
             return heads[-1:]
         coarse_px = mean_of_all(scores)[:, None]
         return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], *heads
 
+    def enlarge(self, quarters: Float[Tensor, "b k h4 w4"], seen: Seen) -> Float[Tensor, "b k h w"]:
+        """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
+
+        def enlarged(
+            quarters: Tensor, left_half: Features, left_quarter: Features, right_half: Features
+        ) -> Tensor:
+            near = Seen(Described(left_half, (left_quarter,)), right_half)
+            weights = self.enlargement(near, quarters[:, 0])
+            return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
+
+        parts = (quarters, seen.left.half, seen.left.levels[0], seen.right_half)
+        return by_rows(enlarged, parts, halo=2, rows=self.rows)
+
     def refine(self, found_px: Maps, seen: Seen) -> Maps:
         """Correct an enlarged disparity, where the network has that part."""
-        if self.refinement is None:
+        refinement = self.refinement
+        if refinement is None:
             return found_px
-        return self.refinement(seen, found_px)
+
+        def refined(found_px: Maps, left_half: Features, right_half: Features) -> Maps:
+            return refinement(Seen(Described(left_half, ()), right_half), found_px)
+
+        half = None if self.rows is None else 2 * self.rows
+        parts = (found_px, seen.left.half, seen.right_half)
+        return by_rows(refined, parts, halo=5, rows=half)
 
     def scores(
         self,
@@ -230,7 +280,8 @@ class LightStereo(nn.Module):
         compares = self.config.with_agreement or self.config.with_refinement
         right_half = far.half if compares else None
         del far
-        scores = self.aggregation(*described, max_disparity_px // _STEP_PX, near.levels)
+        bins = max_disparity_px // _STEP_PX
+        scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), Seen(near, right_half)
 

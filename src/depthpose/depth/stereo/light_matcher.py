@@ -5,16 +5,11 @@ import copy
 import torch
 
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.stereo.enlargement import enlarge
 from depthpose.depth.stereo.folding import fold_features, fold_volumes
 from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
 from depthpose.depth.stereo.network_matcher import NetworkMatcher, Views
 from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.types import Match
-
-_ROWS = 16
-"""Rows at quarter size whose confidence is computed at a time: probabilities between the scores are
-the largest of all volumes."""
 
 
 class LightMatcher(NetworkMatcher):
@@ -37,6 +32,7 @@ class LightMatcher(NetworkMatcher):
         like = torch.empty(0, dtype=self.dtype, device=self.device)
         folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
         self._network = fold_features(folded, like)
+        self._network.rows = LightFootprint.rows
         if self.config.with_compile:
             self._network.features.compile()
 
@@ -52,11 +48,15 @@ class LightMatcher(NetworkMatcher):
         scores, seen = self._network.scores(
             left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
         )
-        quarter_px = mean_of_best(scores, network.candidates)
-        weights = self._network.enlargement(seen, quarter_px).to(scores.dtype)
-        found_px = self._network.refine(enlarge(quarter_px, weights), seen)
-        if not self.config.with_confidence:
+        quarters = [mean_of_best(scores, network.candidates)]
+        if self.config.with_confidence:
+            count = footprint.rows
+            rows = zip(scores.split(count, 2), quarters[0].split(count, 1), strict=True)
+            quarters.append(torch.cat([confidence_near(*some) for some in rows], 1))
+        del scores
+        found_px, *sure = self._network.enlarge(torch.stack(quarters, 1), seen).unbind(1)
+        found_px = self._network.refine(found_px, seen)
+        if not sure:
             return [Match(disparity_px=one) for one in found_px]
-        rows = zip(scores.split(_ROWS, 2), quarter_px.split(_ROWS, 1), strict=True)
-        sure = enlarge(torch.cat([confidence_near(*some) for some in rows], 1), weights)
-        return [Match(disparity_px=d, confidence=c) for d, c in zip(found_px, sure, strict=True)]
+        parts = zip(found_px, sure[0], strict=True)
+        return [Match(disparity_px=d, confidence=c) for d, c in parts]

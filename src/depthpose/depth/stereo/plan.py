@@ -128,32 +128,38 @@ class Footprint:
 class LightFootprint:
     """The light network at a size of images, as far as memory is concerned.
 
-    It computes whole volumes: a bound can be met or refused, not traded for time.
+    One volume of the largest size is held whole: a bound can be met or refused, not traded for
+    time.
 
     Attributes:
         config: the network.
         height: rows of the padded image [px].
         width: columns of the padded image [px].
         dtype: what the network computes in.
+        rows: at quarter size, computed at a time.
     """
 
     config: LightConfig
     height: int
     width: int
     dtype: torch.dtype
+    rows: int = 16
 
     def estimate_bytes(self) -> int:
         """Peak memory of activations of one pair [bytes], with margin for the allocator."""
         pixels = self.height * self.width // 16
+        slab_pixels = min((self.rows + 4) * self.width // 4, pixels)
         halves = 2 if self.config.with_agreement or self.config.with_refinement else 1
         kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
-        stages = (self._volume_bytes(pixels), self._weights_bytes(pixels))
-        return int(MARGIN * (kept + max(stages))) + OVERHEAD_BYTES
+        images = 6 * 3 * 4 * self.height * self.width
+        stages = (self._volume_bytes(pixels, slab_pixels), self._weights_bytes(slab_pixels))
+        return int(MARGIN * (images + kept + max(stages))) + OVERHEAD_BYTES // 2
 
-    def _volume_bytes(self, pixels: int) -> int:
-        """Two volumes at quarter size, going in and out of a layer, and the smaller ones kept."""
+    def _volume_bytes(self, pixels: int, slab_pixels: int) -> int:
+        """A volume at quarter size, the smaller ones, and three of the rows at a time."""
         widest = max(self.config.groups, self.config.volume_widths[0])
-        return 5 * widest * self.config.max_disparity_px // 8 * pixels * self.dtype.itemsize
+        voxel_bytes = widest * (self.config.max_disparity_px // 4) * self.dtype.itemsize
+        return voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
 
     def _weights_bytes(self, pixels: int) -> int:
         """Weights that enlarge maps, thrice, and what they are made of at half size.

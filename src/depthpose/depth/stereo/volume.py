@@ -5,7 +5,7 @@ The concatenation volume holds ``left[y, x]`` and ``right[y, x - d]``: a convolu
 the edge ``x = d`` where the volume turns to zero, and the last column, need more care.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -177,6 +177,60 @@ def spans(height: int, step: int) -> Iterator[tuple[int, int]]:
     """Cut ``height`` rows into pieces of ``step``."""
     for first in range(0, height, step):
         yield first, min(first + step, height)
+
+
+def by_rows(
+    function: Callable[..., Tensor],
+    inputs: Sequence[Tensor | None],
+    *,
+    halo: int,
+    rows: int | None,
+    into: Tensor | None = None,
+) -> Tensor:
+    """Compute some rows of an answer at a time: the same numbers, with less held in between.
+
+    Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
+    input, in which everything here is counted.
+
+    Args:
+        function: of the inputs; its answer depends on nearby rows alone.
+        inputs: tensors; None stays None.
+        halo: so many rows to each side an answer depends on.
+        rows: at a time; None: all.
+        into: where the answer is written, perhaps over an input of which no answer needs another
+            row than its own; None: a new tensor.
+    """
+    if rows is None:
+        return function(*inputs)
+    given = [x.shape[-2] for x in inputs if x is not None]
+    height, whole = min(given), into
+    for first, stop in spans(height, rows):
+        before, after = max(first - halo, 0), min(stop + halo, height)
+        some = function(*(_rows_of(x, height, before, after) for x in inputs))
+        times = some.shape[-2] // (after - before)
+        if whole is None:
+            whole = _empty_like(some, times * height)
+        own = some[..., times * (first - before) : times * (stop - before), :]
+        whole[..., times * first : times * stop, :] = own
+    assert whole is not None, "there are rows"
+    return whole
+
+
+def _rows_of(x: Tensor | None, height: int, first: int, stop: int) -> Tensor | None:
+    if x is None:
+        return None
+    times = x.shape[-2] // height
+    return x[..., times * first : times * stop, :]
+
+
+def _empty_like(some: Tensor, height: int) -> Tensor:
+    """Make room for all rows, in the order of memory that convolutions of volumes like."""
+    return torch.empty(
+        (*some.shape[:-2], height, some.shape[-1]),
+        dtype=some.dtype,
+        device=some.device,
+        memory_format=torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format,
+    )
 
 
 WINDOW_PX = 2.0
