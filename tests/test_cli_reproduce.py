@@ -256,15 +256,18 @@ def test_near_duplicates_are_listed(
 ) -> None:
     write_image(tmp_path / "other/left/x.png", torch.rand(3, 188, 621))
     assert main(["data", "duplicates", str(street), str(tmp_path / "other")]) == 0
-    assert "4 x 1 images: 0 pairs of likeness 0.3 or more; the likest:" in capsys.readouterr().out
+    assert (
+        "4 x 1 images: 0 pairs of similarity 0.3 or more; the most similar:"
+        in capsys.readouterr().out
+    )
     words = ["data", "duplicates", str(street), str(street), "--out", str(tmp_path / "o")]
     assert main(words) == 1
     assert len(json.loads((tmp_path / "o/duplicates.json").read_text())) == 16
     unlike = ["data", "duplicates", str(street), str(tmp_path / "other"), "--at-least", "-1"]
     assert main(unlike) == 1
-    assert "4 pairs of likeness -1 or more" in capsys.readouterr().out
+    assert "4 pairs of similarity -1 or more" in capsys.readouterr().out
     assert main([*words, "--at-least", "2"]) == 2
-    assert "a likeness is -1 .. 1" in capsys.readouterr().err
+    assert "a similarity is -1 .. 1" in capsys.readouterr().err
 
 
 def test_two_processes_share_the_frames_and_the_first_measures(

@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from depthpose.core.files import write_image
-from depthpose.depth.datasets import Dataset, find_duplicates, likeness_matrix, open_dataset
+from depthpose.depth.datasets import Dataset, find_duplicates, open_dataset, similarity_matrix
 
 H, W = 120, 400
 
@@ -30,22 +30,22 @@ def test_the_same_view_is_found_again(tmp_path: Path) -> None:
     first = write_set(tmp_path / "one", ours | {"other": street(2)})
     found = find_duplicates(first, write_set(tmp_path / "two", {"eval": base, "far": street(3)}))
     assert found[0].first == "same"
-    assert found[0].likeness == pytest.approx(1, abs=1e-4)
+    assert found[0].similarity == pytest.approx(1, abs=1e-4)
     assert {(pair.first, pair.second) for pair in found} == {(name, "eval") for name in ours}
 
 
-def test_the_likest_pair_is_named_though_it_is_no_duplicate(tmp_path: Path) -> None:
+def test_the_most_similar_pair_is_named_though_it_is_no_duplicate(tmp_path: Path) -> None:
     first = write_set(tmp_path / "one", {"a": street(4), "b": street(5)})
     second = write_set(tmp_path / "two", {"c": street(6)})
     found = find_duplicates(first, second)
     assert len(found) == 1
-    assert found[0].likeness == float(likeness_matrix(first, second).max()) < 0.3
+    assert found[0].similarity == float(similarity_matrix(first, second).max()) < 0.3
 
 
-def test_likeness_does_not_depend_on_the_order(tmp_path: Path) -> None:
+def test_similarity_does_not_depend_on_the_order(tmp_path: Path) -> None:
     first = write_set(tmp_path / "one", {"a": street(4), "b": street(1).roll(8, 2)})
     second = write_set(tmp_path / "two", {"c": street(1), "d": street(5)})
-    there, back = likeness_matrix(first, second), likeness_matrix(second, first)
+    there, back = similarity_matrix(first, second), similarity_matrix(second, first)
     assert there.shape == (2, 2)
     assert torch.allclose(there, back.T, atol=0.1)  # the window moves over the other image
     assert int(there.argmax()) == int(back.T.contiguous().argmax())
@@ -53,7 +53,7 @@ def test_likeness_does_not_depend_on_the_order(tmp_path: Path) -> None:
 
 def test_a_flat_picture_is_like_nothing(tmp_path: Path) -> None:
     first = write_set(tmp_path / "one", {"a": torch.full((3, H, W), 0.5)})
-    assert float(likeness_matrix(first, first)) < 0.3
+    assert float(similarity_matrix(first, first)) < 0.3
 
 
 @pytest.mark.data

@@ -173,7 +173,7 @@ def test_few_negatives_are_answered_on_other_data() -> None:
 
 
 def test_what_cannot_be_calibrated_is_an_error() -> None:
-    with pytest.raises(InputError, match="2 estimates, 1 verdicts and a share"):
+    with pytest.raises(InputError, match="2 estimates, 1 verdicts; give as many"):
         calibrate_refusal([answer()] * 2, [True])
     with pytest.raises(InputError, match=r"max_negative_share is 0.0, but a share is between"):
         calibrate_refusal([answer()], [True], 0.01, [answer()], 0.0)

@@ -119,6 +119,7 @@ COMMANDS = {
 }
 _GONE = {
     ("export", "--format"): "ONNX is the one format; leave --format away",
+    ("reproduce", "--made"): "synthetic views are asked for by --synthetic",
 }
 """Options of before, by the first word of their command, and what to do instead."""
 _THESIS = ("reproduce", "figure")

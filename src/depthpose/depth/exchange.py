@@ -21,7 +21,8 @@ from depthpose.core.files import (
     write_json,
     write_map,
 )
-from depthpose.core.files.disk import AnyPath, read_bytes, write_bytes
+from depthpose.core.files.disk import AnyPath, write_bytes
+from depthpose.core.files.shards import read_bytes
 from depthpose.core.run import read_sources
 
 Kind = Literal["png", "npy"]

@@ -15,6 +15,7 @@ from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
+    from depthpose.depth.datasets import Duplicate
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import LabelConfig
 
@@ -145,7 +146,7 @@ def pack(
 def duplicates(
     train: tyro.conf.Positional[Path],
     evaluation: tyro.conf.Positional[Path],
-    at_least: float | None = None,
+    at_least: float = 0.3,
     out: Path | None = None,
 ) -> int:
     """List images of one set that show nearly the same as images of another.
@@ -160,36 +161,36 @@ def duplicates(
     Args:
         train: folder of the first set, in any layout that 'data check' knows.
         evaluation: folder of the second set.
-        at_least: least similarity of a listed pair; 0.3 by default.
+        at_least: least similarity of a listed pair.
         out: folder to write the list to as well: duplicates.json, .csv and .md.
     """
     from tqdm import tqdm
 
-    from depthpose.depth.datasets import DUPLICATE_LIKENESS, find_duplicates, open_dataset
+    from depthpose.depth.datasets import find_duplicates, open_dataset
 
-    threshold = DUPLICATE_LIKENESS if at_least is None else at_least
-    if not -1 <= threshold <= 1:
-        raise InputError(f"--at-least {threshold:g}: a likeness is -1 .. 1; take 0.3")
-    first, second = open_dataset(train), open_dataset(evaluation)
-    show = partial(tqdm, unit=" frames", disable=None)
-    ranked = find_duplicates(first, second, threshold, show)
-    rows = [asdict(pair) for pair in ranked if pair.likeness >= threshold]
-    _list_duplicates(rows, out)
-    likest = f"the likest: {ranked[0].first} and {ranked[0].second}, {ranked[0].likeness:.3f}"
-    what = f"{len(first)} x {len(second)} images"
-    print(f"{what}: {len(rows)} pairs of likeness {threshold:g} or more; {likest}")
-    return 1 if rows else 0
+    if not -1 <= at_least <= 1:
+        raise InputError(f"--at-least {at_least:g}: a similarity is -1 .. 1; take 0.3")
+    sets = open_dataset(train), open_dataset(evaluation)
+    ranked = find_duplicates(*sets, at_least, partial(tqdm, unit=" frames", disable=None))
+    count = _list_duplicates([pair for pair in ranked if pair.similarity >= at_least], out)
+    best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
+    what = f"{len(sets[0])} x {len(sets[1])} images: {count} pairs of similarity {at_least:g} or"
+    print(f"{what} more; the most similar: {best}")
+    return 1 if count else 0
 
 
-def _list_duplicates(rows: list[dict[str, Any]], out: Path | None) -> None:
+def _list_duplicates(pairs: "list[Duplicate]", out: Path | None) -> int:
+    """Print pairs, and write them; give their number."""
     from depthpose.core.run import claim_folder
     from depthpose.report.tables import markdown_table, table_files, write_table
 
+    rows = [asdict(pair) for pair in pairs]
     if rows:
         print(markdown_table(rows))
     if out is not None:
         claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
         write_table(out, rows, name="duplicates")
+    return len(rows)
 
 
 def label(

@@ -101,16 +101,20 @@ def predict(
     with inputs.first() as first:
         if camera is not None:
             known = read_camera(camera, image_size(first[0]))
-    facts = {} if known is None else {"K": known.K.tolist()}
-    settings = {
+    work = replace(work, object=name, camera=known)
+    return say(run(work, inputs, out, _settings(work, method), options), out, "inputs")
+
+
+def _settings(work: PoseWork, method: PoseMethod) -> dict[str, Any]:
+    """What a folder of results remembers of the run."""
+    facts = {} if work.camera is None else {"K": work.camera.K.tolist()}
+    return {
         **method.settings,
         "estimate": config_to_dict(work.source.config),
-        "object": name,
+        "object": work.object,
         "unit": work.unit,
         **facts,
     }
-    work = replace(work, object=name, camera=known)
-    return say(run(work, inputs, out, settings, options), out, "inputs")
 
 
 def _refuse_other_masks(words: Sequence[str], inputs: Inputs) -> None:

@@ -42,17 +42,20 @@ def find_all(
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
     if find_shard().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    depths = list_images(depth)
-    refuse_among_inputs(out, [depth], depths)
-    settings: dict[str, Any] = {**method.settings, "find": sorted(objects)}
-    settings |= {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
+    refuse_among_inputs(out, [depth], depths := list_images(depth))
+    facts = {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
+    settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, [], depth)
     found: list[tuple[Prediction, Job[Any]]] = []
     for path in tqdm(depths, disable=None, unit=" images"):
-        view = view_input(path, None, camera, objects[0], path.stem, unit)
-        found += _find(method, view, objects)
-    predictions, jobs = [prediction for prediction, _ in found], [job for _, job in found]
-    claim(out, settings, jobs, depth)
+        found += _find(method, view_input(path, None, camera, objects[0], path.stem, unit), objects)
+    claim(out, settings, [job for _, job in found], depth)
+    return _write(found, method, out)
+
+
+def _write(found: list[tuple[Prediction, Job[Any]]], method: PoseMethod, out: Path) -> int:
+    """Write what was found, files and a page of what was answered; give the exit code."""
+    predictions = [prediction for prediction, _ in found]
     write_predictions(out, predictions)
     answered = [pair for pair in found if pair[0].estimate.is_ok]
     answers, own = [prediction for prediction, _ in answered], [job for _, job in answered]

@@ -181,6 +181,19 @@ def source_of(
     Raises:
         InputError: options that do not go together, no unit, or a CAD file that cannot be read.
     """
+    _refuse_contradictions(register, unit, bop)
+    if register.method == "network":
+        return MethodSource(config=config, weights=weights)
+    if bop is not None:
+        return MethodSource(config=config, models=tuple(open_bop(*bop).objects.values()))
+    unit = register.cad_unit or unit
+    models = Registration.load(*register.cad, unit=unit).models if register.cad and unit else ()
+    return MethodSource(config=config, models=tuple(models))
+
+
+def _refuse_contradictions(
+    register: RegisterOptions, unit: Unit | None, bop: tuple[Path, str] | None
+) -> None:
     if register.method == "network" and register.cad:
         raise InputError(
             "--cad: weights know their own objects; add --method register, or train weights of "
@@ -188,20 +201,13 @@ def source_of(
         )
     if register.cad_unit and not register.cad:
         raise InputError("--cad-unit is the unit of --cad, and no CAD file is given; leave it out")
-    if register.method == "network":
-        return MethodSource(config=config, weights=weights)
     if register.cad and bop is not None:
         raise InputError("--cad: the models of --bop are taken; leave --cad out")
-    if bop is not None:
-        return MethodSource(config=config, models=tuple(open_bop(*bop).objects.values()))
-    unit = register.cad_unit or unit
-    if register.cad and unit is None:
+    if register.cad and not (register.cad_unit or unit):
         raise InputError(
             "--cad without a unit: no file says its unit; give --unit mm, of CAD and clouds, or "
             "--cad-unit mm"
         )
-    models = Registration.load(*register.cad, unit=unit).models if register.cad and unit else ()
-    return MethodSource(config=config, models=tuple(models))
 
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:

@@ -46,6 +46,11 @@ class SequenceOptions:
         if find_shard().world > 1:
             raise InputError("a sequence is followed by one process; start one")
 
+    @property
+    def dataset(self) -> tuple[Path, str] | None:
+        """Folder and split of a data set whose scenes are followed."""
+        return None if self.bop is None else (self.bop, self.split)
+
 
 def track(
     out: Path,
@@ -73,12 +78,11 @@ def track(
     from depthpose.cli.pose.tracking import track_bop, track_folder
 
     frames.refuse_unusable()
-    bop = None if frames.bop is None else (frames.bop, frames.split)
     config = EstimateConfig(device=frames.device)
-    method = source_of(weights, register, frames.unit, bop, config).build()
+    method = source_of(weights, register, frames.unit, frames.dataset, config).build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
-    if frames.bop is not None:
-        return track_bop(method, (frames.bop, frames.split, frames.object), out)
+    if frames.dataset is not None:
+        return track_bop(method, (*frames.dataset, frames.object), out)
     files = (frames.depth, frames.camera, frames.cloud)
     return track_folder(method, files, frames.object, frames.unit, out)

@@ -11,7 +11,6 @@ from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
 from depthpose.core.files.disk import AnyPath as AnyPath
 from depthpose.core.files.disk import atomic_write as atomic_write
-from depthpose.core.files.disk import read_bytes as read_bytes
 from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
 from depthpose.core.files.images import encode_image as encode_image
@@ -26,6 +25,7 @@ from depthpose.core.files.maps import read_map as read_map
 from depthpose.core.files.maps import write_depth_png as write_depth_png
 from depthpose.core.files.maps import write_disparity_png as write_disparity_png
 from depthpose.core.files.maps import write_map as write_map
+from depthpose.core.files.shards import read_bytes as read_bytes
 from depthpose.core.files.text import read_json as read_json
 from depthpose.core.files.text import read_key_values as read_key_values
 from depthpose.core.files.text import read_text as read_text

@@ -10,7 +10,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.shards import read_member, split_member
 
 AnyPath = str | os.PathLike[str]
 """A path as users give it."""
@@ -19,8 +18,8 @@ MAX_FILE_BYTES = 2**28
 """Nothing that is read whole is larger; a bigger file is a mistake or an attack."""
 
 
-def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole, or one in a tar shard (``core.files.shards``).
+def read_file(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file whole.
 
     Args:
         path: the file.
@@ -29,13 +28,16 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
     Raises:
         InputError: there is no such file, or it is a folder, a device, too large or unreadable.
     """
-    try:
-        member = split_member(Path(path))
-        if member is not None:
-            return read_member(*member, most)
-        status = Path(path).stat()
-        _refuse_irregular(path, status, most)
+    with refused_read(path):
+        _refuse_irregular(path, Path(path).stat(), most)
         return Path(path).read_bytes()
+
+
+@contextmanager
+def refused_read(path: AnyPath) -> Iterator[None]:
+    """Turn what a disk refuses to give into an :class:`InputError`."""
+    try:
+        yield
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
     except (OSError, MemoryError) as error:

@@ -14,11 +14,11 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import (
     AnyPath,
-    read_bytes,
     refused_as,
     refused_suffix,
     write_bytes,
 )
+from depthpose.core.files.shards import read_bytes
 
 LISTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 FAST_PNG = {"compress_level": 1}

@@ -14,12 +14,12 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import (
     AnyPath,
-    read_bytes,
     refused_as,
     refused_suffix,
     write_bytes,
 )
 from depthpose.core.files.images import FAST_PNG, opened_image
+from depthpose.core.files.shards import read_bytes
 
 _SUFFIXES = (".npy", ".pfm")
 _HEADER_READERS = {

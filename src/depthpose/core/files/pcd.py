@@ -5,8 +5,9 @@ import re
 import numpy as np
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, read_bytes
+from depthpose.core.files.disk import AnyPath
 from depthpose.core.files.points import Columns, Field, need_bytes, split_records, split_rows
+from depthpose.core.files.shards import read_bytes
 
 _CODES = {
     **{("F", "4"): "f4", ("F", "8"): "f8"},

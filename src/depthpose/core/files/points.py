@@ -12,7 +12,8 @@ from itertools import accumulate, islice
 import numpy as np
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, read_bytes, refused_as
+from depthpose.core.files.disk import AnyPath, refused_as
+from depthpose.core.files.shards import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 Columns = dict[str, np.ndarray]

@@ -6,10 +6,28 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
+from depthpose.core.files.disk import MAX_FILE_BYTES, AnyPath, read_file, refused_read
 
 SOURCE = "source.json"
 """Beside shards that are fetched when they are first read: ``{"url": ...}``, where from."""
 _SUFFIX = ".tar"
+
+
+def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file whole, or one in a shard.
+
+    Args:
+        path: the file.
+        most: bytes beyond which it is refused unread: files of its kind are smaller.
+
+    Raises:
+        InputError: there is no such file, or it is a folder, a device, too large or unreadable.
+    """
+    with refused_read(path):
+        member = split_member(Path(path))
+        if member is not None:
+            return read_member(*member, most)
+    return read_file(path, most)
 
 
 def split_member(path: Path) -> tuple[Path, str] | None:

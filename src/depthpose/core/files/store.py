@@ -10,7 +10,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, read_bytes
+from depthpose.core.files.disk import atomic_write, read_file
 
 _DISK = "file"
 _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
@@ -31,7 +31,7 @@ def local_path(url: str) -> Path | None:
 
 
 def join(folder: str, *names: str) -> str:
-    """List a folder."""
+    """Join names to a folder or its URL."""
     return "/".join([folder.rstrip("/"), *names])
 
 
@@ -49,7 +49,7 @@ def read_from(url: str) -> bytes:
     """
     path = local_path(url)
     if path is not None:
-        return read_bytes(path)
+        return read_file(path)
     with _refused(url, "read"):
         fs, inner = url_to_fs(url)
         return fs.cat_file(inner)
@@ -78,7 +78,7 @@ def read_all(folder: str, suffix: str) -> dict[str, bytes]:
     """
     path = local_path(folder)
     if path is not None:
-        return {p.name: read_bytes(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
+        return {p.name: read_file(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
     with _refused(folder, "listed"):
         fs, inner = url_to_fs(folder)
         fs.invalidate_cache()

@@ -10,7 +10,8 @@ from typing import Any, NoReturn
 import yaml
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import AnyPath, read_bytes, refused_as, write_bytes
+from depthpose.core.files.disk import AnyPath, refused_as, write_bytes
+from depthpose.core.files.shards import read_bytes
 
 MAX_TEXT_BYTES = 2**26
 """Of text and tables in it: a million points, ten thousand images of annotations."""

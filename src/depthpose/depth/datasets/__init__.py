@@ -7,11 +7,11 @@ from depthpose.depth.datasets.dataset import Dataset as Dataset
 from depthpose.depth.datasets.dataset import join_datasets as join_datasets
 from depthpose.depth.datasets.dataset import open_dataset as open_dataset
 from depthpose.depth.datasets.dataset import read_known_depth as read_known_depth
-from depthpose.depth.datasets.duplicates import DUPLICATE_LIKENESS as DUPLICATE_LIKENESS
+from depthpose.depth.datasets.duplicates import DUPLICATE_SIMILARITY as DUPLICATE_SIMILARITY
 from depthpose.depth.datasets.duplicates import Duplicate as Duplicate
 from depthpose.depth.datasets.duplicates import find_duplicates as find_duplicates
-from depthpose.depth.datasets.duplicates import likeness_matrix as likeness_matrix
 from depthpose.depth.datasets.duplicates import shrink as shrink
+from depthpose.depth.datasets.duplicates import similarity_matrix as similarity_matrix
 from depthpose.depth.datasets.frames import Frame as Frame
 from depthpose.depth.datasets.frames import has_lidar as has_lidar
 from depthpose.depth.datasets.frames import kitti_calibration as kitti_calibration

@@ -25,8 +25,8 @@ _ROWS, _COLUMNS = 40, 128
 _SHIFT_ROWS, _SHIFT_COLUMNS = 2, 6
 _BLUR = 9
 _ZOOMS = (1.0, 1.12, 1.25, 1.4)
-DUPLICATE_LIKENESS = 0.3
-"""Likeness from which two images count as near-duplicates."""
+DUPLICATE_SIMILARITY = 0.3
+"""Similarity from which two images count as near-duplicates."""
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -38,12 +38,12 @@ class Duplicate:
     Attributes:
         first: name of the frame in the first set.
         second: name of the frame in the second set.
-        likeness: 1 for the same picture, about 0 for two streets.
+        similarity: 1 for the same picture, about 0 for two streets.
     """
 
     first: str
     second: str
-    likeness: float
+    similarity: float
 
 
 def shrink(image: Float[Tensor, "c h w"], rows: int, columns: int) -> Float[Tensor, "c rows cols"]:
@@ -52,32 +52,35 @@ def shrink(image: Float[Tensor, "c h w"], rows: int, columns: int) -> Float[Tens
 
 
 def find_duplicates(
-    first: Dataset, second: Dataset, at_least: float = DUPLICATE_LIKENESS, progress: Progress = iter
+    first: Dataset,
+    second: Dataset,
+    at_least: float = DUPLICATE_SIMILARITY,
+    progress: Progress = iter,
 ) -> list[Duplicate]:
-    """List the pairs of left images, one of either set, that look alike, the likest first.
+    """List the pairs of left images, one of either set, that look alike, the most similar first.
 
-    The likest pair is listed in any case: its likeness says how far the sets are apart.
+    The most similar pair is listed in any case: its similarity says how far the sets are apart.
 
     Args:
         first: usually the training set.
         second: usually the evaluation set.
-        at_least: smallest likeness that is listed; a lower one lists more pairs to compare by eye.
+        at_least: smallest similarity that is listed; a lower one lists more pairs to compare.
         progress: wraps the sequence of frames, to show how far it is.
     """
-    likeness = likeness_matrix(first, second, progress)
-    pairs = (likeness >= min(at_least, float(likeness.max()))).nonzero().tolist()
+    similarity = similarity_matrix(first, second, progress)
+    pairs = (similarity >= min(at_least, float(similarity.max()))).nonzero().tolist()
     found = [
         Duplicate(
             first=first.frames[i].name,
             second=second.frames[j].name,
-            likeness=float(likeness[i, j]),
+            similarity=float(similarity[i, j]),
         )
         for i, j in pairs
     ]
-    return sorted(found, key=lambda pair: (-pair.likeness, pair.first, pair.second))
+    return sorted(found, key=lambda pair: (-pair.similarity, pair.first, pair.second))
 
 
-def likeness_matrix(
+def similarity_matrix(
     first: Dataset, second: Dataset, progress: Progress = iter
 ) -> Float[Tensor, "n m"]:
     """Largest correlation of fine structure over small shifts and zooms, for every pair."""
@@ -85,11 +88,11 @@ def likeness_matrix(
         torch.stack([_fine_structure(images, i) for i in progress(range(len(images)))], 1)
         for images in (first, second)
     )
-    likest = torch.full((len(first), len(second)), -1.0)
+    best = torch.full((len(first), len(second)), -1.0)
     for zoomed in range(len(_ZOOMS)):
-        likest = torch.maximum(likest, _best_shift(ours[0], theirs[zoomed]))
-        likest = torch.maximum(likest, _best_shift(theirs[0], ours[zoomed]).T)
-    return likest
+        best = torch.maximum(best, _best_shift(ours[0], theirs[zoomed]))
+        best = torch.maximum(best, _best_shift(theirs[0], ours[zoomed]).T)
+    return best
 
 
 def _best_shift(
@@ -97,12 +100,12 @@ def _best_shift(
 ) -> Float[Tensor, "n m"]:
     height, width = _ROWS - 2 * _SHIFT_ROWS, _COLUMNS - 2 * _SHIFT_COLUMNS
     middle = theirs[:, _SHIFT_ROWS : _SHIFT_ROWS + height, _SHIFT_COLUMNS : _SHIFT_COLUMNS + width]
-    likest = torch.full((len(ours), len(theirs)), -1.0)
+    best = torch.full((len(ours), len(theirs)), -1.0)
     for top in range(2 * _SHIFT_ROWS + 1):
         for left in range(2 * _SHIFT_COLUMNS + 1):
             window = ours[:, top : top + height, left : left + width]
-            likest = torch.maximum(likest, _unit(window) @ _unit(middle).T)
-    return likest
+            best = torch.maximum(best, _unit(window) @ _unit(middle).T)
+    return best
 
 
 def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows columns"]:

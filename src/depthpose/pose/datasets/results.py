@@ -8,7 +8,8 @@ from io import StringIO
 from pathlib import Path
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import read_bytes, refused_as, write_bytes
+from depthpose.core.files.disk import refused_as, write_bytes
+from depthpose.core.files.shards import read_bytes
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets.parse import MOST, make_pose

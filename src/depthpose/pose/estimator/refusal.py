@@ -103,23 +103,14 @@ def calibrate_refusal(
         InputError: numbers that differ, a share that is none, a signal that there is not, or no
             answer at all.
     """
-    for name in without:
-        refuse_unknown("calibrate_refusal: a signal in without", name, SIGNALS)
-    if not 0 < max_negative_share < 1:
-        raise InputError(
-            f"calibrate_refusal: max_negative_share is {max_negative_share}, but a share is "
-            "between 0 and 1; take 0.01"
-        )
-    if len(estimates) != len(is_right) or not 0 < max_wrong_share < 1:
-        raise InputError(
-            f"calibrate_refusal: {len(estimates)} estimates, {len(is_right)} verdicts and a share "
-            f"of {max_wrong_share}; give a verdict for each, and a share between 0 and 1"
-        )
+    _refuse_settings(max_wrong_share, max_negative_share, without)
+    given, verdicts = len(estimates), len(is_right)
+    if given != verdicts:
+        raise InputError(f"calibrate_refusal: {given} estimates, {verdicts} verdicts; give as many")
     answered = [(e, ok) for e, ok in zip(estimates, is_right, strict=True) if e.is_ok]
     if not answered:
         raise InputError(
-            "calibrate_refusal: not one estimate is an answer, so nothing can be learnt; train "
-            "longer, or show easier views"
+            "calibrate_refusal: not one estimate is an answer; train longer, or show easier views"
         )
     foreign = [e for e in negatives if e.is_ok]
     every = [e for e, _ in answered] + foreign
@@ -128,14 +119,8 @@ def calibrate_refusal(
     ]
     x = np.array([[log_signal(e.signals[name]) for name in names] for e in every])
     wrong = np.array([not ok for _, ok in answered] + [True] * len(foreign), dtype=float)
-    # Views go round the objects: in order, a fold would be an object.
-    fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
-    risks = np.empty(len(x))
-    for k in range(_FOLDS):
-        bias, slopes = _fit(x[fold != k], wrong[fold != k], names)
-        risks[fold == k] = _sigmoid(bias + x[fold == k] @ slopes)
+    risks, own = _risks_by_others(x, wrong, names), len(answered)
     bias, slopes = _fit(x, wrong, names)
-    own = len(answered)
     limits = [_choose_limit(risks[:own], wrong[:own], max_wrong_share)]
     if foreign:
         limits.append(_negative_limit(risks[own:], len(negatives), max_negative_share))
@@ -180,6 +165,30 @@ def fit_candidate_slopes(
     start = np.ones(len(names))
     found = minimize(loss, start, jac=True, bounds=[(0.0, None)] * len(names), method="L-BFGS-B")
     return dict(zip(names, found.x.tolist(), strict=True))
+
+
+def _refuse_settings(
+    max_wrong_share: float, max_negative_share: float, without: Sequence[str]
+) -> None:
+    for name in without:
+        refuse_unknown("calibrate_refusal: a signal in without", name, SIGNALS)
+    shares = {"max_wrong_share": max_wrong_share, "max_negative_share": max_negative_share}
+    for name, share in shares.items():
+        if not 0 < share < 1:
+            raise InputError(
+                f"calibrate_refusal: {name} is {share}, but a share is between 0 and 1; take 0.01"
+            )
+
+
+def _risks_by_others(x: np.ndarray, wrong: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Give each row the risk that the other four fifths teach."""
+    # Views go round the objects: in order, a fold would be an object.
+    fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
+    risks = np.empty(len(x))
+    for k in range(_FOLDS):
+        bias, slopes = _fit(x[fold != k], wrong[fold != k], names)
+        risks[fold == k] = _sigmoid(bias + x[fold == k] @ slopes)
+    return risks
 
 
 def _fit(x: np.ndarray, wrong: np.ndarray, names: Sequence[str]) -> tuple[float, np.ndarray]:
