@@ -155,8 +155,9 @@ def test_exact_steps_end_no_worse_than_rough_ones() -> None:
     body, cap = trimesh.creation.capsule(0.1, 0.03), trimesh.creation.cylinder(0.012, 0.05)
     body.apply_scale([1.5, 1, 1])
     cap.apply_translation([0.01, 0, 0.15])
-    mesh = trimesh.util.concatenate([body, cap])
-    model = make_model(torch.tensor(mesh.vertices), torch.tensor(mesh.faces), name="bottle")
+    mesh = body + cap
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
+    model = make_model(vertices, faces, name="bottle")
     truth = pose_at(seed=0)
     start = pose_near(
         Rigid(truth.R.double(), truth.t_m.double()), 155, math.radians(50), 0.12 * model.diameter_m

@@ -13,17 +13,11 @@ from depthpose.core.errors import InputError
 Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
-Map = Float[Tensor, "h w"]
-"""One number a pixel; its unit is in the variable's name (``_m``, ``_px``). NaN: invalid."""
-
 Mask = Bool[Tensor, "h w"]
 """True where a pixel counts."""
 
 Points = Float[Tensor, "n 3"]
 """Points of a cloud, in the frame and unit of the variable's name."""
-
-Matrix3 = Float[Tensor, "3 3"]
-"""A 3x3 matrix: intrinsics ``K``, fundamental ``F``, essential ``E`` or a rotation ``R``."""
 
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:

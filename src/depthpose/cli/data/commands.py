@@ -245,7 +245,7 @@ def export_depth(
 
     Args:
         results: folder of predictions.
-        format: whose files.
+        format: program whose format is written.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
     """
     export.refuse_unusable(format)

@@ -72,7 +72,7 @@ class ObjectsOptions:
     sensor: Literal["structured light", "active stereo", "time of flight", "laser", "none"] = (
         "structured light"
     )
-    """whose errors the depth has."""
+    """kind of depth sensor whose errors are simulated."""
     symmetries: Literal["none", "found"] = "none"
     """found: declare the symmetries that are found from a part's shape; none: only print them."""
 
@@ -130,7 +130,7 @@ def make_objects(
     A scene has 50 frames; existing scenes are skipped, so an interrupted run can be resumed.
     'depthpose data check OUT' checks the result.
 
-        depthpose data make objects --cad part.stl clamp.stl --unit mm --out made --number 500
+        depthpose data make objects --cad part.stl clamp.stl --unit mm --out synthetic --number 500
 
     Args:
         cad: model files with a surface or points; the first is object 1.

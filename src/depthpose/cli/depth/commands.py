@@ -36,7 +36,7 @@ def predict(
     synthesised view), NAME.sky.png (255 in the sky, where the weights know it), NAME.color.png, and
     NAME.cloud.ply with --cloud. A video gives the files of each frame and NAME.color.mp4.
     report.html shows some of them, with the cloud in 3D. A rerun skips what is finished; other
-    settings need another --out. No file is written over that is not the run's own.
+    settings need another --out. Only files of the same run are overwritten.
 
         depthpose depth predict street.png --camera cam.json --out out
         depthpose depth predict drive.mp4 --focal-px 1100 --out out
@@ -46,7 +46,8 @@ def predict(
         out: folder for the results.
         camera: JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D,
             BOP, ROS or OpenCV. A baseline in it is ignored: one image has none.
-        focal_px: the focal length in pixels, in place of a camera whose centre is the image's.
+        focal_px: focal length in pixels, in place of a camera; the principal point is then the
+            centre of the image.
     """
     from depthpose.cli.depth import methods, predicting
 
@@ -110,8 +111,7 @@ def match(
     For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
     NAME.cloud.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips
-    what is finished; other settings need another --out. No file is written over that is not the
-    run's own.
+    what is finished; other settings need another --out. Only files of the same run are overwritten.
 
         depthpose depth match left.png right.png --camera cam.json --out out
         depthpose depth match left.png right.png --camera cam.json --matcher sgbm --out sgbm
@@ -121,7 +121,7 @@ def match(
             ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
         right: right image, folder or pattern; images are paired in sorted order.
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
-            Middlebury, ROS or OpenCV; of the latter two a folder may hold both files of the pair.
+            Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
     from depthpose.cli.depth import matching as pairs_of

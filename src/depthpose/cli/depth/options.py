@@ -21,9 +21,9 @@ class MatcherOptions:
 
     device: Device = "cpu"
     precision: Literal["fp32", "bf16"] = "fp32"
-    """fp32, or bf16: faster, at some hundredths of a pixel."""
+    """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
     max_memory: str | None = None
-    """bound on the memory of activations, such as 1GB or 800MB; exact."""
+    """limit on the memory of activations, such as 1GB or 800MB; the result stays exact."""
 
     @property
     def config(self) -> MatcherConfig:
@@ -55,8 +55,8 @@ class MatchOptions(PairOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
     tile: tuple[int, int] | None = None
-    """match tiles of so many rows and columns: less memory and approximate. The first pair is
-    matched whole as well, and the change of its disparity is printed."""
+    """match tiles of so many rows and columns: less memory; the result is approximate. The first
+    pair is matched whole as well, and the change of its disparity is printed."""
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
 
@@ -110,7 +110,7 @@ class ImageNetworks:
     or file. Left out: that of the weights."""
     answer: Answer | None = None
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
-    joined: both. Left out: what the weights say; another matcher matches."""
+    joined: both. Default: what the weights say; with --matcher, matched."""
     with_unlike: bool = False
     """answer images that are unlike the training images too, with a warning (NAME.warning.txt), in
     place of refusing them."""

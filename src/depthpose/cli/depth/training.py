@@ -23,8 +23,8 @@ class PairsOptions:
     data: tuple[str, ...] = ()
     """folders of pairs; they replace the config's."""
     held_out: tuple[str, ...] = ()
-    """folders of pairs for validation, none of which is learnt from; of each 20, evenly taken,
-    unless the config sets another number."""
+    """folders of pairs for validation alone; 20 of each, evenly spaced, unless the config says
+    otherwise."""
 
     def applied(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
         """Give the config of a training with these folders.
@@ -137,8 +137,8 @@ def calibrate(
 ) -> int:
     """Choose when one image is refused as unlike what weights know.
 
-    Their mean confidence is measured on images that they shall know; what lies below that of all
-    but a share of these is refused by 'depth predict'. Tensors stay as they are.
+    The mean confidence is measured on images like those of the training. The threshold below which
+    'depth predict' refuses is set so that a share of them is refused. Tensors stay as they are.
 
         depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
 

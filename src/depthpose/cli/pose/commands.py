@@ -33,11 +33,10 @@ def predict(
     alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
     none of them is right, status and reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
-    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, with the
-    alternatives too depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
-    shows some of them in 3D, and every refusal. A rerun skips
-    what is finished; other settings need another --out; no file is written over that is not the
-    run's own. Processes of torchrun share the work.
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, if there
+    are alternatives depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
+    shows some of them in 3D, and every refusal. A rerun skips what is finished; other settings need
+    another --out; only files of the same run are overwritten. Processes of torchrun share the work.
 
         depthpose pose predict --cloud part.ply --unit mm --object part --out out
         depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
@@ -143,8 +142,8 @@ def evaluate(
         bop: folder of the data set.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
-        weights: files or names, of the method or of a baseline; the words register, registration
-            without training, and open3d, that of Open3D (an extra), have none.
+        weights: files or names, of the method or of a baseline; also register (registration
+            without training) and open3d (Open3D's, an extra), which need no weights.
         csv: BOP results of any method.
         predictions: folders with poses.json.
         objects: keep these alone, by name or number.

@@ -28,7 +28,7 @@ class OneObjectOptions:
     object: str | None = None
     """which of the objects that are known."""
     unit: Unit | None = None
-    """of the clouds, metres by default; of depth images, where their camera says none."""
+    """unit of clouds (default m), and of depth images whose camera file gives none."""
 
 
 @group

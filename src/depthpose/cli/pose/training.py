@@ -31,12 +31,13 @@ class LearntOptions:
     unit: Literal["m", "mm"] | None = None
     """of the numbers in the files."""
     symmetries: Literal["none", "found"] | None = None
-    """found looks whether the part looks alike from several sides, and counts these poses as one;
-    without, what is found is printed."""
+    """found: detect symmetries of the part and count equivalent poses as one; by default they are
+    only printed."""
     data: str | None = None
     """folder of a data set; it takes the place of the config's, for models and frames."""
     what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
-    """which network; all but pose are compared with it, or cut the object out for it."""
+    """pose: the network of directions; segmentation: the masks for it; depth-image and pointnet:
+    baselines."""
     start: str | None = None
     """weights to begin with, by name or file. A CAD file without a config begins with 'parts',
     which saves two thirds of the first minutes; 'nothing' begins anew."""
@@ -118,13 +119,13 @@ class CalibrationOptions:
     config: Path | None = None
     """YAML of the training: its sensor and distances, and what is not said here."""
     max_wrong_share: float | None = None
-    """of the answers that are given."""
+    """accepted share of wrong answers among all answers."""
     number: int | None = None
     """views of each object to choose by."""
     negatives: int | None = None
     """views of something else in the place of each object to choose by; 0: none."""
     max_negative_share: float | None = None
-    """of these that may be answered."""
+    """accepted share of such views that get an answer."""
 
     @property
     def chosen(self) -> "PoseTraining":
@@ -142,11 +143,11 @@ def calibrate(
     out: Path,
     calibration: CalibrationOptions = CalibrationOptions(),
 ) -> int:
-    """Choose anew how much risk of a wrong pose is too much, on synthetic views of the objects.
+    """Choose anew how much risk of a wrong pose is too much.
 
-    And of other things in their place: other objects, copies of another size, mirrored ones, boxes,
-    balls, hands. A larger share of wrong answers buys more answers. The network stays as it is;
-    the views by which it is then measured are others.
+    Synthetic views decide: of the objects, and of other things in their place (other objects,
+    copies of another size, mirrored ones, boxes, balls, hands). A larger share of wrong answers
+    buys more answers. The network stays as it is, and is then measured on other views.
 
         depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
 

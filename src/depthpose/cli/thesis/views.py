@@ -72,7 +72,7 @@ def _synthetic_views(net: GeoPoseNet, number: int) -> Views:
     config = ObjectsConfig(number=number, seed=SYNTHETIC_SEED)
     objects = Objects(net.weights.models, config, net.weights.cloud)
     samples = [objects.view(i) for i in range(number)]
-    facts = {"frames": f"made, seed {SYNTHETIC_SEED}"}
+    facts = {"frames": f"synthetic, seed {SYNTHETIC_SEED}"}
     return Views(samples=samples, instances=[None] * number, facts=facts)
 
 

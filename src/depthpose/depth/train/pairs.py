@@ -69,10 +69,12 @@ class TrainingPairs:
     def __len__(self) -> int:
         return len(self._places)
 
-    def __getitem__(self, ticket: int) -> TrainingPair:
+    def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make the n-th sample."""
-        index = shuffled_index(ticket, len(self), self.seed)
-        return augment(self.read(index), self.config.augment, sample_generator(ticket, self.seed))
+        index = shuffled_index(sample_index, len(self), self.seed)
+        return augment(
+            self.read(index), self.config.augment, sample_generator(sample_index, self.seed)
+        )
 
     def read(self, index: int) -> TrainingPair:
         """Read one whole pair at the config's focal length, unchanged otherwise."""

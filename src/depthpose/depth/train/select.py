@@ -70,11 +70,11 @@ class SelectionSamples:
     def __len__(self) -> int:
         return len(self.sources[0])
 
-    def __getitem__(self, ticket: int) -> SelectionSample:
+    def __getitem__(self, sample_index: int) -> SelectionSample:
         """Make the n-th sample."""
-        before, now = int(ticket * self.more_share), int((ticket + 1) * self.more_share)
-        pair = self.sources[1][before] if now > before else self.sources[0][ticket - before]
-        seen = degrade(pair.left, self.config, sample_generator(ticket, self.seed + 1))
+        before, now = int(sample_index * self.more_share), int((sample_index + 1) * self.more_share)
+        pair = self.sources[1][before] if now > before else self.sources[0][sample_index - before]
+        seen = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
         return as_sample(pair, seen)
 
 

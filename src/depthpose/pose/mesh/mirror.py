@@ -19,7 +19,7 @@ of an object may differ."""
 _DIRECTIONS = 400
 _STARTS = 8
 _APART_RAD = math.radians(25)
-_SLIDES = 20
+_STEPS = 20
 _NEAREST = 0.9
 """Points that count in each step of ICP."""
 _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
@@ -59,7 +59,7 @@ def slid(
     points = surface.many if flip is None else surface.many @ flip
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
     turn = Rigid(R, middle - (R if flip is None else R @ flip) @ middle)
-    for _ in range(_SLIDES):
+    for _ in range(_STEPS):
         moved = turn.apply(points)
         distance, index = surface.nearest(moved)
         near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST)).double()
