@@ -26,6 +26,7 @@ from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import Ruler
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
 from depthpose.pose.mesh import mesh_suffixes, read_model
+from depthpose.pose.mesh.models import MESH_READERS
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.train import PoseTraining
 from depthpose.web.answer import KINDS
@@ -51,6 +52,25 @@ def test_extending_clouds(
     assert main(["doctor", str(path)]) in (0, 1)
     assert f"{len(points)} points" in capsys.readouterr().out
     assert np.allclose(read_model(path, "m").vertices_m, points)
+
+
+def read_json_mesh(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    """A format of our own: points and faces in JSON."""
+    read = json.loads(Path(path).read_text())
+    return np.array(read["points"], dtype=np.float64), np.array(read["faces"], dtype=np.int64)
+
+
+def test_extending_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, path = bracket(), tmp_path / "part.corners"
+    mesh = {"points": model.vertices_m.tolist(), "faces": model.faces.tolist()}
+    path.write_text(json.dumps(mesh))
+    with pytest.raises(InputError, match=r"\.corners is no model format"):
+        read_model(path, "m")
+    monkeypatch.setitem(MESH_READERS, ".corners", read_json_mesh)
+    read = read_model(path, "m")
+    assert ".corners" in mesh_suffixes()
+    assert read.diameter_m == pytest.approx(model.diameter_m)
+    assert len(read.faces) == len(model.faces)
 
 
 def test_extending_layouts(
