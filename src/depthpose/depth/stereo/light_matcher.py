@@ -32,7 +32,8 @@ class LightMatcher(NetworkMatcher):
         like = torch.empty(0, dtype=self.dtype, device=self.device)
         folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
         self._network = fold_features(folded, like)
-        self._network.rows = LightFootprint.rows
+        # A GPU has the memory, and is busy with whole volumes alone.
+        self._network.rows = LightFootprint.rows if self.device.type == "cpu" else None
         if self.config.with_compile:
             self._network.features.compile()
 
@@ -43,14 +44,20 @@ class LightMatcher(NetworkMatcher):
             InputError: a memory bound that is too small for them.
         """
         height, width = left.shape[-2:]
-        footprint = LightFootprint(config=network, height=height, width=width, dtype=self.dtype)
+        footprint = LightFootprint(
+            config=network,
+            height=height,
+            width=width,
+            dtype=self.dtype,
+            rows=self._network.rows or height // 4,
+        )
         footprint.refuse_more_than(self.config.max_memory_bytes)
         scores, seen = self._network.scores(
             left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
         )
         quarters = [mean_of_best(scores, network.candidates)]
         if self.config.with_confidence:
-            count = footprint.rows
+            count = LightFootprint.rows  # probabilities between the scores are the largest volume
             rows = zip(scores.split(count, 2), quarters[0].split(count, 1), strict=True)
             quarters.append(torch.cat([confidence_near(*some) for some in rows], 1))
         del scores
