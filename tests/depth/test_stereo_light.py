@@ -1,6 +1,7 @@
 """The light matcher: its parts against oracles, inference against the plain network, learning."""
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -241,8 +242,9 @@ def test_batches_say_what_single_pairs_say() -> None:
         assert float((difference > 1e-2).float().mean()) < 0.01
 
 
-def test_some_rows_at_a_time_give_the_same_numbers() -> None:
-    network = random_network()
+@pytest.mark.parametrize("compares", [False, True])
+def test_some_rows_at_a_time_give_the_same_numbers(compares: bool) -> None:
+    network = random_network(replace(SMALL, with_agreement=compares, with_refinement=compares))
     left, right = torch.randn(2, 2, 3, 96, 64, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         scores, _ = network.scores(left, right, 32)

@@ -242,7 +242,10 @@ class LightStereo(nn.Module):
         """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
 
         def enlarged(
-            quarters: Tensor, left_half: Features, left_quarter: Features, right_half: Features
+            quarters: Tensor,
+            left_half: Features,
+            left_quarter: Features,
+            right_half: Features | None,
         ) -> Tensor:
             near = Seen(Described(left_half, (left_quarter,)), right_half)
             weights = self.enlargement(near, quarters[:, 0])
