@@ -14,15 +14,7 @@ _SUFFIX = ".tar"
 
 
 def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole, or one in a shard.
-
-    Args:
-        path: the file.
-        most: bytes beyond which it is refused unread: files of its kind are smaller.
-
-    Raises:
-        InputError: there is no such file, or it is a folder, a device, too large or unreadable.
-    """
+    """Read a file as :func:`~depthpose.core.files.disk.read_file` does, also one in a shard."""
     with refused_read(path):
         member = split_member(Path(path))
         if member is not None:
