@@ -14,7 +14,11 @@ _SUFFIX = ".tar"
 
 
 def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a file as :func:`~depthpose.core.files.disk.read_file` does, also one in a shard."""
+    """Read a regular file whole, or one in a shard; more than ``most`` bytes are refused unread.
+
+    Raises:
+        InputError: there is no such file, or it is none that can be read.
+    """
     with refused_read(path):
         member = split_member(Path(path))
         if member is not None:
