@@ -7,6 +7,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_depth_png, read_image, read_points_bin
+from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.depth.datasets.frames import Frame, frame_rig, kitti_calibration, read_disparity
 from depthpose.depth.datasets.layouts import find_frames
@@ -89,7 +90,7 @@ def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
     for left, right in sorted(folders):
         stems = {path.stem for path in left.iterdir()}
         for path in sorted(right.iterdir()):
-            is_view = path.suffix.lower() in (".png", ".jpg", ".jpeg") and path.name[0] != "."
+            is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and left != right and path.stem not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.packed import packed_frames
-
-_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,11 +171,11 @@ def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in found if path.suffix.lower() in _IMAGES)
+    return sorted(path for path in found if path.suffix.lower() in LISTED_SUFFIXES)
 
 
 def _partner(folder: Path, stem: str) -> Path | None:
-    candidates = (folder / f"{stem}{ending}" for ending in _IMAGES)
+    candidates = (folder / f"{stem}{ending}" for ending in LISTED_SUFFIXES)
     return next((path for path in candidates if path.is_file()), None)
 
 

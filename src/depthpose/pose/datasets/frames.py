@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets.parse import (
     camera_from_bop,
@@ -24,7 +25,7 @@ from depthpose.pose.datasets.parse import (
 )
 
 _IMAGE_FOLDERS = ("rgb", "gray")
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif")
+_IMAGE_SUFFIXES = (*LISTED_SUFFIXES, ".tif")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
