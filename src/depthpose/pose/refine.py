@@ -147,13 +147,14 @@ def refine_best(
     short = replace(config, iterations=(config.iterations + 1) // 2)
     refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
-        refined = refine_pose(points_m, Rigid(given.R[best], given.t_m[best]), surface, short)
-        both = _both(_doubled(refined.camera_from_model), _one(tried, best))
+        refined = refine_pose(points_m, _one(given, best), surface, short)
+        exact, rough = _doubled(refined.camera_from_model), _one(tried, best)
+        both = Rigid(torch.stack([exact.R, rough.R]), torch.stack([exact.t_m, rough.t_m]))
         if float(_worth(points_m, both, surface, end_m).diff()) > 0:
             refined = None  # it began farther off than exact steps reach
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
-        refined = refine_pose(points_m, Rigid(tried.R[best], tried.t_m[best]), surface, short)
+        refined = refine_pose(points_m, _one(tried, best), surface, short)
     away = _distances(tried, _doubled(refined.camera_from_model), surface) > _OTHER
     others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
     return Best(refined, best % len(given.R), float(away.double().mean()), others)
@@ -259,10 +260,6 @@ def _pick(poses: Rigid, numbers: list[int]) -> Rigid:
 
 def _one(poses: Rigid, number: int) -> Rigid:
     return Rigid(poses.R[number], poses.t_m[number])
-
-
-def _both(first: Rigid, second: Rigid) -> Rigid:
-    return Rigid(torch.stack([first.R, second.R]), torch.stack([first.t_m, second.t_m]))
 
 
 def _doubled(pose: Rigid) -> Rigid:

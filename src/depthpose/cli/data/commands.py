@@ -174,8 +174,8 @@ def duplicates(
     ranked = find_duplicates(*sets, at_least, partial(tqdm, unit=" frames", disable=None))
     count = _list_duplicates([pair for pair in ranked if pair.similarity >= at_least], out)
     best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
-    what = f"{len(sets[0])} x {len(sets[1])} images: {count} pairs of similarity {at_least:g} or"
-    print(f"{what} more; the most similar: {best}")
+    size = f"{len(sets[0])} x {len(sets[1])} images"
+    print(f"{size}: {count} pairs of similarity {at_least:g} or more; the most similar: {best}")
     return 1 if count else 0
 
 

@@ -38,11 +38,9 @@ def find_all(
     Raises:
         InputError: weights that take no clouds, several processes, or two images of one name.
     """
-    if method.find is None:
-        raise InputError("--depth without --mask: these weights need masked views; give --mask")
-    if find_shard().world > 1:
-        raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    refuse_among_inputs(out, [depth], depths := list_images(depth))
+    _refuse_unable(method)
+    depths = list_images(depth)
+    refuse_among_inputs(out, [depth], depths)
     facts = {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, [], depth)
@@ -51,6 +49,13 @@ def find_all(
         found += _find(method, view_input(path, None, camera, objects[0], path.stem, unit), objects)
     claim(out, settings, [job for _, job in found], depth)
     return _write(found, method, out)
+
+
+def _refuse_unable(method: PoseMethod) -> None:
+    if method.find is None:
+        raise InputError("--depth without --mask: these weights need masked views; give --mask")
+    if find_shard().world > 1:
+        raise InputError("--depth without --mask is done by one process; give --mask, or start one")
 
 
 def _write(found: list[tuple[Prediction, Job[Any]]], method: PoseMethod, out: Path) -> int:

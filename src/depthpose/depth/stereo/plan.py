@@ -151,6 +151,7 @@ class LightFootprint:
         slab_pixels = min((self.rows + 4) * self.width // 4, pixels)
         halves = 2 if self.config.with_agreement or self.config.with_refinement else 1
         kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
+        # Both views in float32: at this size, normalised, padded.
         images = 6 * 3 * 4 * self.height * self.width
         stages = (self._volume_bytes(pixels, slab_pixels), self._weights_bytes(slab_pixels))
         return int(MARGIN * (images + kept + max(stages))) + OVERHEAD_BYTES // 2
