@@ -1,7 +1,7 @@
 """Volumes computed some rows at a time, and PSMNet's first convolution and expected disparity.
 
-PSMNet's concatenation volume holds ``left[y, x]`` and ``right[y, x - d]``: a convolution over it is a
-2D convolution of each view, looked up and added for each disparity. Only the four columns beside
+PSMNet's concatenation volume holds ``left[y, x]`` and ``right[y, x - d]``: a convolution over it is
+a 2D convolution of each view, looked up and added for each disparity. Only the four columns beside
 the edge ``x = d`` where the volume turns to zero, and the last column, need more care.
 """
 
