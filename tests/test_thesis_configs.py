@@ -212,7 +212,7 @@ def test_fine_tuning_moves_the_generator_alone(
     stereo = read_config(CONFIGS / "depth/stereo.yaml", StereoTraining)
     made = {"generator": UNetGenerator(view.generator), "matcher": PSMNet(stereo.matcher)}
     monkeypatch.setattr(depth_runs, "find_weights", Path)
-    for reader, part in (("read_generator", "generator"), ("read_network", "matcher")):
+    for reader, part in (("read_generator", "generator"), ("read_matcher", "matcher")):
         monkeypatch.setattr(depth_runs, reader, lambda _, n=made[part]: n)
     kind, run_stage = DEPTH_STAGES["finetune"]
     words = {part: f"{part}.safetensors" for part in made}

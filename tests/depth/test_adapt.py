@@ -20,7 +20,7 @@ from depthpose.depth.config import PSMNetConfig as Config
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.labels import LabelConfig, is_consistent
 from depthpose.depth.losses import photometric_error, smoothness_loss
-from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
+from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, StereoNetwork
 from depthpose.depth.train import train_adapt
 from depthpose.depth.train.adapt import (
     AdaptMetrics,
@@ -38,7 +38,7 @@ SIZE = (48, 96)
 SAME = AdaptMetrics(photometric=0.1, disagreeing=0.2, street_d1=0.05, street_epe_px=1.0)
 
 
-class OneDisparity(nn.Module):
+class OneDisparity(StereoNetwork):
     """A matcher whose one weight is the disparity of everything."""
 
     def __init__(self, px: float) -> None:
@@ -167,7 +167,7 @@ def test_the_guard_tells_a_worse_matcher(monkeypatch: pytest.MonkeyPatch) -> Non
     truth_px = street.truth.disparity_px
     assert truth_px is not None
 
-    class Fixed(nn.Module):
+    class Fixed(StereoNetwork):
         def __init__(self, off_px: float) -> None:
             super().__init__()
             self.off_px = off_px

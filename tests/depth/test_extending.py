@@ -13,7 +13,15 @@ from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit
 from depthpose.core.files import read_map, write_disparity_png, write_image, write_map
-from depthpose.depth.config import MatcherConfig, SelectionConfig
+from depthpose.core.loop import LoopConfig, Run
+from depthpose.depth.augment import TrainingPair
+from depthpose.depth.config import (
+    AugmentConfig,
+    GeneratorConfig,
+    MatcherConfig,
+    PairsConfig,
+    SelectionConfig,
+)
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
@@ -22,10 +30,12 @@ from depthpose.depth.export import TARGETS, depth_export
 from depthpose.depth.export.proof import Target
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
-from depthpose.depth.stereo import MATCHERS, MatcherKind
-from depthpose.depth.synthesis import SelectionGenerator
-from depthpose.depth.train.config import SelectTraining
+from depthpose.depth.stereo import MATCHERS, MatcherKind, StereoNetwork
+from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
+from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
+from depthpose.depth.train.runs import train_finetune
 from depthpose.depth.train.select import SelectionSample, SelectTask
+from depthpose.depth.train.stages import StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import DepthWeights, read_depth_weights, write_depth_weights
 
@@ -51,15 +61,20 @@ class FlatConfig:
     """Settings of the example's network."""
 
     most_px: float = 10.0
+    max_disparity_px: int = 192
 
 
-class FlatNetwork(nn.Module):
+class FlatNetwork(StereoNetwork):
     """Learns one disparity for all pixels."""
 
     def __init__(self, config: FlatConfig) -> None:
         super().__init__()
         self.config = config
         self.share = nn.Parameter(torch.tensor(0.4))
+
+    def forward(self, left: Tensor, right: Tensor) -> tuple[Tensor]:  # noqa: ARG002
+        """Give every pixel one disparity [px]."""
+        return (self.share * self.config.most_px + torch.zeros_like(left[:, 0]),)
 
 
 class FlatMatcher:
@@ -98,6 +113,37 @@ def test_extending_matchers_with_weights(
     assert "| flat | both views | fine | flat |" in (out / "table.md").read_text()
 
 
+def test_extending_matchers_with_training(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = MatcherKind(config=FlatConfig, network=FlatNetwork, matcher=FlatMatcher)
+    monkeypatch.setitem(MATCHERS, "flat", kind)
+    network = FlatNetwork(FlatConfig())
+    truth_px = torch.full((2, H, W), 5.0)
+    images = torch.rand(2, 3, H, W)
+    batch = TrainingPair(left=images, right=images, left_px=truth_px, right_px=truth_px)
+    (turn,) = StereoTask(network, StereoTraining(), None).step(batch)
+    turn.loss.backward()
+    assert network.share.grad is not None
+    assert float(network.share.grad) < 0, "4 px found, 5 px true"
+    assert float(turn.facts["epe"]) == pytest.approx(1.0)
+
+    # Fine-tuning a generator takes its matcher from any weights.
+    weights, generator = tmp_path / "flat.safetensors", tmp_path / "generator.safetensors"
+    write_depth_weights(weights, matcher=network, facts=FACTS)
+    small = GeneratorConfig(levels=2, width=4, virtual_focal_px=50.0,
+                            virtual_baseline_m=0.5)  # fmt: skip
+    write_depth_weights(generator, generator=UNetGenerator(small), facts=FACTS)
+    config = FinetuneTraining(
+        generator=str(generator),
+        matcher=str(weights),
+        pairs=PairsConfig(folders=(str(pairs),), augment=AugmentConfig(crop_px=(16, 16))),
+        loop=LoopConfig(steps=1, batch_size=1),
+    )
+    out = train_finetune(config, Run(folder=tmp_path / "run"))
+    assert isinstance(read_depth_weights(out).matcher, FlatNetwork)
+
+
 def test_a_matcher_without_tiles_refuses_them(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -109,7 +155,7 @@ def test_a_matcher_without_tiles_refuses_them(
     how = ["--no-check", "--weights", str(weights), "--tile", "32", "32"]
     assert main(["depth", "match", *sides, *how, "--out", str(tmp_path / "out")]) != 0
     assert "--tile: flat matches no tiles" in capsys.readouterr().err
-    with pytest.raises(InputError, match="the matcher is FlatNetwork, and only PSMNet"):
+    with pytest.raises(InputError, match="the matcher is FlatNetwork, and no file is made of it"):
         depth_export(read_depth_weights(weights), "pair", {}).graph()
 
 

@@ -344,7 +344,7 @@ def test_it_learns_and_every_part_gets_gradients() -> None:
 
 def test_a_fixed_start_keeps_what_imagenet_taught() -> None:
     task = stereo_task()
-    encoder = task.matcher.features.encoder
+    encoder = task.matcher.encoder
     assert isinstance(encoder, LiteEncoder)
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
     (turn,) = task.step(training_batch())

@@ -12,7 +12,7 @@ from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
-from depthpose.depth.stereo import MATCHERS
+from depthpose.depth.stereo import MATCHERS, StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 
 BOTH = "fakestereo"
@@ -39,7 +39,7 @@ class DepthWeights:
     """
 
     generator: Generator | None
-    matcher: nn.Module | None
+    matcher: StereoNetwork | None
     facts: Mapping[str, str]
 
 
@@ -83,7 +83,7 @@ def read_generator(path: Path) -> Generator:
     return generator
 
 
-def read_matcher(path: Path) -> nn.Module:
+def read_matcher(path: Path) -> StereoNetwork:
     """Read the matcher of a weights file, of any kind.
 
     Raises:
@@ -99,7 +99,7 @@ def write_depth_weights(
     path: Path,
     *,
     generator: Generator | None = None,
-    matcher: nn.Module | None = None,
+    matcher: StereoNetwork | None = None,
     facts: Mapping[str, str],
     with_half: bool = False,
 ) -> None:

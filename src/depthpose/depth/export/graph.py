@@ -28,6 +28,7 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
 from depthpose.depth.weights import DepthWeights
 
@@ -105,7 +106,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
 def _answered(
     left: Value,
     seen: DrawnValues,
-    matcher: nn.Module | None,
+    matcher: StereoNetwork | None,
     rig: GeneratorConfig | SelectionConfig,
 ) -> _Maps:
     """Take the generator's own disparity, the matcher's, or both."""

@@ -1,6 +1,8 @@
 """The networks, and what a synthesiser does around its own, in operations of any size."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from depthpose.depth.export.steps import (
     rows,
     size_of,
 )
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
@@ -81,20 +84,26 @@ class SizelessLight(nn.Module):
         return self.network.refine(found_px, seen), sure
 
 
-def sizeless(matcher: nn.Module) -> nn.Module:
+SIZELESS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
+    PSMNet: SizelessPSMNet,
+    LightStereo: SizelessLight,
+}
+"""What makes of a matcher's network its form in operations of any size: a new kind is one entry."""
+
+
+def sizeless(matcher: StereoNetwork) -> nn.Module:
     """Give a matcher's network, with what is made of its answer, in operations of any size.
 
     Raises:
         InputError: a matcher that has no such form.
     """
-    if isinstance(matcher, PSMNet):
-        return SizelessPSMNet(matcher).eval()
-    if isinstance(matcher, LightStereo):
-        return SizelessLight(matcher).eval()
-    raise InputError(
-        f"the matcher is {type(matcher).__name__}, and only PSMNet and LightStereo are exported; "
-        "give weights of one of these."
-    )
+    if type(matcher) not in SIZELESS:
+        known = ", ".join(kind.__name__ for kind in SIZELESS)
+        raise InputError(
+            f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
+            f"one of {known}."
+        )
+    return SIZELESS[type(matcher)](matcher).eval()
 
 
 class SizelessSelection(nn.Module):

@@ -15,7 +15,7 @@ from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export.graph import image_graph, pair_graph
-from depthpose.depth.stereo import LightStereo, make_matcher
+from depthpose.depth.stereo import LightStereo, StereoNetwork, make_matcher
 from depthpose.depth.stereo.network_matcher import NetworkConfig
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -34,7 +34,9 @@ _FLIPPING_LIMITS = {
     name: limit if limit.of == "mean" else dataclasses.replace(limit, flips=_FLIPS)
     for name, limit in _LIMITS.items()
 }
-"""Of the light matcher: where two scores tie, the last bit decides between candidates."""
+"""Where two scores tie, the last bit decides between candidates."""
+_FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
+"""Matchers that choose between candidates."""
 _SELECTION_LIMITS = {
     **_FLIPPING_LIMITS,
     "is_sky": Limit(value=_FLIPS, of="mean"),
@@ -87,7 +89,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     return Export(
         graph=lambda: pair_graph(weights),
         cases=lambda: _pair_cases(weights),
-        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, LightStereo) else _LIMITS,
+        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
     )
 
@@ -95,7 +97,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     rig = {} if weights.generator is None else _rig_facts(weights)
     selects = isinstance(weights.generator, SelectionGenerator)
-    chooses = isinstance(weights.matcher, LightStereo)
+    chooses = isinstance(weights.matcher, _FLIPPING)
     return Export(
         graph=lambda: image_graph(weights),
         cases=lambda: _image_cases(weights),

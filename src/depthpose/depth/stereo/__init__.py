@@ -12,6 +12,7 @@ from depthpose.depth.stereo.matcher import (
 )
 from depthpose.depth.stereo.network_matcher import (
     NetworkMatcher,
+    StereoNetwork,
     normalise,
     tile_change_px,
     with_usable_precision,
@@ -38,6 +39,7 @@ __all__ = [
     "PSMNetMatcher",
     "SGBMMatcher",
     "Steps",
+    "StereoNetwork",
     "TiledMatcher",
     "check_pair",
     "fill_holes",

@@ -33,7 +33,7 @@ from depthpose.depth.stereo.enlargement import (
     enlarge,
     unit_groups,
 )
-from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD
+from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
 from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
 from depthpose.depth.stereo.volume import (
     WINDOW_PX,
@@ -195,7 +195,7 @@ def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
     return (probability * is_near).sum(1).clamp(0, 1)
 
 
-class LightStereo(nn.Module):
+class LightStereo(StereoNetwork):
     """Rectified pair to disparity at a fraction of PSMNet's operations.
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 32.
@@ -215,6 +215,11 @@ class LightStereo(nn.Module):
         self.aggregation = Aggregation(self.config, self.features.widths)
         self.enlargement = Enlargement(self.config.width, with_agreement=self.config.with_agreement)
         self.refinement = Refinement() if self.config.with_refinement else None
+
+    @property
+    def encoder(self) -> LiteEncoder:
+        """Of ImageNet, in the features."""
+        return self.features.encoder
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]

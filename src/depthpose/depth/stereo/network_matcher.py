@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from depthpose.core.camera import Camera
 from depthpose.core.devices import usable_device, usable_precision
@@ -27,6 +27,7 @@ from depthpose.depth.disparity import (
     resize_image,
     resized_match,
 )
+from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.matcher import TiledMatcher, check_pair
 from depthpose.depth.stereo.plan import Tiling, match_tiles
 from depthpose.depth.types import Match
@@ -41,6 +42,21 @@ NetworkConfig = PSMNetConfig | LightConfig
 
 AGREEMENT_PX = 3.0
 """Difference of left and right disparity at which their agreement is down to 1/e."""
+
+
+class StereoNetwork(nn.Module):
+    """A network of normalised pairs whose disparity maps, the last of which is the answer, train.
+
+    Attributes:
+        config: its sizes and conventions; it has ``max_disparity_px``.
+    """
+
+    config: Any
+
+    @property
+    def encoder(self) -> LiteEncoder | None:
+        """The part that may begin with weights of ImageNet, which a training treats with care."""
+        return None
 
 
 class NetworkMatcher(ABC):

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
+from depthpose.depth.stereo.network_matcher import StereoNetwork
 
 
 class ConvNorm(nn.Module):
@@ -201,7 +202,7 @@ def soft_argmin(cost: Volume, size: tuple[int, int, int], *, align_corners: bool
     return (full.softmax(1) * disparity_px[:, None, None]).sum(1)
 
 
-class PSMNet(nn.Module):
+class PSMNet(StereoNetwork):
     """Rectified pair to disparity: features, concatenation volume, three hourglasses, three heads.
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 16 and

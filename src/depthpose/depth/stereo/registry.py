@@ -4,13 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from torch import nn
-
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo.light import LightStereo
 from depthpose.depth.stereo.light_matcher import LightMatcher
 from depthpose.depth.stereo.matcher import Matcher
+from depthpose.depth.stereo.network_matcher import StereoNetwork
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
 
@@ -26,7 +25,7 @@ class MatcherKind:
     """
 
     config: type
-    network: type[nn.Module]
+    network: type[StereoNetwork]
     matcher: Callable[[Any, MatcherConfig], Matcher]
 
 
@@ -37,7 +36,12 @@ MATCHERS = {
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 
-def make_matcher(network: nn.Module, config: MatcherConfig) -> Matcher:
+def make_network(config: Any) -> StereoNetwork:  # noqa: ANN401
+    """Make the network of a config of any kind, with random weights."""
+    return next(k.network(config) for k in MATCHERS.values() if isinstance(config, k.config))
+
+
+def make_matcher(network: StereoNetwork, config: MatcherConfig) -> Matcher:
     """Make the matcher of a network of any kind.
 
     Raises:

@@ -25,7 +25,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.labels import LabelConfig, is_consistent, label_pairs, match_both_ways
 from depthpose.depth.losses import heads_loss, photometric_error, smoothness_loss
 from depthpose.depth.metrics import disparity_errors
-from depthpose.depth.stereo import NetworkMatcher, make_matcher, normalise
+from depthpose.depth.stereo import NetworkMatcher, StereoNetwork, make_matcher, normalise
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.train.config import AdaptTraining
 from depthpose.depth.types import StereoInput
@@ -47,7 +47,7 @@ class AdaptTask:
         config: weights of the losses.
     """
 
-    def __init__(self, matcher: nn.Module, config: AdaptTraining) -> None:
+    def __init__(self, matcher: StereoNetwork, config: AdaptTraining) -> None:
         self.config, self.matcher = config, matcher
         _keep_statistics(matcher)
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
@@ -134,7 +134,7 @@ class Guard:
         self._seen: list[Bool[Tensor, "h w"]] = []
 
     @torch.no_grad()
-    def measure(self, matcher: nn.Module) -> AdaptMetrics:
+    def measure(self, matcher: StereoNetwork) -> AdaptMetrics:
         """Measure a network in eval mode; the first one decides which pixels count."""
         net = FakestereoNet(make_matcher(matcher, self.config))
         errors, apart = [], []
@@ -223,7 +223,7 @@ def split_pairs(
     return dataset, usable[:: max(min(kept_back, len(usable)), 2)]
 
 
-def fine_focal_px(config: AdaptTraining, network: nn.Module) -> float:
+def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
     """Give the focal length of a fine match of the first pair, not enlarged beyond the pair [px].
 
     Raises:

@@ -8,7 +8,8 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.encoder import load_encoder
-from depthpose.depth.stereo import LightStereo, PSMNet
+from depthpose.depth.stereo import StereoNetwork
+from depthpose.depth.stereo.registry import make_network
 from depthpose.depth.synthesis import Generator
 from depthpose.depth.train.config import SelectTraining, StereoTraining
 from depthpose.depth.weights import read_matcher
@@ -30,7 +31,7 @@ def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
         )
 
 
-def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, source: str) -> None:
+def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str) -> None:
     """Copy weights whose config is the network's own, but for what no weight depends on.
 
     What the network has beyond them keeps its beginning, where that has no effect.
@@ -55,35 +56,18 @@ def start_from(network: Generator | PSMNet | LightStereo, found: nn.Module, sour
     network.load_state_dict(network.state_dict() | found.state_dict())
 
 
-def read_network(name: str) -> PSMNet | LightStereo:
-    """Read a matcher of weights, to train it or to train a generator through it.
-
-    Raises:
-        InputError: the weights hold none, or one of a kind that is not trained here.
-    """
-    network = read_matcher(find_weights(name))
-    if not isinstance(network, PSMNet | LightStereo):
-        raise InputError(
-            f"{name}: the matcher is {type(network).__name__}, and only PSMNet and LightStereo "
-            "take part in a training; give weights of one of these."
-        )
-    return network
-
-
-def make_matcher_network(config: StereoTraining) -> PSMNet | LightStereo:
+def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     """Make the network that a config trains, with the weights that it begins with."""
-    if config.light is None and config.encoder is not None:
-        raise InputError(
-            f"--encoder {config.encoder}: PSMNet has no encoder of its own kind; give the config "
-            "a light network (light: {}), or leave it out."
-        )
-    if config.light is None:
-        matcher = PSMNet(config.matcher)
-    else:
+    matcher = make_network(config.network)
+    if config.encoder is not None:
+        if matcher.encoder is None:
+            raise InputError(
+                f"--encoder {config.encoder}: {type(matcher).__name__} has no encoder of its own "
+                "kind; give the config a light network (light: {}), or leave it out."
+            )
+        load_encoder(matcher.encoder, find_weights(config.encoder))
+    if matcher.encoder is not None:
         refuse_fixed_chance(config)
-        matcher = LightStereo(config.light)
-        if config.encoder is not None:
-            load_encoder(matcher.features.encoder, find_weights(config.encoder))
     if config.start is not None:
         start_from(matcher, read_matcher(find_weights(config.start)), config.start)
     return matcher

@@ -20,7 +20,7 @@ from depthpose.core.loop import (
 from depthpose.core.run import find_shard
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.encoder import load_encoder
-from depthpose.depth.stereo import LightStereo, PSMNet
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.train.adapt import (
     AdaptTask,
@@ -32,7 +32,6 @@ from depthpose.depth.train.adapt import (
 )
 from depthpose.depth.train.begin import (
     make_matcher_network,
-    read_network,
     refuse_fixed_chance,
     start_from,
 )
@@ -46,7 +45,7 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-from depthpose.depth.weights import read_generator, write_depth_weights
+from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
 
 _OfGenerator = TypeVar("_OfGenerator", ViewTraining, SelectTraining, FinetuneTraining)
 _BEGINS_WITH = ("start", "encoder", "generator", "matcher")
@@ -126,7 +125,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     torch.manual_seed(config.loop.seed)
     if not config.pairs.folders:
         raise InputError("there is nothing to adapt to: name a folder of the rig's pairs (--data).")
-    matcher = read_network(config.start)
+    matcher = read_matcher(find_weights(config.start))
     if config.pairs.focal_px is None:
         pairs = replace(config.pairs, focal_px=fine_focal_px(config, matcher))
         config = replace(config, pairs=pairs)
@@ -140,7 +139,8 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     guard = Guard(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
     )
-    found = [guard.measure(network) for network in (read_network(config.start), matcher.eval())]
+    before = read_matcher(find_weights(config.start))
+    found = [guard.measure(network) for network in (before, matcher.eval())]
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
@@ -160,7 +160,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     generator = read_generator(find_weights(config.generator))
     if isinstance(generator, SelectionGenerator):  # the limit is chosen anew, by depth calibrate
         generator.config = replace(generator.config, least_confidence=0.0)
-    matcher = read_network(config.matcher)
+    matcher = read_matcher(find_weights(config.matcher))
     config = _at_virtual_focal(config, generator.config)
     rig_m = generator.config.virtual_baseline_m
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
@@ -232,7 +232,7 @@ def _leave(
     seconds: float,
     *,
     generator: Generator | None = None,
-    matcher: PSMNet | LightStereo | None = None,
+    matcher: StereoNetwork | None = None,
 ) -> Path:
     """Write the weights and their card."""
     names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]

@@ -17,7 +17,7 @@ from depthpose.depth.losses import (
     l1_loss,
     valid_disparity,
 )
-from depthpose.depth.stereo import LightStereo, PSMNet, normalise
+from depthpose.depth.stereo import StereoNetwork, normalise
 from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.synthesis import Generator, UNetGenerator, make_discriminator
 from depthpose.depth.synthesis.synthesiser import draw_right
@@ -30,22 +30,23 @@ class StereoTask:
 
     def __init__(
         self,
-        matcher: PSMNet | LightStereo,
+        matcher: StereoNetwork,
         config: StereoTraining,
         held_out: TrainingPairs | None,
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
-        if isinstance(matcher, LightStereo) and config.with_fixed_start:
-            matcher.features.encoder.freeze_early()
+        self._fixed = matcher.encoder if config.with_fixed_start else None
+        if self._fixed is not None:
+            self._fixed.freeze_early()
         self._train()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         self.optimizers = {"matcher": (make_adam(self._groups(), config.adam), config.adam)}
 
     def _groups(self) -> list[dict[str, object]]:
-        if not isinstance(self.matcher, LightStereo):
+        if self.matcher.encoder is None:
             return [{"params": list(self.matcher.parameters())}]
-        encoder = list(self.matcher.features.encoder.parameters())
+        encoder = list(self.matcher.encoder.parameters())
         ours = set(encoder)
         rest = [p for p in self.matcher.parameters() if p not in ours]
         learnt = [p for p in encoder if p.requires_grad]
@@ -53,8 +54,8 @@ class StereoTask:
 
     def _train(self) -> None:
         self.matcher.train()
-        if isinstance(self.matcher, LightStereo) and self.config.with_fixed_start:
-            self.matcher.features.encoder.keep_statistics()
+        if self._fixed is not None:
+            self._fixed.keep_statistics()
 
     def step(self, batch: TrainingPair) -> Iterator[Turn]:
         """One turn: match and compare."""
@@ -75,7 +76,7 @@ class StereoTask:
 
 
 def held_out_evidence(
-    matcher: PSMNet | LightStereo,
+    matcher: StereoNetwork,
     held_out: TrainingPairs,
     draw: Callable[[Tensor], Tensor] | None = None,
 ) -> Evidence:
@@ -102,7 +103,7 @@ def held_out_evidence(
 
 @torch.no_grad()
 def match_whole(
-    matcher: PSMNet | LightStereo,
+    matcher: StereoNetwork,
     left: Float[Tensor, "3 h w"],
     right: Float[Tensor, "3 h w"],
 ) -> Float[Tensor, "h w"]:
@@ -193,7 +194,7 @@ class FinetuneTask:
     def __init__(
         self,
         generator: Generator,
-        matcher: PSMNet | LightStereo,
+        matcher: StereoNetwork,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
     ) -> None:
