@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.camera import (
+    CAMERA_SUFFIXES,
     Camera,
     StereoRig,
     check_image_matches_camera,
@@ -18,6 +19,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
+    MAP_SUFFIXES,
     cloud_suffixes,
     read_cloud,
     read_depth_png,
@@ -32,8 +34,6 @@ from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, un
 
 Size = tuple[int, int]
 
-_CAMERAS = (".json", ".yaml", ".yml", ".xml", ".txt")
-_MAPS = (".npy", ".pfm")
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
 _NEAR_M, _FAR_M = 0.05, 100.0
 _ONLY_MM, _ONLY_M = 20.0, 2.0
@@ -82,7 +82,7 @@ def look_at_all(files: Sequence[Path]) -> int:
 
 
 def _is_camera_like(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in _CAMERAS
+    return path.is_dir() or path.suffix.lower() in CAMERA_SUFFIXES
 
 
 def _look_at(path: Path, size: Size | None) -> Seen:
@@ -97,7 +97,7 @@ def _read(path: Path, size: Size | None) -> Seen:
     suffix = path.suffix.lower()
     if _is_camera_like(path):
         return _read_words(path, size)
-    if suffix in _MAPS:
+    if suffix in MAP_SUFFIXES:
         return _of_map(path)
     if suffix in mesh_suffixes():
         vertices, faces = read_geometry(path)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from depthpose.core.camera import Camera, read_camera
+from depthpose.core.camera import CAMERA_SUFFIXES, Camera, read_camera
 from depthpose.core.draw import Scale
 from depthpose.core.errors import InputError
-from depthpose.core.files import cloud_suffixes, image_size, write_json
+from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.pose.mesh import mesh_suffixes
 from depthpose.report.scene import Scene
@@ -71,9 +71,9 @@ MOST_PIXELS = 12_500_000
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", IMAGES),
     "right": ("a picture", IMAGES),
-    "depth": ("a depth image", (".png", ".npy", ".pfm")),
+    "depth": ("a depth image", (".png", *MAP_SUFFIXES)),
     "mask": ("a mask", (".png", ".jpg", ".jpeg", ".bmp")),
-    "camera": ("a camera file", (".json", ".yaml", ".yml", ".xml", ".txt")),
+    "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", cloud_suffixes()),
     "cad": ("a model file", mesh_suffixes()),
 }

@@ -35,3 +35,4 @@ from depthpose.core.camera.rectify import Rectifier as Rectifier
 from depthpose.core.camera.rectify import epipolar_residual as epipolar_residual
 from depthpose.core.camera.rectify import make_rectifier as make_rectifier
 from depthpose.core.camera.rectify import match_features as match_features
+from depthpose.core.camera.stored_camera import CAMERA_SUFFIXES as CAMERA_SUFFIXES

@@ -15,6 +15,8 @@ from depthpose.core.files.disk import refused_as
 from depthpose.core.files.text import MAX_LIST_BYTES
 
 _SUFFIXES = (".yaml", ".yml", ".xml")
+CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt")
+"""Of files that a camera may be read from."""
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
 _D = ("d", "d1", "d2")
 _P = ("p", "projectionmatrix", "p1")

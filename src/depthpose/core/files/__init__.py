@@ -19,6 +19,7 @@ from depthpose.core.files.images import list_images as list_images
 from depthpose.core.files.images import picture_tensor as picture_tensor
 from depthpose.core.files.images import read_image as read_image
 from depthpose.core.files.images import write_image as write_image
+from depthpose.core.files.maps import MAP_SUFFIXES as MAP_SUFFIXES
 from depthpose.core.files.maps import read_depth_png as read_depth_png
 from depthpose.core.files.maps import read_disparity_png as read_disparity_png
 from depthpose.core.files.maps import read_map as read_map

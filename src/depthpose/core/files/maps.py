@@ -21,7 +21,8 @@ from depthpose.core.files.disk import (
 from depthpose.core.files.images import FAST_PNG, opened_image
 from depthpose.core.files.shards import read_bytes
 
-_SUFFIXES = (".npy", ".pfm")
+MAP_SUFFIXES = (".npy", ".pfm")
+"""Of files that hold a map of floats."""
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -45,7 +46,7 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
     if suffix == ".pfm":
         return _read_pfm(path)
     if suffix != ".npy":
-        raise refused_suffix(path, "map", _SUFFIXES)
+        raise refused_suffix(path, "map", MAP_SUFFIXES)
     array = read_npy(path)
     if array.ndim != 2 or array.size == 0:
         raise InputError(f"{path}: a map is (H, W), got {array.shape}; save one channel alone")
@@ -61,8 +62,8 @@ def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
         InputError: the map is empty or holds infinity, the suffix is another, the disk refuses.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise refused_suffix(path, "map", _SUFFIXES)
+    if suffix not in MAP_SUFFIXES:
+        raise refused_suffix(path, "map", MAP_SUFFIXES)
     array = map.detach().cpu().float().contiguous().numpy()
     if array.size == 0 or np.isinf(array).any():
         raise InputError(f"{path}: the map is empty or holds infinity; mark invalid pixels by NaN")
