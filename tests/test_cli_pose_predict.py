@@ -105,7 +105,7 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     out = tmp_path / "out"
     assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "1 inputs: 1 ok" in said
+    assert "1 input: 1 ok" in said
     found = read_predictions(out)[0].estimate
     assert found.camera_from_model is not None
     heads, answer = (re.split(r"  +", line) for line in said.splitlines()[1:3])

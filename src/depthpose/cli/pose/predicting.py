@@ -125,7 +125,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         for line in alternative_lines(prediction.estimate):
             print(f"{prediction.estimate.name}: {line}")
     said = ", ".join(f"{count} {status}" for status, count in sorted(reasons.items()))
-    print(f"{len(predictions)} inputs: {said or 'none readable'}; {out / 'poses.json'}")
+    inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
+    print(f"{inputs}: {said or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
 
 
