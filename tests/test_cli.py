@@ -126,7 +126,7 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
         (["export", "depth", "--out", "d.engine"], "end the name in .onnx"),
         (["export", "depth", "--out", "d.onnx", "--format", "onnx"],
          "'depthpose export depth' has no --format any more: ONNX is the one format"),
-        (["export", "pose", "--format=onnx", "--out", "p.onnx"], "leave --format away"),
+        (["export", "pose", "--format=onnx", "--out", "p.onnx"], "omit --format"),
     ],
 )  # fmt: skip
 def test_wrong_words_are_refused(

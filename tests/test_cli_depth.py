@@ -145,10 +145,10 @@ def test_an_image_unlike_the_known_is_refused_unless_asked_for(
     words = [str(home / "images/0.png"), "--camera", str(home / "cam.json")]
     words += ["--weights", str(tmp_path / "g.safetensors"), "--out"]
     assert main(["depth", "predict", *words, str(tmp_path / "a")]) == 2
-    assert "0: unlike the images that these weights know" in capsys.readouterr().err
+    assert "0: out of distribution for these weights" in capsys.readouterr().err
     assert not (tmp_path / "a/0.depth_m.npy").exists()
     assert main(["depth", "predict", *words, str(tmp_path / "b"), "--with-unlike"]) == 0
-    assert "warning: 0: unlike the images" in capsys.readouterr().err
+    assert "warning: 0: out of distribution" in capsys.readouterr().err
     assert "its depth is a guess" in (tmp_path / "b/0.warning.txt").read_text()
     assert "its depth is a guess" in (tmp_path / "b/report.html").read_text()
 
@@ -171,7 +171,7 @@ def test_where_depth_comes_from_is_one_word(
     capsys.readouterr()
     other = ["--answer", "own", "--matcher", "sgbm", "--out", str(tmp_path / "x")]
     assert main(["depth", "predict", *words, *other]) == 2
-    assert "another matcher matches the synthesised view; leave one away" in capsys.readouterr().err
+    assert "another matcher matches the synthesised view; omit one" in capsys.readouterr().err
 
 
 def test_a_threshold_is_chosen_on_a_folder(

@@ -235,7 +235,7 @@ def test_weights_and_predictions_of_one_name_are_distinguished(
     assert "two predictions by 'x-pose', masks 'truth', are given" in capsys.readouterr().err
     twice = [*words, str(out), "--weights", str(files[0]), str(files[0])]
     assert main(twice) == 2
-    assert "x/pose: 2 that are given bear this name" in capsys.readouterr().err
+    assert "x/pose: 2 that are given have this name" in capsys.readouterr().err
 
 
 def test_predictions_whose_record_names_another_data_set_are_refused(

@@ -197,4 +197,4 @@ def test_masks_of_one_name_are_distinguished_by_their_folders(
     rows = json.loads((tmp_path / "out" / "rows.json").read_text())
     assert {row["masks"] for row in rows} == {"x-found", "y-found"}
     assert main([*words, files[0], files[0]]) == 2
-    assert "x/found: 2 that are given bear this name" in capsys.readouterr().err
+    assert "x/found: 2 that are given have this name" in capsys.readouterr().err

@@ -51,7 +51,7 @@ MISTAKES = {
     ),
     "camera and focal length": (
         "depth.estimate(torch.rand(3, 48, 64), camera, focal_px=50)",
-        "camera and focal_px are both given; leave one of the two away",
+        "camera and focal_px are both given; omit one of the two",
     ),
     "a mapping as a cloud": (
         "pose.estimate(cloud={'points': points}, object='flange')",

@@ -22,7 +22,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'
 
 # Ray's workers are polite (nice 15): on a machine that others keep busy they would get no core.
 os.environ.setdefault("RAY_worker_niceness", "0")
-PATIENCE_S = float(os.environ.get("DEPTHPOSE_PATIENCE_S", "540"))
+SECOND_CTRL_C_S = float(os.environ.get("DEPTHPOSE_PATIENCE_S", "540"))
 """How long a command may take: a worker that starts again loads torch for half a minute where
 cores are shared."""
 
@@ -128,7 +128,7 @@ def run(
     ) as process:  # fmt: skip
         try:
             meanwhile()
-            said, _ = process.communicate(timeout=PATIENCE_S)
+            said, _ = process.communicate(timeout=SECOND_CTRL_C_S)
         finally:
             process.kill()
     assert process.returncode == 0, said[-3000:]
@@ -161,7 +161,7 @@ def test_ten_kills_at_random_moments_lose_nothing(
     moments = sorted(choose.sample(range(1, total // 5 * 2 // 3), 10))
 
     def kill_ten() -> None:
-        shards, until = tmp_path / "out" / "shards", time.monotonic() + PATIENCE_S
+        shards, until = tmp_path / "out" / "shards", time.monotonic() + SECOND_CTRL_C_S
         while len(kills) < 10 and time.monotonic() < until:
             time.sleep(choose.uniform(0.0, 0.3))
             if len(list(shards.glob("*.json"))) < moments[len(kills)]:
@@ -191,7 +191,7 @@ def test_a_killed_command_goes_on_where_it_was(home: Path, tmp_path: Path) -> No
     out = tmp_path / "out"
     words = command(home, str(out), str(repeated(home, 300)), "--block", "10", "--workers", "1")
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        until = time.monotonic() + PATIENCE_S
+        until = time.monotonic() + SECOND_CTRL_C_S
         while len(list((out / "shards").glob("*.json"))) < 5 and time.monotonic() < until:
             time.sleep(0.1)
         process.kill()
@@ -209,7 +209,7 @@ def test_an_address_where_nothing_answers_is_refused(home: Path, tmp_path: Path)
     words = [str(home / "left"), "--address", "127.0.0.1:1"]
     made = subprocess.run(
         command(home, str(tmp_path), *words),
-        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+        capture_output=True, text=True, check=False, timeout=SECOND_CTRL_C_S,
     )  # fmt: skip
     assert made.returncode == 2
     assert "--address 127.0.0.1:1: no Ray cluster answers there" in made.stderr

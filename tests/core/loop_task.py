@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from depthpose.core.loop import (
     AdamConfig,
-    Evidence,
     LoopConfig,
-    Turn,
+    Update,
+    ValidationResult,
     make_adam,
     sample_generator,
     shuffled_index,
@@ -34,20 +34,20 @@ class ToyTask:
             n: (make_adam(m.parameters(), ADAM), ADAM) for n, m in self.modules.items()
         }
 
-    def step(self, batch: tuple[Tensor, Tensor]) -> Iterator[Turn]:
+    def step(self, batch: tuple[Tensor, Tensor]) -> Iterator[Update]:
         time.sleep(self.pause_s)
         x, y = batch
         found = self.modules["regressor"](x)
         discriminator = self.modules["discriminator"]
-        yield Turn(
+        yield Update(
             "discriminator", (discriminator(found.detach()) - discriminator(y)).square().mean(), {}
         )
         loss = (found - y).square().mean() + 0.1 * discriminator(found).square().mean()
-        yield Turn("regressor", self.factor * loss, {"double": 2 * loss.detach()})
+        yield Update("regressor", self.factor * loss, {"double": 2 * loss.detach()})
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         picture = torch.full((3, 4, 4), 0.5)
-        return Evidence(numbers={"held_out/one": 1.0}, pictures={"grey": picture})
+        return ValidationResult(numbers={"held_out/one": 1.0}, pictures={"grey": picture})
 
 
 class ToySamples:

@@ -151,7 +151,7 @@ def test_good_ones_are_read(tmp_path: Path) -> None:
 def test_a_fisheye_that_the_file_denies_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     path.write_text(yaml.safe_dump({"cam0": KALIBR, "cam1": KALIBR}))
-    with pytest.raises(InputError, match=r"'radtan', no fisheye; leave --fisheye away"):
+    with pytest.raises(InputError, match=r"'radtan', no fisheye; omit --fisheye"):
         read_raw_pair(path, is_fisheye=True)
 
 

@@ -20,17 +20,17 @@ from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import (
     AdamConfig,
-    Evidence,
     Interrupted,
     LoopConfig,
     Progress,
+    ValidationResult,
     card_text,
     held_out_text,
-    leave_card,
     read_metrics,
     sample_generator,
     shuffled_index,
     train,
+    write_card,
 )
 from depthpose.core.loop.host import Arithmetic
 
@@ -125,7 +125,7 @@ def test_ctrl_c_twice_finishes_with_the_step_at_hand(
 
 
 def test_ctrl_c_once_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("depthpose.core.loop.host.PATIENCE_S", 0.1)
+    monkeypatch.setattr("depthpose.core.loop.host.SECOND_CTRL_C_S", 0.1)
 
     def press(progress: Progress) -> None:
         if progress.step == 5:
@@ -166,7 +166,7 @@ def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     measured = held_out_text(folder, "Errors (m).")
     assert measured == "Errors (m).\n\n| held out | |\n| --- | --- |\n| error | 0.3333 |"
     facts = {"trained_on": "kitti", "terms": "For research."}
-    leave_card(folder / "net.safetensors", "depth train view", 7300.0, facts, measured)
+    write_card(folder / "net.safetensors", "depth train view", 7300.0, facts, measured)
     title, empty, *lines = (folder / "net.md").read_text().splitlines()
     assert (title, empty) == ("# net", "")
     assert lines[:3] == [
@@ -177,7 +177,7 @@ def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     assert lines[3].startswith("- **Time**: 12 steps in 2.0 h on Linux ")
     assert "\n".join(lines[5:]) == measured
     for seconds, said in ((3.4, "3 s"), (119.0, "119 s"), (300.0, "5 min")):
-        leave_card(folder / "net.safetensors", "", seconds, {}, "")
+        write_card(folder / "net.safetensors", "", seconds, {}, "")
         assert f" steps in {said} on " in (folder / "net.md").read_text()
     assert card_text("net", {"licence": "MIT"}) == "# net\n\n- **Licence**: MIT\n"
 
@@ -273,7 +273,7 @@ def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
 
 def test_validation_sees_the_average_and_leaves_the_weights(tmp_path: Path) -> None:
     class Watched(ToyTask):
-        def validate(self) -> Evidence:
+        def validate(self) -> ValidationResult:
             seen.append(weights(self)["discriminator.weight"].clone())
             return super().validate()
 

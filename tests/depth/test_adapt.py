@@ -23,9 +23,9 @@ from depthpose.depth.losses import photometric_error, smoothness_loss
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher, StereoNetwork
 from depthpose.depth.train import train_adapt
 from depthpose.depth.train.adapt import (
+    AdaptationCheck,
     AdaptMetrics,
     AdaptTask,
-    Guard,
     fine_focal_px,
     refuse_worse,
     split_pairs,
@@ -176,7 +176,7 @@ def test_the_guard_tells_a_worse_matcher(monkeypatch: pytest.MonkeyPatch) -> Non
         return CallableMatcher(lambda *_: truth_px + network.off_px)
 
     monkeypatch.setattr("depthpose.depth.train.adapt.make_matcher", matcher_of)
-    guard = Guard([street.input], 0, MatcherConfig())
+    guard = AdaptationCheck([street.input], 0, MatcherConfig())
     good, bad = guard.measure(Fixed(0.0)), guard.measure(Fixed(5.0))
     assert good.photometric < bad.photometric
     assert good.street_d1 != good.street_d1, "no streets were asked for"

@@ -103,12 +103,12 @@ def test_without_openvino_the_extra_is_named(
 def test_engines_that_cannot_compute_the_weights_are_refused(weights: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="engine is 'tensorrt'; Known: 'openvino', 'torch'"):
         FakestereoNet.load(weights, engine="tensorrt")
-    with pytest.raises(InputError, match="device is 'cuda:7'; leave one of the two away"):
+    with pytest.raises(InputError, match="device is 'cuda:7'; omit one of the two"):
         FakestereoNet.load(weights, engine="openvino", config=MatcherConfig(device="cuda:7"))
     with pytest.raises(InputError, match="engine is 'openvino', and there is no generator"):
         FakestereoNet.load(matcher="sgbm", engine="openvino")
     painter = UNetGenerator(GeneratorConfig(width=2, levels=3))
     path = tmp_path / "painter.safetensors"
     write_depth_weights(path, generator=painter, facts={})
-    with pytest.raises(InputError, match="these weights hold one that paints"):
+    with pytest.raises(InputError, match="these weights hold a U-Net"):
         FakestereoNet.load(path, matcher="sgbm", engine="openvino")

@@ -206,7 +206,7 @@ def test_a_frame_without_depth_is_refused_before_anything_is_written(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--scale", "0"], "--scale 0: units a metre are positive"),
+        (["--scale", "0"], "--scale 0: units per metre must be positive"),
         (["--images", "."], "--images . is for --format colmap"),
     ],
 )

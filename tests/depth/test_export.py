@@ -25,9 +25,9 @@ from depthpose.depth.config import (
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
 from depthpose.depth.export.network import (
-    SizelessLight,
-    SizelessPSMNet,
-    SizelessSelection,
+    DynamicLightStereo,
+    DynamicPSMNet,
+    DynamicSelection,
     gathered_volume,
 )
 from depthpose.depth.stereo import LightStereo, PSMNet
@@ -67,7 +67,7 @@ def tiny_weights(**settings: object) -> DepthWeights:
 @pytest.fixture(scope="module")
 def selection_network() -> Any:  # noqa: ANN401 - an ONNX model
     """The network of :func:`of_all_kinds`, exported once: that is what takes the time."""
-    module, multiple = SizelessSelection(of_all_kinds()).eval(), CONFIG.side_multiple_px
+    module, multiple = DynamicSelection(of_all_kinds()).eval(), CONFIG.side_multiple_px
     return network_model(module, [torch.rand(2, 3, 2 * multiple, 3 * multiple)], multiple)
 
 
@@ -117,7 +117,7 @@ def test_the_graph_of_the_light_network_takes_any_size() -> None:
     torch.nn.init.normal_(light.enlargement.agreement.weight)
     assert light.refinement is not None
     torch.nn.init.normal_(light.refinement.correction.weight)
-    network = SizelessLight(light).eval()
+    network = DynamicLightStereo(light).eval()
     model = network_model(network, [torch.rand(2, 3, 64, 96) for _ in range(2)], 32)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     pair = torch.randn(2, 3, 3, 32, 128).unbind()
@@ -137,7 +137,7 @@ def test_the_sizeless_network_is_the_network(align_corners: bool) -> None:
     matcher = tiny_matcher(align_corners=align_corners)
     pair = torch.randn(2, 2, 3, 48, 64).unbind()
     with torch.no_grad():
-        disparity_px, confidence = SizelessPSMNet(matcher)(*pair)
+        disparity_px, confidence = DynamicPSMNet(matcher)(*pair)
         expected_px = matcher(*pair)[-1]
     assert expected_px.std() > 1
     torch.testing.assert_close(disparity_px, expected_px, rtol=0, atol=2e-3)

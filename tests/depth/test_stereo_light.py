@@ -24,9 +24,9 @@ from depthpose.depth.config import (
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
 from depthpose.depth.stereo.enlargement import (
-    Described,
     Refinement,
     Seen,
+    ViewFeatures,
     agreement_around,
     agreement_of_neighbours,
     enlarge,
@@ -172,7 +172,7 @@ def test_what_the_refinement_corrects_learns_by_a_loss_of_its_own() -> None:
     refinement = Refinement().train()
     torch.nn.init.normal_(refinement.correction.weight)
     half, level = torch.randn(2, 16, 16, 32), torch.zeros(2, 8, 8, 16)
-    seen = Seen(Described(half, (level,) * 4), half.flip(-1))
+    seen = Seen(ViewFeatures(half, (level,) * 4), half.flip(-1))
     found_px = torch.rand(2, 32, 64, requires_grad=True)
     refinement(seen, found_px).square().sum().backward()
     assert found_px.grad is None

@@ -11,7 +11,7 @@ from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 from depthpose.core.rigid import Rigid
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.report.overlay import FOUND, TRUE
-from depthpose.report.pose import PoseShown, pose_section, spreads
+from depthpose.report.pose import PoseShown, pose_section, standard_deviations
 from depthpose.report.tables import Section
 
 POSE = pose_at(seed=1)
@@ -47,7 +47,7 @@ def test_the_numbers_are_those_of_the_estimate() -> None:
     R_t, spread, covariance = section.tables.values()
     for row, (R, t) in zip(R_t, zip(POSE.R.tolist(), POSE.t_m.tolist(), strict=True), strict=True):
         assert [float(cell) for cell in row] == pytest.approx([*R, t], abs=1e-5)
-    turn_deg, origin_mm = spreads(POSE, torch.eye(6).double() * 1e-6)
+    turn_deg, origin_mm = standard_deviations(POSE, torch.eye(6).double() * 1e-6)
     assert [float(cell) for cell in spread[1][1:]] == pytest.approx(turn_deg, abs=1e-3)
     assert [float(cell) for cell in spread[2][1:]] == pytest.approx(origin_mm, abs=1e-3)
     assert [float(row[k]) for k, row in enumerate(covariance)] == [1e-6] * 6
@@ -99,9 +99,9 @@ def test_a_turn_about_the_camera_moves_an_origin_that_is_far_from_it() -> None:
     pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
     covariance = torch.zeros(6, 6)
     covariance[1, 1] = 0.01**2  # about y: two metres ahead, sideways by 20 mm
-    turn_deg, origin_mm = spreads(pose, covariance)
+    turn_deg, origin_mm = standard_deviations(pose, covariance)
     assert turn_deg == pytest.approx([0.0, math.degrees(0.01), 0.0], rel=1e-5)
     assert origin_mm == pytest.approx([20.0, 0.0, 0.0], rel=1e-5)
     # A translation that takes the turn back leaves the origin where it is.
     covariance[3, 3], covariance[1, 3], covariance[3, 1] = 0.02**2, -0.0002, -0.0002
-    assert spreads(pose, covariance)[1] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    assert standard_deviations(pose, covariance)[1] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)

@@ -6,7 +6,7 @@ from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tin
 from depthpose.core.files import Cloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
-from depthpose.report.overlay import TRUE, bent_edges, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.overlay import TRUE, crease_edges, keypoint_layers, pose_layers, vote_layer
 from depthpose.report.scene import Lines
 
 
@@ -25,11 +25,11 @@ def lengths(ends_m: torch.Tensor) -> list[float]:
 
 def test_the_edges_of_a_cube_are_twelve_and_no_diagonal() -> None:
     for model in (cube(), cube(with_repeats=True)):
-        assert lengths(bent_edges(model)) == [1.0] * 12
+        assert lengths(crease_edges(model)) == [1.0] * 12
 
 
 def test_an_open_sheet_shows_its_border() -> None:
-    assert lengths(bent_edges(cube(faces=2))) == [1.0] * 4
+    assert lengths(crease_edges(cube(faces=2))) == [1.0] * 4
 
 
 def test_a_posed_model_lies_where_its_pose_says() -> None:

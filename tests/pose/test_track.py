@@ -9,7 +9,7 @@ from tests.pose.synthetic_objects import K, Oracle, bracket, pose_at, tiny_weigh
 from depthpose.core.camera import Camera, back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.estimator.track import Followed, track
+from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import (
     Prediction,
@@ -132,7 +132,7 @@ def test_what_else_it_may_be_moves_along() -> None:
     )  # fmt: skip
     net = oracle(poses)
     model = net.weights.models[0]
-    known = Followed(
+    known = TrackedObject(
         model=model, surface=prepare_surface(model), refusal=net.weights.refusal,
         icp=net.config.icp, look=lambda _: start,
     )  # fmt: skip

@@ -53,7 +53,12 @@ from depthpose.pose.train.held_out import (
 )
 from depthpose.pose.train.task import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
-from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+from depthpose.pose.weights import (
+    PoseWeights,
+    read_pose_network,
+    read_pose_weights,
+    write_pose_weights,
+)
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "pose"
 _SMALL = ResUNetConfig(classes=2, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
@@ -282,14 +287,18 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
         train_pose(_training(), Run(folder=tmp_path / "run"))
 
 
-def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> None:
+@pytest.mark.parametrize("with_meshes", [True, False])
+def test_a_training_begins_with_what_other_objects_taught(
+    tmp_path: Path, with_meshes: bool
+) -> None:
     first = train_pose(_training(), Run(folder=tmp_path / "first"))
+    write_pose_weights(first, read_pose_weights(first), with_meshes=with_meshes)
     loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
     still = AdamConfig(learning_rate=1e-9)
     parts = ModelsConfig(parts=("bracket", "mug"))
     config = _training(models=parts, start=str(first), adam=still, loop=loop)
     then = train_pose(config, Run(folder=tmp_path / "then"))
-    networks = [read_pose_weights(path).network for path in (first, then)]
+    networks = [read_pose_network(path) for path in (first, then)]
     cloud = TrainingClouds(_models(), _VIEWS, None, _CLOUD, seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
     seen = [n.point_features(voxels).detach() for n in networks if isinstance(n, ResUNet)]

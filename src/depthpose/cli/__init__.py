@@ -35,7 +35,7 @@ COMMANDS = {
     "pose train": ("pose.training:train", "your CAD file, or a config, to a network that poses it"),
     "pose calibrate": (
         "pose.training:calibrate",
-        "choose anew how uncertain a pose may be before it is refused",
+        "recalibrate the risk above which a pose is refused",
     ),
     "pose evaluate": ("pose.commands:evaluate", "measure poses on a BOP or LineMOD data set"),
     "depth match": ("depth.commands:match", "a real stereo pair, or many, to metric depth"),
@@ -46,7 +46,7 @@ COMMANDS = {
     ),
     "depth calibrate": (
         "depth.training:calibrate",
-        "choose how unlike its training data an image may be",
+        "set when an image is refused as out of distribution",
     ),
     "depth evaluate": ("depth.commands:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
@@ -117,8 +117,8 @@ COMMANDS = {
     "figure 3-4": ("thesis.figures:figure_3_4", "true and predicted directions to a keypoint"),
     "figure 3-5": ("thesis.figures:figure_3_5", "boxes of true and estimated poses"),
 }
-_GONE = {
-    ("export", "--format"): "ONNX is the one format; leave --format away",
+_REMOVED_OPTIONS = {
+    ("export", "--format"): "ONNX is the one format; omit --format",
     ("reproduce", "--made"): "synthetic views are asked for by --synthetic",
 }
 """Options of before, by the first word of their command, and what to do instead."""
@@ -158,7 +158,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno not in _OF_THE_DISK:
             raise
-        return _fail(f"error: {_said_of(error)}")
+        return _fail(f"error: {_message_of(error)}")
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
@@ -171,7 +171,7 @@ def _fail(reason: str, code: int = 2) -> int:
     return code
 
 
-def _said_of(error: OSError) -> str:
+def _message_of(error: OSError) -> str:
     from tempfile import gettempdir
 
     place = error.filename or f"a temporary file in {gettempdir()}"
@@ -248,7 +248,7 @@ def _run(name: str, rest: list[str]) -> int:
 def _refuse_gone(name: str, rest: list[str]) -> None:
     for word in rest:
         option = word.partition("=")[0]
-        if remedy := _GONE.get((name.partition(" ")[0], option)):
+        if remedy := _REMOVED_OPTIONS.get((name.partition(" ")[0], option)):
             raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from depthpose.core.errors import InputError, install_words
+from depthpose.core.errors import InputError, install_command
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -77,7 +77,7 @@ def _extras() -> Iterator[str]:
         if not _is_installed(package):
             lacking[extra].append(package)
     for extra, packages in lacking.items():
-        how = f"lacks {', '.join(packages)}: {install_words(extra)}"
+        how = f"lacks {', '.join(packages)}: {install_command(extra)}"
         yield f"extra {extra}: {how if packages else 'installed'}"
 
 

@@ -45,7 +45,7 @@ _MOST = 0.5
 
 @dataclass(kw_only=True)
 class Seen:
-    """A file, what it is, what is odd, and what the others are held against."""
+    """A file, what it is, what is odd, and what the others are compared with."""
 
     path: Path
     what: str = ""
@@ -265,7 +265,7 @@ def _beside_camera(one: Seen, camera: Camera) -> Iterator[str]:
 
 
 def _look_at_pair(seen: Sequence[Seen]) -> tuple[str, bool] | None:
-    """Hold two pictures of one size against each other: a pair, the left one first."""
+    """Compare two pictures of one size: a pair, the left one first."""
     pictures = [one for one in seen if one.image is not None]
     if len(pictures) != 2 or pictures[0].size != pictures[1].size:
         return None

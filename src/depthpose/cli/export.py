@@ -58,9 +58,9 @@ def export_pose(out: Path, weights: str = "parts") -> int:
 
 
 def _facts(weights: str, path: Path, card: Any) -> dict[str, Any]:  # noqa: ANN401
-    from depthpose.core.checkpoint import file_sha256, say_terms
+    from depthpose.core.checkpoint import file_sha256, warn_of_terms
 
-    say_terms(card)
+    warn_of_terms(card)
     own = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
     return {**card, **own}
 

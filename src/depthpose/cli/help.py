@@ -99,7 +99,7 @@ def group(options: type[Group]) -> type[Group]:
 
 
 def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Let a function that stands for a command look like it to tyro, with each option in words.
+    """Give a wrapper the signature of its command, with option types in words, for tyro.
 
     Groups of options, which are dataclasses, have words of their own.
     """
@@ -110,14 +110,14 @@ def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], C
             hints[name] = Annotated[hints[name], in_words(_metavar(name, hints[name]))]
     worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
 
-    def dress(given: Callable[..., int]) -> Callable[..., int]:
+    def with_signature(given: Callable[..., int]) -> Callable[..., int]:
         function = unwrap(given)  # tyro looks behind what checks types in tests, and so do we
         function.__doc__, function.__module__ = command.__doc__, command.__module__
         function.__annotations__ = hints
         vars(function)["__signature__"] = shape.replace(parameters=worded)
         return function
 
-    return dress
+    return with_signature
 
 
 def _hint(default: str) -> str:

@@ -152,14 +152,14 @@ def pack_weights(
             the packed weights are kept too.
         half: store 16-bit floats: half the size.
     """
-    from depthpose.core.checkpoint import bound_facts, find_weights, say_terms
+    from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
     refuse_to_replace(out)
     found = read_depth_weights(find_weights(weights))
     made_of = [weights] if matcher is None else [weights, matcher]
-    say_terms(bound_facts({}, made_of))
+    warn_of_terms(bound_facts({}, made_of))
     facts = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
     write_depth_weights(
         out,

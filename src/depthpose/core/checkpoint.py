@@ -208,7 +208,7 @@ def save_imported(
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
 
 
-def say_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
+def warn_of_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
     """Warn of the terms of use of weights that have any."""
     if terms := facts.get("terms", ""):
         warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
@@ -251,7 +251,7 @@ def _opened_safetensors(path: Path) -> Iterator[Any]:
     """Open the header of a file; whatever is raised of what it holds is an input error."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such weights file.")
-    remedy = "a published checkpoint is brought in by 'depthpose weights import'"
+    remedy = "a published checkpoint is imported by 'depthpose weights import'"
     with refused_as(path, "safetensors file", remedy), safe_open(path, framework="pt") as file:
         yield file
 
@@ -267,7 +267,7 @@ def _interpreted(
     if "kind" not in metadata or "config" not in metadata:
         raise InputError(
             f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A published "
-            "checkpoint is brought in by 'depthpose weights import'."
+            "checkpoint is imported by 'depthpose weights import'."
         )
     found = metadata.pop("kind")
     if kind is not None and found != kind:

@@ -1,4 +1,4 @@
-"""YAML to frozen dataclass and back. One text: the dataclass is default, check, help and record."""
+"""YAML to frozen dataclass and back. The dataclass has defaults, checks and help."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def write_config(path: Path, config: object) -> None:
 
 
 def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
-    """Lay nested differences over the defaults of ``kind``, which may differ from their class's.
+    """Merge nested differences into the defaults of ``kind``, which may differ from their class's.
 
     A setting given instead of another (``INSTEAD`` in its class) removes that one's default.
     """

@@ -19,17 +19,17 @@ class MissingExtraError(ImportError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(
-            f"{purpose} needs {package}, which is not installed: {install_words(extra)}"
+            f"{purpose} needs {package}, which is not installed: {install_command(extra)}"
         )
 
 
-def install_words(extra: str) -> str:
+def install_command(extra: str) -> str:
     """Say how an extra is installed; the package index has no release yet."""
     return f"pip install -e '.[{extra}]' in the clone of depthpose"
 
 
 class Notice(UserWarning):
-    """Something to know that stops nothing; the command line prints it as one line."""
+    """A warning that stops nothing; the command line prints it as one line."""
 
 
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types

@@ -32,12 +32,12 @@ def write_once(record: Path, content: Mapping[str, Any]) -> None:
         own.unlink(missing_ok=True)
 
 
-_held: dict[Path, int] = {}
+_locks: dict[Path, int] = {}
 """Records of the folders that this process writes to, locked, and their descriptors."""
 
 
 def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
-    """Keep other commands out of a folder until :func:`release_folders`, or the process ends.
+    """Lock a folder against other commands until :func:`release_folders`, or the process ends.
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
     Where the file system or the machine has none, nothing is held.
@@ -54,7 +54,7 @@ def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
         InputError: another command holds the folder, and goes on holding it; or nothing can be
             written there.
     """
-    if fcntl is None or record.resolve() in _held:
+    if fcntl is None or record.resolve() in _locks:
         return False
     with refused_write(record):
         file = os.open(record, os.O_RDWR)
@@ -75,11 +75,11 @@ def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
             os.close(file)
             return False
         else:
-            _held[record.resolve()] = file
+            _locks[record.resolve()] = file
             return not is_shared
 
 
 def release_folders() -> None:
     """Let other commands into the folders that this process has claimed."""
-    while _held:
-        os.close(_held.popitem()[1])
+    while _locks:
+        os.close(_locks.popitem()[1])

@@ -120,13 +120,13 @@ def _explained(name: str) -> Iterator[None]:
     except errors.RepositoryNotFoundError as error:
         raise InputError(
             f"{name}: there is no such repository, or it is private: check the name, or "
-            "'hf auth login' as one who may see it."
+            "'hf auth login' with an account that may read it."
         ) from error
     except errors.RevisionNotFoundError as error:
         raise InputError(f"{name}: the repository has no such revision.") from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         raise InputError(
-            f"{name}: the hub cannot be reached, and the cache has not got it. Connect once, unset "
+            f"{name}: the hub cannot be reached, and it is not in the cache. Connect once, unset "
             "HF_HUB_OFFLINE, or copy the repository's folder here and give its path."
         ) from error
     except errors.EntryNotFoundError as error:
@@ -136,12 +136,12 @@ def _explained(name: str) -> Iterator[None]:
         ) from error
     except (OSError, *_http_errors()) as error:  # of the connection, of access, of a full disk
         raise InputError(
-            f"{name}: the hub did not do it: {_short(error)}. To upload, 'hf auth login' first."
+            f"{name}: the hub refused: {_short(error)}. To upload, 'hf auth login' first."
         ) from error
 
 
 def _http_errors() -> tuple[type[Exception], ...]:
-    """Give what the library's own errors are kinds of: requests', httpx's or its heir's."""
+    """Give the base classes of the library's errors: of requests, of httpx or its successor."""
     own = import_module("huggingface_hub.errors").HfHubHTTPError
     return tuple(kind for kind in own.__mro__[1:] if kind.__module__ != "builtins")
 
@@ -184,7 +184,7 @@ def find_weights(name: str | Path) -> Path:
         )
     raise InputError(
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
-        f"{nearest_name(str(name), shipped)} 'depthpose weights import' brings in published ones, "
+        f"{nearest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
         "hf://OWNER/NAME those on the hub."
     )
 

@@ -26,7 +26,7 @@ _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """Which of several processes this one is; they share the work and meet in the files.
+    """Rank of this process among several that share the work through files.
 
     Attributes:
         rank: 0 .. world - 1.
@@ -73,7 +73,7 @@ def wait_for(
         patience_s: how long nothing new may appear: a process that died finishes nothing.
 
     Raises:
-        InputError: patience is at its end; what is missing is named.
+        InputError: the time is up; what is missing is named.
     """
     missing = [name for name in names if not is_there(name)]
     last_news = time.monotonic()
@@ -105,7 +105,7 @@ def environment() -> dict[str, str]:
 def claim_folder(
     folder: Path, settings: Mapping[str, Any], results: Iterable[str | Path] = ()
 ) -> None:
-    """Make ``folder`` the home of a run with these settings, or continue such a run.
+    """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
     It is this process's until :func:`depthpose.core.hold.release_folders`, and that of all
     processes of one launch. What a killed run left half written in it is removed.

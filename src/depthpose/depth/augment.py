@@ -84,7 +84,7 @@ def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
 
 
 def _veiled(image: Picture, draw: _Draw) -> Picture:
-    """Lay haze over the image: a share of one light grey everywhere."""
+    """Add haze to the image: a share of one light grey everywhere."""
     return torch.lerp(image, torch.full_like(image, draw.between(0.5, 1.0)), draw.between(0.0, 0.4))
 
 

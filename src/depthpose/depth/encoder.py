@@ -86,7 +86,7 @@ class LiteEncoder(nn.Module):
         return features
 
     def freeze_early(self) -> None:
-        """Keep what ImageNet taught the first layers: edges and colours are the same everywhere."""
+        """Freeze the first layers: their ImageNet features (edges, colours) need no training."""
         for part in (self.stem, *self.blocks[: self._frozen]):
             part.requires_grad_(False)
 

@@ -20,7 +20,7 @@ class StereoInput:
         name: what the files made from this input are called.
         left: left (reference) image, RGB in [0, 1].
         right: right image of the rectified pair, or None for one image alone. That its size is
-            the left one's is for the estimator to check: it is the user's to get wrong.
+            the left one's is checked by the estimator.
         camera: intrinsics of the left image; its baseline makes disparity metric.
     """
 
@@ -85,7 +85,7 @@ class DepthEstimate:
         is_sky: where the image shows the sky, or None where the weights do not know it.
         familiarity: mean confidence of the generator over the image, 0..1: how well its weights
             know such images. None for pairs, and where the generator has no confidence.
-        warning: what speaks against the whole of it, such as an image unlike those that the
+        warning: why the whole estimate is doubtful, such as an image unlike those that the
             weights know; else empty.
         seen: what it was estimated from, for its colours and camera; None where files hold the
             estimate alone.

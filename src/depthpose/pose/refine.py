@@ -216,7 +216,7 @@ def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
 def _worth(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> Float64[Tensor, " b"]:
-    """Say what speaks for each pose: the share of points near the surface, less what contradicts.
+    """Score each pose: share of points near the surface, less distance and contradictions.
 
     The first pose is trusted by ``_TRUST`` more.
     """
@@ -301,7 +301,7 @@ def _normal_equations(
     J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
     weighted = J.mT * weight[..., None, :]
     H = weighted @ J
-    # A direction that no point speaks of stays where it was.
+    # A direction that no point constrains stays where it was.
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
     H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
     return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight

@@ -37,7 +37,7 @@ class CloudInput:
         points_m: the visible part of one object, in the camera frame (x right, y down, z forward).
         object: name of the object, as its :class:`ObjectModel` carries it.
         view: the depth image that the points are of, where there is one: what the camera saw
-            through a pose speaks against it.
+            through a pose is evidence against it.
     """
 
     name: str
@@ -238,7 +238,7 @@ class Alternative:
         probability: that it is the right one, 0..1.
         difference: from the estimate's own pose, in words: "turned by 180 degrees about the long
             axis".
-        signals: what speaks against it, by name; not kept in files.
+        signals: evidence against it, by name; not kept in files.
     """
 
     camera_from_model: Rigid
@@ -259,7 +259,7 @@ class PoseEstimate:
         camera_from_model: the pose; None where it is refused.
         keypoints_m: the found keypoints in the camera frame.
         covariance: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn
-            off may have one of 0.2 degrees; what speaks of such errors is ``risk``. Finite: it
+            off may have one of 0.2 degrees; such errors are covered by ``risk``. Finite: it
             leaves out the motions of ``free_motions``.
         free_motions: unit vectors of (rotation, translation) along which a declared continuous
             symmetry makes the variance infinite; no row where there is none.

@@ -156,37 +156,49 @@ def read_pose_weights(path: Path) -> PoseWeights:
         InputError: no such weights, a part that is missing, or weights that do not fit their own
             config.
     """
-    checkpoint = read_checkpoint(path)
-    if checkpoint.kind not in _NETWORKS:
-        raise InputError(
-            f"{path}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
-            f"{', '.join(map(repr, _NETWORKS))}."
-        )
+    checkpoint, source = read_checkpoint(path), str(path)
+    network = _network_of(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         raise InputError(
             f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
             f"in once: depthpose weights complete {path.stem} --models FOLDER --out "
             f"{path.stem}-complete.safetensors, with the data set's folder."
         )
-    source = str(path)
-    parts = {name: _part(checkpoint, name, source) for name in ("network", "cloud", "refusal")}
+    parts = {name: _part(checkpoint, name, source) for name in ("cloud", "refusal")}
     records = checkpoint.config.get("models")
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
-    made, kind = _NETWORKS[checkpoint.kind]
-    config = config_from_dict(parts["network"], kind, source=source)
-    held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
-    network = build_network(lambda: made(config), held, source)
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
         models = tuple(_read_model(checkpoint, k, source) for k in range(len(records)))
     _refuse_strays(checkpoint, len(models), source)
     return PoseWeights(
-        network=network.eval(),
+        network=network,
         models=models,
         cloud=config_from_dict(parts["cloud"], CloudConfig, source=source),
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
         facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
     )
+
+
+def read_pose_network(path: Path) -> AnyNetwork:
+    """Read the network alone, in eval mode, of weights with or without their objects' surfaces.
+
+    Raises:
+        InputError: no such weights, or weights that do not fit their own config.
+    """
+    return _network_of(read_checkpoint(path), str(path))
+
+
+def _network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
+    if checkpoint.kind not in _NETWORKS:
+        raise InputError(
+            f"{source}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
+            f"{', '.join(map(repr, _NETWORKS))}."
+        )
+    made, kind = _NETWORKS[checkpoint.kind]
+    config = config_from_dict(_part(checkpoint, "network", source), kind, source=source)
+    held = dataclasses.replace(checkpoint, state=_under(checkpoint, "network."))
+    return build_network(lambda: made(config), held, source).eval()
 
 
 def _record_of(model: ObjectModel) -> dict[str, Any]:

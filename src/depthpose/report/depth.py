@@ -1,4 +1,4 @@
-"""Depth on a page: picture, depth, confidence, right view, error, and the cloud that turns."""
+"""Depth on a page: picture, depth, confidence, right view, error, and the cloud in 3D."""
 
 from dataclasses import dataclass
 
@@ -111,7 +111,7 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
     return facts
 
 
-def said_grey(found: DepthEstimate) -> str:
+def grey_caption(found: DepthEstimate) -> str:
     """Say what grey is in the picture of an estimate."""
     return "grey: none" if found.is_sky is None else "grey: sky or no answer"
 
@@ -131,12 +131,12 @@ def _map_drawing(shown: DepthShown) -> Drawing:
     if found.depth_m is None:
         return Drawing(
             image=draw_disparity(found.disparity_px),
-            caption=f"estimated disparity, large (near) bright; {said_grey(found)}",
+            caption=f"estimated disparity, large (near) bright; {grey_caption(found)}",
             scale=rising_scale("disparity [px]", 96.0, has_more=True),
         )
     return Drawing(
         image=draw_depth(found.depth_m, *shown.range_m),
-        caption=f"estimated depth, near bright and far dark; {said_grey(found)}",
+        caption=f"estimated depth, near bright and far dark; {grey_caption(found)}",
         scale=depth_scale(*shown.range_m),
     )
 

@@ -72,7 +72,7 @@ def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     return corners[torch.tensor(pairs)]
 
 
-def bent_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
+def crease_edges(model: ObjectModel) -> Float[Tensor, "n 2 3"]:
     """Give both ends of the edges where the surface ends, or bends by more than 30 degrees [m]."""
     # By place, not by number: STL repeats the points of every face.
     places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
@@ -104,7 +104,7 @@ def pose_layers(
         return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
 
     box_m = posed(box_edges(model))
-    edges_m = posed(bent_edges(model)) if len(model.faces) else None
+    edges_m = posed(crease_edges(model)) if len(model.faces) else None
     if is_true:
         layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
         if edges_m is not None:

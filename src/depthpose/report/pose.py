@@ -128,7 +128,7 @@ def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
         rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
         tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
     if pose is not None and found.covariance is not None:
-        turn_deg, origin_mm = spreads(pose, found.covariance)
+        turn_deg, origin_mm = standard_deviations(pose, found.covariance)
         tables["standard deviations along the camera's axes, about this answer alone"] = [
             ["", "x", "y", "z"],
             ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
@@ -140,7 +140,9 @@ def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
     return tables
 
 
-def spreads(pose: Rigid, covariance: Float[Tensor, "6 6"]) -> tuple[list[float], list[float]]:
+def standard_deviations(
+    pose: Rigid, covariance: Float[Tensor, "6 6"]
+) -> tuple[list[float], list[float]]:
     """Give the standard deviations of the rotation [deg] and of the model's origin [mm].
 
     The perturbation is a left one: a rotation about the camera moves an origin at t by

@@ -29,11 +29,11 @@ from depthpose.web.depth import answer_depth
 from depthpose.web.examples import depth_example, pose_example
 from depthpose.web.guard import (
     LOOPBACK,
-    Guard,
+    AdaptationCheck,
+    crash_response,
+    error_response,
     read_form,
     refuse_size,
-    say_crash,
-    say_error,
     zip_files,
 )
 from depthpose.web.pose import answer_pose
@@ -217,6 +217,6 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
             Route("/queue/{ticket}", pages.place),
             Route("/results/{key}/{name}", pages.download),
         ],
-        middleware=[Middleware(Guard, hosts=limits.hosts)],
-        exception_handlers={HTTPException: say_error, Exception: say_crash},
+        middleware=[Middleware(AdaptationCheck, hosts=limits.hosts)],
+        exception_handlers={HTTPException: error_response, Exception: crash_response},
     )

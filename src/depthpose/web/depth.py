@@ -12,7 +12,7 @@ from depthpose.depth.estimator.rig import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.depth import depth_facts, depth_scene, said_grey
+from depthpose.report.depth import depth_facts, depth_scene, grey_caption
 from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 _MOST_WORK_PIXELS = 8_000_000
@@ -138,7 +138,9 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
 
 def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, float]) -> list[Shown]:
     name = pair.name
-    colors = f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {said_grey(found)}"
+    colors = (
+        f"near bright and far dark, {{:g}} m to {{:g}} m by the logarithm; {grey_caption(found)}"
+    )
     pictures = [
         Shown(file=f"{name}.input.jpg", caption="the image"),
         Shown(

@@ -28,7 +28,7 @@ _SAFE = {
 _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 
 
-class Guard:
+class AdaptationCheck:
     """Refuses requests from other pages, and tells the browser what this page may load.
 
     Args:
@@ -127,13 +127,13 @@ def zip_files(files: Mapping[str, bytes]) -> bytes:
     return packed.getvalue()
 
 
-async def say_error(_: Request, error: Exception) -> Response:
+async def error_response(_: Request, error: Exception) -> Response:
     """Answer a refusal with its message."""
     assert isinstance(error, HTTPException)
     return _sentence(error.status_code, error.detail, error.headers)
 
 
-async def say_crash(_: Request, error: Exception) -> Response:
+async def crash_response(_: Request, error: Exception) -> Response:
     """Answer an unexpected error; the trace is on the server's terminal."""
     kind = type(error).__name__
     return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")

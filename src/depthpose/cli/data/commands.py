@@ -62,7 +62,7 @@ class ExportOptions:
     images: Path | None = None
     """of colmap: folder that image names are relative to; by default that of each image."""
     scale: float = 1.0
-    """units of the reconstruction in a metre."""
+    """units of the reconstruction per metre."""
 
     def refuse_unusable(self, format: str) -> None:
         """Refuse a scale out of its range, and images of another format.
@@ -72,7 +72,7 @@ class ExportOptions:
         """
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise InputError(
-                f"--scale {self.scale:g}: units a metre are positive; 1 where metres are meant"
+                f"--scale {self.scale:g}: units per metre must be positive; 1 for metres"
             )
         if self.images is not None and format != "colmap":
             raise InputError(f"--images {self.images} is for --format colmap; remove it")
@@ -201,7 +201,7 @@ def label(
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
     Writes a folder of pairs that every training takes. Such labels are no better than their
-    matcher; one that was trained on evaluation frames passes these on.
+    matcher; one that was trained on evaluation frames leaks them into the labels.
 
         depthpose data label my-pairs --out my-pairs-labelled
 

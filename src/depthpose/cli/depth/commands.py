@@ -85,7 +85,7 @@ def _predict_on_ray(
             f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
             "file of both by 'depthpose weights pack G --matcher S --out W'"
         )
-    recipe = engine.NetRecipe(
+    recipe = engine.NetSpec(
         weights=Weights.read(networks.weights),
         config=config,
         with_right=False,
@@ -164,7 +164,7 @@ def _match_on_ray(
 ) -> int:
     from depthpose.cli.depth import engine as engine_depth
 
-    recipe = engine_depth.NetRecipe(
+    recipe = engine_depth.NetSpec(
         weights=None if weights is None else Weights.read(weights),
         config=config,
         with_right=True,

@@ -48,7 +48,7 @@ PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetRecipe:
+class NetSpec:
     """What a worker builds its networks of; without weights it is OpenCV's matcher."""
 
     weights: Weights | None
@@ -83,7 +83,7 @@ class NetRecipe:
 class PredictWork:
     """Single images to the files of their depth."""
 
-    recipe: NetRecipe
+    recipe: NetSpec
     lens: Lens
     look: PredictOutput
     files: Files = IMAGES
@@ -105,7 +105,7 @@ class PredictWork:
 class MatchWork:
     """Stereo pairs to the files of their depth."""
 
-    recipe: NetRecipe
+    recipe: NetSpec
     rig: StereoRig
     with_cloud: bool
     files: Files = PAIRS
@@ -120,7 +120,7 @@ class MatchWork:
 def predict(
     words: Sequence[str],
     given: tuple[Path | None, float | None],
-    recipe: NetRecipe,
+    recipe: NetSpec,
     look: PredictOutput,
     out: str,
     options: EngineOptions,
@@ -128,7 +128,7 @@ def predict(
     """Predict by an engine; ``given`` is the camera's file, or its focal length [px]."""
     video = next((word for word in words if word.lower().endswith(tuple(VIDEO_SUFFIXES))), None)
     if video is not None:
-        raise InputError(f"{video}: --engine ray takes no videos; leave --engine away for them")
+        raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, IMAGES)
     with inputs.first() as (image,):
         lens = read_lens(*given, image)
@@ -142,7 +142,7 @@ def predict(
 def match(
     words: Sequence[str],
     camera: Path,
-    recipe: NetRecipe,
+    recipe: NetSpec,
     out: str,
     options: EngineOptions,
     *,

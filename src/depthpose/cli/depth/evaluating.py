@@ -153,7 +153,7 @@ def measure_each(
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Write into each row whose predictions it is of.
+    """Add the source of the predictions to each row.
 
     Args:
         result: of one set of predictions.

@@ -88,7 +88,7 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
     assert pair.right is not None
     assert isinstance(method.net, FakestereoNet)
     if not isinstance(method.net.matcher, TiledMatcher):
-        raise InputError(f"--tile: {method.name} matches no tiles; leave --tile away")
+        raise InputError(f"--tile: {method.name} matches no tiles; omit --tile")
     change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
     print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
 

@@ -47,9 +47,9 @@ def weights_method(
         weights: the file; what it holds decides what is built.
         config: how the matcher runs.
         with_right: give it the real right view; by default only to a matcher, which needs it.
-        matcher: what matches the drawn view: None (the weights' own), sgbm (OpenCV's), or that of
+        matcher: for the synthesised view: None (the weights' own), sgbm (OpenCV's), or that of
             other weights, by name or file.
-        with_unlike: answer images unlike what the weights know too, as a measurement must.
+        with_unlike: answer out-of-distribution images too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
     Raises:
@@ -93,7 +93,7 @@ def _matched_by(
     is_shown: bool,
     with_unlike: bool,
 ) -> Method:
-    """Build the network of weights whose drawn view is matched by OpenCV, or by other weights."""
+    """Build the network of a generator whose view is matched by OpenCV, or by other weights."""
     if matcher == "sgbm":
         name, other, used = "sgbm", "sgbm", SGBMConfig(with_filled_holes=True)
     else:

@@ -94,7 +94,7 @@ class PairNetworks:
         if self.weights is not None:
             raise InputError(
                 f"--weights {self.weights} and --matcher {self.matcher}: one of the two matches "
-                "the pair; leave the other away"
+                "the pair; omit the other"
             )
         return None if self.matcher == "sgbm" else self.matcher
 
@@ -112,19 +112,19 @@ class ImageNetworks:
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
     joined: both. Default: what the weights say; with --matcher, matched."""
     with_unlike: bool = False
-    """answer images that are unlike the training images too, with a warning (NAME.warning.txt), in
+    """also answer out-of-distribution images, with a warning (NAME.warning.txt), in
     place of refusing them."""
 
     def refuse_contradiction(self, matching: MatcherOptions) -> None:
         """Refuse options that exclude each other.
 
         Raises:
-            InputError: which, and what to leave away.
+            InputError: which, and what to omit.
         """
         if self.matcher is not None and self.answer is not None:
             raise InputError(
                 f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
-                "synthesised view; leave one away."
+                "synthesised view; omit one."
             )
         if self.matcher == "sgbm" and matching != MatcherOptions():
             raise InputError(

@@ -39,7 +39,7 @@ class PairsOptions:
             return dataclasses.replace(chosen, pairs=pairs)
         if not hasattr(chosen, "held_out"):
             raise InputError(
-                "--held-out has no meaning for 'adapt', which keeps a share of the pairs back "
+                "--held-out has no meaning for 'adapt', which holds out a share of the pairs "
                 "itself (kept_back in the config); leave it out."
             )
         held_out = chosen.held_out or PairsConfig(
@@ -56,7 +56,7 @@ class BeginningOptions:
     generator: str | None = None
     """finetune: weights of the generator to begin with."""
     matcher: str | None = None
-    """finetune: what matches the drawn view: weights with a matcher, by name or file, which are not
+    """finetune: for the synthesised view: weights with a matcher, by name or file, which are not
     changed."""
     start: str | None = None
     """view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default."""
@@ -89,12 +89,12 @@ def train(
 ) -> int:
     """Train a generator, the matcher, or the first through the second, by stages.
 
-        view      the thesis's generator, which paints the right view; needs pairs
-        select    a generator that looks the right view up in the left image, and answers depth
+        view      the thesis's generator, a U-Net (pix2pix) for the right view; needs pairs
+        select    a generator that warps the left image to the right view, and estimates depth
                   itself; needs pairs with truth
         stereo    the matcher; needs pairs with truth
         adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. A fifth
-                  of them is kept back, and weights are written only if these fit better and
+                  of them is held out, and weights are written only if these fit better and
                   synthetic streets no worse
         finetune  either generator through the frozen matcher; needs weights of both
 
@@ -135,7 +135,7 @@ def calibrate(
     split: str | None = None,
     device: Device = "cpu",
 ) -> int:
-    """Choose when one image is refused as unlike what weights know.
+    """Set below which confidence an image is refused as out of distribution.
 
     The mean confidence is measured on images like those of the training. The threshold below which
     'depth predict' refuses is set so that a share of them is refused. Tensors stay as they are.

@@ -123,7 +123,7 @@ def _refuse_other_masks(words: Sequence[str], inputs: Inputs) -> None:
         depth, mask = map(stem, item.files)
         if depth != mask and len(inputs.items) > 1:
             raise InputError(
-                f"{words[1]}: no mask called {depth!r}; the mask of a depth image bears its name"
+                f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"
             )
 
 

@@ -83,7 +83,7 @@ def view_jobs(
     lost = [path.stem for path in depths if path.stem not in masks]
     if lost:
         raise InputError(
-            f"{mask}: no mask called {lost[0]!r}; the mask of a depth image bears its name"
+            f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
     return [
         input_job(

@@ -192,7 +192,7 @@ def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
     for some, count in Counter(parts).items():
         if count > 1:
             raise InputError(
-                f"{'/'.join(some[-2:])}: {count} that are given bear this name, and their results "
+                f"{'/'.join(some[-2:])}: {count} that are given have this name, and their results "
                 "would be one; give it once, or rename a file"
             )
     names: list[str] = []

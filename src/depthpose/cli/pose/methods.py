@@ -11,7 +11,7 @@ from tqdm import tqdm
 from depthpose.cli.engine import Weights
 from depthpose.cli.pose.masks import Masks, distinct_names, of_dataset
 from depthpose.cli.pose.options import RegisterOptions
-from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, say_terms
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
@@ -212,7 +212,7 @@ def _refuse_contradictions(
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     found = read_pose_weights(path)
-    say_terms(found.facts)
+    warn_of_terms(found.facts)
     is_regressor = isinstance(found.network, DepthImageNet)
     net = DepthImageRegressor(found, config) if is_regressor else GeoPoseNet(found, config)
     suffix = "" if config.voting.method == "ransac" else "-least-squares"

@@ -60,7 +60,7 @@ _SAID = 5
 
 
 def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Path) -> None:
-    """Make a folder the home of the poses of clouds or depth images.
+    """Claim a folder for the poses of clouds or depth images.
 
     Raises:
         InputError: it is another run's, or holds a file of somebody else that would be written
@@ -72,7 +72,7 @@ def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Pat
 
 
 def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
-    """Make a folder the home of the poses of a data set; raises as :func:`claim`."""
+    """Claim a folder for the poses of a data set; raises as :func:`claim`."""
     images = {(i.scene_id, i.image_id) for i in dataset.instances}
     pictures = (_picture_name(*image) for image in sorted(images))
     tables = [results_name(dataset), alternatives_name(dataset)]
@@ -227,7 +227,7 @@ def _model(method: PoseMethod, name: str) -> ObjectModel:
 
 
 def _safely(method: PoseMethod) -> EstimateMany:
-    """Let a method pass by what could not be read."""
+    """Let a method skip what could not be read."""
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
         found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))

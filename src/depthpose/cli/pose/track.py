@@ -61,7 +61,7 @@ def track(
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
     Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
-    contradicts the pose the object is looked for anew in that frame; where it is not found either,
+    contradicts the pose, the object is detected again in that frame; where that fails too,
     the frame is lost, and the next is searched. poses.json says of each frame which of the three it
     was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
     their names, and a rerun begins anew.

@@ -77,7 +77,7 @@ def train(
 
     Views of the object are rendered while it trains: no photograph is needed. At the end the
     refusal is calibrated and the whole is measured on held-out views; OUT holds the weights with
-    the model in them, their card, and all that led there. A training that stopped goes on with
+    the model in them, their card, config, metrics and states. A training that stopped goes on with
     --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
     line is printed each minute.
 
@@ -143,11 +143,11 @@ def calibrate(
     out: Path,
     calibration: CalibrationOptions = CalibrationOptions(),
 ) -> int:
-    """Choose anew how much risk of a wrong pose is too much.
+    """Recalibrate the risk above which a pose is refused.
 
     Synthetic views decide: of the objects, and of other things in their place (other objects,
     copies of another size, mirrored ones, boxes, balls, hands). A larger share of wrong answers
-    buys more answers. The network stays as it is, and is then measured on other views.
+    gives more answers. The network stays as it is, and is then measured on other views.
 
         depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
 

@@ -97,7 +97,7 @@ def own_methods(
 
 
 def reproduce_table(order: Order, methods: Sequence[tuple[str, Method]], out: Path) -> int:
-    """Predict what is missing, measure, set beside the print, and write everything."""
+    """Predict what is missing, measure, join with the published rows, and write everything."""
     claim_folder(out, _settings(order, [method for _, method in methods]), _RESULTS)
     rule = find_protocol(order.protocol)
     home = out / "predictions"
@@ -176,7 +176,7 @@ def write_figure(
 
 
 def claim_figure(out: Path, number: str) -> None:
-    """Make a folder the home of a figure.
+    """Claim a folder for a figure.
 
     Raises:
         InputError: it is another command's, or holds files that would be written over.

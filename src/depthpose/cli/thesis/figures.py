@@ -50,7 +50,7 @@ def figure_3_4(
     number: int = 20,
     keypoint: int | None = None,
 ) -> int:
-    """Draw figure 3-4: true and predicted directions to the keypoint whose vote errs most.
+    """Draw figure 3-4: true and predicted directions to the keypoint with the largest error.
 
     Looks at some views and shows the worst. In the plane of the camera's x and y: a yellow star is
     the true keypoint, a red cross the voted one. Without a data set the views are synthetic, of the

@@ -64,7 +64,7 @@ def reproduce_by_object(
     out: Path,
     csv: Sequence[Path] = (),
 ) -> int:
-    """Predict what is missing, measure, set beside the print, and write everything."""
+    """Predict what is missing, measure, join with the published rows, and write everything."""
     dataset = order.dataset
     methods = pose_methods.pose_methods(weights, how.estimate, tuple(dataset.objects.values()))
     claim_folder(out, _settings(order, methods, how), _RESULTS)

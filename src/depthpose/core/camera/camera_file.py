@@ -160,7 +160,7 @@ def choose_lens(camera: AnyLens | None, focal_px: float | None) -> AnyLens | Non
         InputError: both were.
     """
     if camera is not None and focal_px is not None:
-        raise InputError("camera and focal_px are both given; leave one of the two away")
+        raise InputError("camera and focal_px are both given; omit one of the two")
     return camera if focal_px is None else focal_px
 
 

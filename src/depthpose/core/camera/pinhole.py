@@ -15,7 +15,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 
 MAX_SIDE_PX = 2**20
-"""Of an image: a number beyond is a mistake, and none that is computed with."""
+"""Largest image side: a larger number in a file is a mistake, and is refused."""
 MAX_BASELINE_M = 100
 """No rig on the ground is this wide: such a number was in millimetres."""
 
@@ -44,7 +44,7 @@ class Camera:
             if not 1 <= size <= MAX_SIDE_PX:
                 raise InputError(
                     f"{name} is {str(size)[:20]}, but an image has 1 to {MAX_SIDE_PX} pixels in a "
-                    "row; mend it"
+                    "row or column; correct it"
                 )
         check_intrinsics(self.K)
         if self.depth_unit_m is not None and not 0 < self.depth_unit_m < math.inf:

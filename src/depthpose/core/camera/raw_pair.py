@@ -216,7 +216,7 @@ def _kind(model: object, is_fisheye: bool | None) -> bool:
             "and equidistant (fisheye). Calibrate with one of them"
         )
     if is_fisheye and not _MODELS[word]:
-        raise InputError(f"its distortion model is {model!r}, no fisheye; leave --fisheye away")
+        raise InputError(f"its distortion model is {model!r}, no fisheye; omit --fisheye")
     return _MODELS[word]
 
 

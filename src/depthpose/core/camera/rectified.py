@@ -1,4 +1,4 @@
-"""Is this pair of images rectified, and the right way round? Asked of the images alone.
+"""Check from the images alone that a pair is rectified, and left and right not swapped.
 
 Corners of the left image are sought in the right one over a window that a rectified pair does not
 need: rows above and below, columns on both sides. Where they are found shows what was done to the
@@ -161,8 +161,8 @@ class RectificationReport:
         positive_share: share of positive disparities among those beyond a pixel; NaN where there
             are none.
         matches: matches that all this rests on.
-        is_rectified: whether rows agree; None where too few matches tell.
-        is_swapped: whether the left image is the right one; None where too few matches tell.
+        is_rectified: whether rows agree; None with too few matches.
+        is_swapped: whether the left image is the right one; None with too few matches.
         message: the finding, and the remedy where there is one.
     """
 
@@ -182,8 +182,8 @@ def check_rectified(
 
     Offsets below 6 rows and disparities below 192 columns are found; images wider than 1280 are
     scaled down first, which widens both. Too few matches (a dark or bare scene, a larger offset)
-    give None, never an alarm; unless enough match once the right image is mirrored or turned over,
-    which is said.
+    give None, not an error; if enough match once the right image is mirrored or rotated,
+    that is reported.
 
     Raises:
         InputError: the sizes differ.

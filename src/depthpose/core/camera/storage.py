@@ -42,7 +42,7 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
 
 
 def named(content: Mapping[Any, Any]) -> Names:
-    """Spell the names of a file in one way."""
+    """Normalise the names of a file: lower case, letters and digits only."""
     return {re.sub(r"[^a-z0-9]", "", str(key).lower()): value for key, value in content.items()}
 
 

@@ -22,7 +22,7 @@ _D = ("d", "d1", "d2")
 _P = ("p", "projectionmatrix", "p1")
 _WIDTH, _HEIGHT = ("width", "imagewidth"), ("height", "imageheight")
 _ROS = ("projectionmatrix", "distortionmodel", "p")
-_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LEVEL = 1e-3
 _UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc in ROS)"
 _UNDISTORT_FISHEYE = (
@@ -52,10 +52,10 @@ def facts_from_names(names: Names) -> CameraFacts | None:
     distortion = _distortion(names)
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
-        return _bent(facts, distortion, _RECTIFY)
+        return _with_distortion(facts, distortion, _RECTIFY)
     Q = matrix(names, ("q",), 16)
     if Q is not None:
-        return _bent(_from_reprojection(Q, size_of(names)), distortion, _RECTIFY)
+        return _with_distortion(_from_reprojection(Q, size_of(names)), distortion, _RECTIFY)
     if left is not None and left[0, 0] != 0:
         return _from_projection(names, left, distortion)
     return _from_intrinsics(names, distortion)
@@ -109,7 +109,9 @@ def _from_settings(names: Names, who: str) -> CameraFacts:
     is_rgbd = factor is not None
     if baseline_m is None and product is not None and not is_rgbd and fx > 0:
         baseline_m = product / fx  # of an RGB-D camera it is a made-up one
-    bent = [value for key in _BENT if (value := scalar(names, f"{who}{key}")) is not None]
+    bent = [
+        value for key in _DISTORTION_KEYS if (value := scalar(names, f"{who}{key}")) is not None
+    ]
     return CameraFacts(
         kind="settings of ORB-SLAM",
         K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
@@ -125,10 +127,10 @@ def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...])
     kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", size_of(names)
     if P[0, 3] == 0 and P[1, 3] == 0:
         facts = facts_from_projections(kind, P, None, size)
-        return _bent(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
+        return _with_distortion(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
     left = P.copy()
     left[:, 3] = 0
-    return _bent(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
+    return _with_distortion(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
 
 
 def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
@@ -144,7 +146,7 @@ def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
     if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
     facts = facts_from_projections("a pair of camera_info", left, right, size_of(first))
-    return _bent(facts, (*_distortion(first), *_distortion(second)), _RECTIFY)
+    return _with_distortion(facts, (*_distortion(first), *_distortion(second)), _RECTIFY)
 
 
 def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
@@ -169,7 +171,7 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     facts = CameraFacts(
         kind=kind, K=torch.from_numpy(K), size=size_of(names), baseline_m=_level_baseline(names)
     )
-    return _bent(facts, distortion, _lens_remedy(names, facts.undistort))
+    return _with_distortion(facts, distortion, _lens_remedy(names, facts.undistort))
 
 
 def _level_baseline(names: Names) -> float | None:
@@ -186,7 +188,9 @@ def _level_baseline(names: Names) -> float | None:
     return -T[0]
 
 
-def _bent(facts: CameraFacts, distortion: tuple[float, ...], undistort: str) -> CameraFacts:
+def _with_distortion(
+    facts: CameraFacts, distortion: tuple[float, ...], undistort: str
+) -> CameraFacts:
     return CameraFacts(**{**vars(facts), "distortion": distortion, "undistort": undistort})
 
 
@@ -199,9 +203,9 @@ def _distortion(names: Names) -> tuple[float, ...]:
     """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1.
 
     Raises:
-        InputError: coefficients that are no numbers, which would be passed over in silence.
+        InputError: coefficients that are no numbers, which would be ignored silently.
     """
-    found = [scalar(names, name) for name in _BENT]
+    found = [scalar(names, name) for name in _DISTORTION_KEYS]
     for name, value in names.items():
         is_list = name in _D or name.startswith(("distcoef", "distortioncoef"))
         if is_list or name.startswith("distortion"):

@@ -28,7 +28,7 @@ from depthpose.core.run import RECORD, refuse_other_settings, run_record
 MANIFEST = "manifest.csv"
 
 Engine = Callable[[Sequence[Block], Work, str, ShardFormat], Iterable[Done]]
-"""Does blocks wherever it likes, and gives what became of each, in any order."""
+"""Processes blocks, on any machine, and yields the outcome of each, in any order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
-    """Make a folder, local or in a store, the home of a run with these settings, or continue it.
+    """Claim a folder, local or in a store, for a run with these settings, or continue it.
 
     Raises:
         InputError: it holds a run with other settings; the first difference is named.

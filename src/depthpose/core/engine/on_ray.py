@@ -109,12 +109,12 @@ def _connected(ray: Any, address: str | None, cores: float | None) -> Iterator[N
     if is_ours:
         here = {"num_cpus": cores, "include_dashboard": False} if address is None else {}
         try:
-            _refuse_silent(address)
+            _refuse_unreachable(address)
             ray.init(address=address or "local", **here)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(
                 f"--address {address}: no Ray cluster answers there ({error}); start one by 'ray "
-                "start --head', or leave the address away"
+                "start --head', or omit the address"
             ) from error
     try:
         yield
@@ -123,8 +123,8 @@ def _connected(ray: Any, address: str | None, cores: float | None) -> Iterator[N
             ray.shutdown()
 
 
-def _refuse_silent(address: str | None) -> None:
-    """Knock at HOST:PORT first: Ray waits for minutes where nothing answers."""
+def _refuse_unreachable(address: str | None) -> None:
+    """Connect to HOST:PORT first: Ray waits for minutes where nothing answers."""
     host, _, port = (address or "").rpartition(":")
     if host and "/" not in host and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=10).close()

@@ -122,7 +122,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _bare(model: Any) -> Any:  # noqa: ANN401
-    """Drop what speaks of the machine that exported: stack traces, paths, names of lines."""
+    """Drop what identifies the exporting machine: stack traces, paths, names of lines."""
     for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
         del part.metadata_props[:]
         part.doc_string = ""

@@ -36,7 +36,7 @@ class Limit:
 
     Attributes:
         value: the limit, in the output's unit.
-        of: the largest difference, or the mean one where the answer itself jumps.
+        of: the largest difference, or the mean one where the output is discontinuous.
         is_relative: differences are shares of what PyTorch answers.
         flips: share of the numbers that may be off by more, or be NaN in one answer alone, and are
             left out of the differences: where a decision is at its limit.

@@ -5,24 +5,23 @@ from depthpose.core.loop.journal import (
     Journal,
     card_text,
     held_out_text,
-    leave_card,
     read_metrics,
     run_files,
+    write_card,
 )
 from depthpose.core.loop.loop import Interrupted, Progress, train
 from depthpose.core.loop.run import Run
 from depthpose.core.loop.task import (
-    Evidence,
     Samples,
     Task,
-    Turn,
+    Update,
+    ValidationResult,
     sample_generator,
     shuffled_index,
 )
 
 __all__ = [
     "AdamConfig",
-    "Evidence",
     "Interrupted",
     "Journal",
     "LoopConfig",
@@ -30,14 +29,15 @@ __all__ = [
     "Run",
     "Samples",
     "Task",
-    "Turn",
+    "Update",
+    "ValidationResult",
     "card_text",
     "held_out_text",
-    "leave_card",
     "make_adam",
     "read_metrics",
     "run_files",
     "sample_generator",
     "shuffled_index",
     "train",
+    "write_card",
 ]

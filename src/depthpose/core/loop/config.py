@@ -88,7 +88,7 @@ class LoopConfig:
 
     accumulate: int = 1
     """Micro-batches whose gradients are averaged before a step. The view stage holds the graphs of
-    all of them until the discriminator has moved."""
+    all of them until the discriminator has been updated."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Arithmetic of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
@@ -161,7 +161,7 @@ def make_adam(
     """Make the optimiser; the loop sets its learning rate before each step.
 
     Args:
-        parameters: what it moves; or groups, whose ``rate`` is their share of the learning rate.
+        parameters: what it updates; or groups, whose ``rate`` is their share of the learning rate.
         config: its settings.
     """
     betas = (config.beta1, config.beta2)

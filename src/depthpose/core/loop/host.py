@@ -19,7 +19,7 @@ _TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 def make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
-    """Bring up accelerate for the device and the processes of a training.
+    """Set up accelerate for the device and the processes of a training.
 
     Precision is the loop's own (:class:`Arithmetic`): accelerate keeps that of a process's first
     training, as it keeps the device.
@@ -72,7 +72,7 @@ class Arithmetic:
         return torch.autocast(self._device, self._type, enabled=self._type is not None)
 
 
-def leave_signals_to_the_loop(_: int) -> None:
+def leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a signal to the group is for the loop.
 
     A worker that dies takes the loop with it before its state is saved.
@@ -80,8 +80,8 @@ def leave_signals_to_the_loop(_: int) -> None:
     os.setsid()
 
 
-class Wish:
-    """What the user asked a training to do, by signals."""
+class StopRequest:
+    """Signals received: whether to stop a training, or to finish it."""
 
     def __init__(self) -> None:
         self._asked: list[tuple[int, float]] = []
@@ -99,13 +99,13 @@ class Wish:
     def to_finish(self) -> bool:
         """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
         presses = [at for number, at in self._asked if number == signal.SIGINT]
-        while len(presses) == 1 and time.monotonic() - presses[0] < PATIENCE_S:
+        while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
             time.sleep(0.05)
             presses = [at for number, at in self._asked if number == signal.SIGINT]
         return len(presses) > 1
 
 
-PATIENCE_S = 3.0
+SECOND_CTRL_C_S = 3.0
 """Between the first Ctrl-C and the second."""
 _SECOND = (
     "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish now: the "
@@ -114,9 +114,9 @@ _SECOND = (
 
 
 @contextmanager
-def polite_stop() -> Iterator[Wish]:
+def graceful_stop() -> Iterator[StopRequest]:
     """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
-    wish = Wish()
+    wish = StopRequest()
     try:
         before = {s: signal.signal(s, wish.remember) for s in (signal.SIGTERM, signal.SIGINT)}
     except ValueError:  # not the main thread: whoever runs us handles signals

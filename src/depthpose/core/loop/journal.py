@@ -23,7 +23,7 @@ from depthpose.core.files import atomic_write, read_text, remove_parts, write_im
 from depthpose.core.files.disk import refused_write
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.loop.state import BEFORE, STATE, write_state
-from depthpose.core.loop.task import Evidence
+from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
 _METRICS = "metrics.jsonl"
@@ -49,7 +49,7 @@ class Journal:
         self._has_good_last = True
 
     def open(self, step: int) -> None:
-        """Begin at ``step``: what a kill left behind goes, lines of later steps and half files."""
+        """Begin at ``step``: remove what a killed run left: later lines and partial files."""
         if not self._is_writer:
             return
         for folder in (self.folder, self.folder / _PICTURES):
@@ -75,7 +75,7 @@ class Journal:
             for name, value in numbers.items():
                 self._board.add_scalar(name, value, step)
 
-    def show(self, step: int, evidence: Evidence) -> None:
+    def show(self, step: int, evidence: ValidationResult) -> None:
         """Write what validation found."""
         if not self._is_writer:
             return
@@ -92,8 +92,8 @@ class Journal:
             write_state(self.folder, state, keeps_last=self._has_good_last)
             self._has_good_last = True
 
-    def goes_on_from(self, state: Path) -> None:
-        """Let the next state not push out the one that the training goes on from."""
+    def keep_resumed_state(self, state: Path) -> None:
+        """Keep the state that the training was resumed from when the next one is saved."""
         self._has_good_last = state.name == STATE
 
     def close(self) -> None:
@@ -155,11 +155,11 @@ def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
         facts: a line each.
         measured: Markdown that follows.
     """
-    lines = [f"- **{_spoken(fact)}**: {value}" for fact, value in facts.items()]
+    lines = [f"- **{_as_label(fact)}**: {value}" for fact, value in facts.items()]
     return "\n".join([f"# {name}", "", *lines, *(["", measured.strip()] if measured else []), ""])
 
 
-def leave_card(
+def write_card(
     weights: Path, words: str, seconds: float, facts: Mapping[str, str], measured: str
 ) -> None:
     """Write ``W.md`` beside the weights: what they are, the command, its time, what was measured.
@@ -202,7 +202,7 @@ def held_out_text(folder: Path, sentence: str) -> str:
     return "\n".join([sentence, "", "| held out | |", "| --- | --- |", *rows])
 
 
-def _spoken(name: str) -> str:
+def _as_label(name: str) -> str:
     return name.replace("_", " ").capitalize()
 
 

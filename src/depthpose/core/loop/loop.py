@@ -21,14 +21,14 @@ from depthpose.core.hold import release_folders
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.host import (
     Arithmetic,
-    Wish,
-    leave_signals_to_the_loop,
+    StopRequest,
+    graceful_stop,
+    leave_process_group,
     make_accelerator,
-    polite_stop,
 )
 from depthpose.core.loop.journal import Journal
 from depthpose.core.loop.state import Parts, restore_last, saved_states
-from depthpose.core.loop.task import Samples, Task, Turn, mixed_seed
+from depthpose.core.loop.task import Samples, Task, Update, mixed_seed
 
 
 class Interrupted(KeyboardInterrupt):
@@ -91,7 +91,7 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
         raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
     run.steps = run.step if finish else run.steps
     try:
-        with polite_stop() as wish:
+        with graceful_stop() as wish:
             run.walk(on_step, wish)
     finally:
         release_folders()
@@ -128,7 +128,7 @@ class _Run:
         if saved:
             path, self.step, seconds = restore_last(folder, self._parts())
             self._began -= seconds
-            self.journal.goes_on_from(path)
+            self.journal.keep_resumed_state(path)
         self.journal.open(self.step)
 
     @property
@@ -136,8 +136,8 @@ class _Run:
         """What it took until now, with the runs before this one."""
         return time.monotonic() - self._began
 
-    def walk(self, on_step: Callable[[Progress], None] | None, wish: Wish) -> None:
-        """Take the remaining steps; asked to finish, the step at hand is the last."""
+    def walk(self, on_step: Callable[[Progress], None] | None, wish: StopRequest) -> None:
+        """Take the remaining steps; if asked to finish, the current step is the last."""
         batches = self._batches()
         while self.step < self.steps:
             micro_batches = [next(batches) for _ in range(self.config.accumulate)]
@@ -178,11 +178,11 @@ class _Run:
         )
 
     def _take_step(self, micro_batches: list[Any]) -> None:
-        """All micro-batches take their first turn together, then the second, and so on."""
-        walks = [iter(self.task.step(batch)) for batch in micro_batches]
+        """Run the first update of all micro-batches, then the second, and so on."""
+        iterators = [iter(self.task.step(batch)) for batch in micro_batches]
         turn_number = 0
         while True:
-            turns = list(self._backward_all(walks, turn_number))
+            turns = list(self._backward_all(iterators, turn_number))
             if not turns:
                 break
             self._move(turns[0])
@@ -190,8 +190,8 @@ class _Run:
         if self.config.ema_decay is not None:
             self._update_average(self.config.ema_decay)
 
-    def _backward_all(self, walks: list[Iterator[Turn]], number: int) -> Iterator[str]:
-        for place, walk in enumerate(walks):
+    def _backward_all(self, iterators: list[Iterator[Update]], number: int) -> Iterator[str]:
+        for place, walk in enumerate(iterators):
             # Dropout follows the micro-batch, not the process that happens to hold it.
             micro = place * self.world + self.accelerator.process_index
             torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
@@ -201,7 +201,7 @@ class _Run:
                 continue
             self._refuse_bad_loss(turn.optimizer, float(turn.loss.detach()))
             parameters = _parameters(self.optimizers[turn.optimizer])
-            self.scaler.scale(turn.loss / len(walks)).backward(inputs=parameters)
+            self.scaler.scale(turn.loss / len(iterators)).backward(inputs=parameters)
             self._remember({"loss": turn.loss.detach(), **turn.facts}, turn.optimizer)
             yield turn.optimizer
 
@@ -237,7 +237,7 @@ class _Run:
             num_workers=self.config.workers,
             collate_fn=getattr(self.samples, "collate", None),
             pin_memory=self.accelerator.device.type == "cuda",
-            worker_init_fn=leave_signals_to_the_loop,
+            worker_init_fn=leave_process_group,
         )
         from accelerate.utils import send_to_device
 

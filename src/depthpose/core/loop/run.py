@@ -26,7 +26,7 @@ class Run:
         resume: go on from its last state.
         finish: make weights of its last state, without another step.
         on_step: called after each optimiser step.
-        tell: called with what a person should know.
+        tell: called with each message for the user.
     """
 
     folder: Path

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from depthpose.core.loop.config import AdamConfig
 
 
-class Turn(NamedTuple):
+class Update(NamedTuple):
     """One optimiser's part of a step: the loss that it minimises, and numbers for the log."""
 
     optimizer: str
@@ -20,7 +20,7 @@ class Turn(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Evidence:
+class ValidationResult:
     """What a validation found.
 
     Attributes:
@@ -46,7 +46,7 @@ class Task(Protocol):
         """Optimisers with their settings; each parameter is in at most one of them."""
         ...
 
-    def step(self, batch: Any) -> Iterator[Turn]:  # noqa: ANN401 - the task's own batch
+    def step(self, batch: Any) -> Iterator[Update]:  # noqa: ANN401 - the task's own batch
         """Yield one turn after the other; each optimiser steps before the next turn is computed.
 
         An adversarial task yields the discriminator's turn, then the generator's, whose loss then
@@ -54,7 +54,7 @@ class Task(Protocol):
         """
         ...
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Evaluate held-out samples; the task sets and restores the networks' mode."""
         ...
 

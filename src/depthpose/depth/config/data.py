@@ -12,7 +12,7 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 
 @dataclass(frozen=True, kw_only=True)
 class DegradeConfig:
-    """Random changes of an input image alone: what carries synthetic images over to real ones."""
+    """Augmentation of the input image alone, for transfer from synthetic to real images."""
 
     colour: float = 0.35
     """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
@@ -21,7 +21,7 @@ class DegradeConfig:
     """Share of images whose channels are exchanged."""
 
     veil_share: float = 0.2
-    """Share of images under a veil of haze."""
+    """Share of images with haze."""
 
     glare_share: float = 0.2
     """Share of images with a light in them."""

@@ -85,7 +85,7 @@ class LightConfig:
     """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
 
     with_agreement: bool = False
-    """Whether the enlargement compares both views, at half size, under the disparities it chooses
+    """Whether the upsampling compares both views, at half size, under the disparities it chooses
     from; weights without it can be trained on with it."""
 
     with_refinement: bool = False

@@ -1,4 +1,4 @@
-"""Settings of the two view synthesis networks: the one that paints, and the one that selects."""
+"""Settings of the two view synthesis networks: a U-Net (pix2pix), and selection (Deep3D)."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -35,7 +35,7 @@ class GeneratorConfig:
 
     virtual_focal_px: float = 493.0
     """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
-    rows of the thesis's crops: what is trained on parts of the height must guess at the horizon."""
+    rows of the thesis's crops: with fewer of the rows a network must guess the horizon."""
 
     virtual_baseline_m: float = 0.5327
     """Baseline of the imitated rig [m]."""
@@ -94,7 +94,7 @@ class SelectionConfig:
     right view; or both, weighed by their confidence."""
 
     least_confidence: float = 0.0
-    """Mean confidence below which an image is unlike what the weights know; 0: not checked.
+    """Mean confidence below which an image is out of distribution; 0: not checked.
     'depthpose depth calibrate' finds it."""
 
     virtual_focal_px: float = 372.0

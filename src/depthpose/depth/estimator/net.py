@@ -18,7 +18,7 @@ from depthpose.core.camera import (
     check_image_matches_camera,
     choose_lens,
 )
-from depthpose.core.checkpoint import find_weights, join_terms, say_terms
+from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
 from depthpose.depth.disparity import depth_from_disparity, focal_size, resize_image
@@ -89,7 +89,7 @@ class FakestereoNet:
         self.weights = weights
 
     def __repr__(self) -> str:
-        """Give one line: what draws and what matches, weights, device."""
+        """Give one line: generator and matcher, weights, device."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
         said = [" + ".join(type(part).__name__ for part in parts)]
         said += [f"weights {self.weights!r}"] if self.weights else []
@@ -143,13 +143,13 @@ class FakestereoNet:
         if isinstance(matcher, str | Path) and matcher != "sgbm":
             own = read_depth_weights(find_weights(matcher))
         terms = join_terms(*(held.facts for held in (found, own) if held is not None))
-        say_terms({"terms": terms})
+        warn_of_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
         chosen = choose_matcher(weights, found, matcher, own, config)
         said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
         if found is None or found.generator is None:
             if engine != "torch":
-                raise InputError(f"engine is {engine!r}, and there is no generator; leave it away")
+                raise InputError(f"engine is {engine!r}, and there is no generator; omit it")
             return cls(chosen, terms=terms, weights=said)
         generator = found.generator
         if engine == "openvino":
@@ -285,7 +285,7 @@ class FakestereoNet:
         if found.familiarity >= least:
             return found
         said = (
-            f"unlike the images that these weights know (mean confidence {found.familiarity:.2f}, "
+            f"out of distribution for these weights (mean confidence {found.familiarity:.2f}, "
             f"below {least:.2f}), so its depth is a guess"
         )
         if not self.with_unlike:

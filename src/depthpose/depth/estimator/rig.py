@@ -100,8 +100,8 @@ def set_answer(found: DepthWeights | None, answer: Answer) -> None:
         generator.config = replace(generator.config, answer=answer)
     elif generator is None or answer != generator.config.answer:
         raise InputError(
-            f"answer is {answer!r}, which takes the weights of a generator that selects; leave it "
-            "away: these have none, or one that paints, whose views a matcher reads."
+            f"answer is {answer!r}, which takes the weights of a generator that selects; omit it: "
+            "these have no generator, or a U-Net, which estimates no disparity."
         )
 
 
@@ -133,7 +133,7 @@ def choose_matcher(
         if found is not None and found.generator is None:
             raise InputError(
                 f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of a "
-                "matcher. Leave one of the two away."
+                "matcher. Omit one of the two."
             )
         return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
     if matcher is not None and not isinstance(matcher, str | Path):

@@ -204,7 +204,7 @@ def _score(
     confidence: Float[Tensor, "h w"] | None,
     mask: Bool[Tensor, "h w"],
 ) -> Measured:
-    """Add what the confidence is worth, where there is one."""
+    """Add AUSE and error by decile of the confidence, where there is one."""
     if confidence is None:
         return measured
     score = asdict(score_confidence(error, confidence[mask]))

@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.export import Graph, Value, network_model
 from depthpose.depth.config import Answer, GeneratorConfig, SelectionConfig
 from depthpose.depth.estimator.rig import SKY_M
-from depthpose.depth.export.network import DrawnValues, drawn, sizeless
+from depthpose.depth.export.network import DrawnValues, drawn, dynamic_shape_network
 from depthpose.depth.export.steps import (
     columns,
     focal_size,
@@ -47,7 +47,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     selects ``is_sky`` too (batch, height, width; bool).
 
     Raises:
-        InputError: a network is missing, or the generator draws by chance.
+        InputError: a network is missing, or the generator is stochastic (dropout at test time).
     """
     generator = weights.generator
     if generator is None or (weights.matcher is None and generator.config.answer != "own"):
@@ -91,7 +91,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
-    network = sizeless(weights.matcher)
+    network = dynamic_shape_network(weights.matcher)
     config = cast("NetworkConfig", weights.matcher.config)
     graph = Graph()
     left = graph.input("left", np.float32, _IMAGES)
@@ -116,7 +116,7 @@ def _answered(
     assert matcher is not None, "checked before"
     focal_px = np.array([rig.virtual_focal_px] * 2)
     config = cast("NetworkConfig", matcher.config)
-    matched = _matched(left, seen.right, focal_px, sizeless(matcher), config)
+    matched = _matched(left, seen.right, focal_px, dynamic_shape_network(matcher), config)
     return matched if answer == "matched" else _both(_own(seen), matched)
 
 

@@ -1,4 +1,4 @@
-"""The networks, and what a synthesiser does around its own, in operations of any size."""
+"""The networks, and what a synthesiser does around its own, with dynamic shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from depthpose.depth.synthesis.synthesiser import COLUMNS_SHARE, ROWS_SHARE
 Maps = Float[Tensor, "b rows columns"]
 
 
-class SizelessPSMNet(nn.Module):
+class DynamicPSMNet(nn.Module):
     """PSMNet with its soft arg-min, in eval mode.
 
     Disparities are few and fixed, so their interpolation is a matrix; rows and columns are resized.
@@ -65,7 +65,7 @@ class SizelessPSMNet(nn.Module):
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
 
 
-class SizelessLight(nn.Module):
+class DynamicLightStereo(nn.Module):
     """The light network with what its matcher makes of its scores."""
 
     def __init__(self, network: LightStereo) -> None:
@@ -84,29 +84,29 @@ class SizelessLight(nn.Module):
         return self.network.refine(found_px, seen), sure
 
 
-SIZELESS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
-    PSMNet: SizelessPSMNet,
-    LightStereo: SizelessLight,
+DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
+    PSMNet: DynamicPSMNet,
+    LightStereo: DynamicLightStereo,
 }
-"""What makes of a matcher's network its form in operations of any size: a new kind is one entry."""
+"""Each kind of matcher network in its form with dynamic shapes: a new kind is one entry."""
 
 
-def sizeless(matcher: StereoNetwork) -> nn.Module:
-    """Give a matcher's network, with what is made of its answer, in operations of any size.
+def dynamic_shape_network(matcher: StereoNetwork) -> nn.Module:
+    """Give a matcher's network, with its post-processing, in a form with dynamic shapes.
 
     Raises:
         InputError: a matcher that has no such form.
     """
-    if type(matcher) not in SIZELESS:
-        known = ", ".join(kind.__name__ for kind in SIZELESS)
+    if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
+        known = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
             f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
             f"one of {known}."
         )
-    return SIZELESS[type(matcher)](matcher).eval()
+    return DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
 
 
-class SizelessSelection(nn.Module):
+class DynamicSelection(nn.Module):
     """The generator that selects, and what its logits say, at half of the image's sides."""
 
     def __init__(self, generator: SelectionGenerator) -> None:
@@ -148,14 +148,14 @@ def drawn(left: Value, generator: Generator) -> DrawnValues:
     """Draw right views.
 
     Raises:
-        InputError: the generator draws by chance.
+        InputError: the generator is stochastic (dropout at test time).
     """
     if isinstance(generator, SelectionGenerator):
         return _selected(left, generator)
     if generator.config.test_mode != "running":
         raise InputError(
             "the generator's test_mode is 'batch': it draws with dropout, other views each time, "
-            "which a file cannot be held to; export weights whose test_mode is 'running'."
+            "so no file can agree with it; export weights whose test_mode is 'running'."
         )
     return DrawnValues(right=_painted(left, generator))
 
@@ -179,7 +179,7 @@ def _selected(left: Value, generator: SelectionGenerator) -> DrawnValues:
     even = (_near_multiple(size, multiple) / 2 * 2).op("Max", 2)
     image = _mirrored(resized_image(left, even), even, multiple)
     example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
-    network = network_model(SizelessSelection(generator).eval(), [example], multiple)
+    network = network_model(DynamicSelection(generator).eval(), [example], multiple)
     found = [m.slice([0, 0], even / 2, [1, 2]) for m in left.graph.call(network, image)]
     log_px, sky, sure, right_log_px, right_sky = (resized_map(m, size) for m in found)
     scale = ratio(size, even)

@@ -1,4 +1,4 @@
-"""From disparities at 1/4 size to the image's: the light matcher's enlargement and refinement."""
+"""From disparities at 1/4 size to the image's: the light matcher's upsampling and refinement."""
 
 from itertools import product
 from typing import NamedTuple
@@ -24,7 +24,7 @@ _REFINED = 32
 """Channels of the refinement at half size."""
 
 
-class Described(NamedTuple):
+class ViewFeatures(NamedTuple):
     """Features of a view.
 
     Attributes:
@@ -37,23 +37,23 @@ class Described(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What the enlargement sees.
+    """Inputs of the upsampling.
 
     Attributes:
         left: features of the left view.
         right_half: of the right view at 1/2 of its sides, where both are compared.
     """
 
-    left: Described
+    left: ViewFeatures
     right_half: Features | None
 
 
-class Enlargement(nn.Module):
+class ConvexUpsampling(nn.Module):
     """Weights of the nine neighbours at 1/4 size, for each pixel of the image.
 
     With agreement, the weights also depend on how alike both views are under the disparity of each
-    neighbour: where two surfaces meet, this says which one a pixel belongs to. That part begins
-    without effect.
+    neighbour: where two surfaces meet, this says which one a pixel belongs to. That part is
+    initialised to zero.
     """
 
     def __init__(self, width: int, *, with_agreement: bool) -> None:
@@ -116,7 +116,7 @@ def _moved(
 class Refinement(nn.Module):
     """A correction of the disparity of each pixel, from both views compared around it.
 
-    It begins without effect.
+    Its output is initialised to zero.
     """
 
     def __init__(self, groups: int = 4) -> None:

@@ -1,6 +1,6 @@
 """PSMNet as it is run: the same function as ``psmnet.PSMNet``, faster and in bounded memory.
 
-- Batch norm is folded; tensors keep their channels last, which convolutions like best.
+- Batch norm is folded; tensors keep their channels last, the fastest layout for convolutions.
 - The first volume convolution runs on the two views, and no concatenation volume is ever made.
 - Volumes are computed by slabs of rows. Only one full-size volume, ``cost0``, is held whole.
 - The soft arg-min enlarges the cost a few rows at a time.
@@ -17,8 +17,8 @@ from depthpose.depth.stereo.folding import CostConv, RowsConv, fold_features, fo
 from depthpose.depth.stereo.plan import Steps
 from depthpose.depth.stereo.psmnet import ConvNorm, Head, Hourglass, PSMNet
 from depthpose.depth.stereo.volume import (
+    ConvolvedPair,
     FirstLayer,
-    LookedPair,
     Size,
     Slab,
     convolve,
@@ -102,7 +102,7 @@ class PSMNetInference:
             pass_.run(index)
         return pass_.finish()
 
-    def _look(self, left: Views, right: Views, bins: int) -> list[LookedPair]:
+    def _look(self, left: Views, right: Views, bins: int) -> list[ConvolvedPair]:
         both = zip(self._describe(left), self._describe(right), strict=True)
         return [self.first.look(one[None], other[None], bins) for one, other in both]
 
@@ -110,7 +110,7 @@ class PSMNetInference:
         batch = views.to(self._like)
         return self.features(batch.contiguous(memory_format=torch.channels_last))
 
-    def _cost0(self, pairs: list[LookedPair], steps: Steps) -> Float[Tensor, "b c h d w"]:
+    def _cost0(self, pairs: list[ConvolvedPair], steps: Steps) -> Float[Tensor, "b c h d w"]:
         """Run the layers before the hourglasses."""
         height = pairs[0].height
         size = (height, pairs[0].bins, pairs[0].width)
@@ -142,7 +142,7 @@ class _FoldedHead:
 
 
 class _Pass:
-    """One walk through the hourglasses, and the half-size volumes that it has to remember."""
+    """One pass through the hourglasses, and the half-size volumes that it keeps."""
 
     def __init__(self, net: PSMNetInference, cost0: Slab, steps: Steps) -> None:
         self.net, self.cost0, self.steps = net, cost0, steps
@@ -153,7 +153,7 @@ class _Pass:
         self.up: Slab | None = None
 
     def run(self, index: int) -> None:
-        """Walk through hourglass ``index``; what it adds is made where it is next used."""
+        """Run hourglass ``index``; what it adds is made where it is next used."""
         hourglass = self.net.hourglasses[index]
         down = self._same1(hourglass, self._down1(hourglass, index))
         deep = relu(convolve(hourglass.down2, down, 0, down.height // 2))

@@ -3,7 +3,7 @@
 - Features: EfficientNet-Lite0 sees the image at half size, two convolutions see it at full size,
   and a decoder joins both at 1/4.
 - Volume: cosines of groups of features (Guo et al., CVPR 2019), refined by one 3D hourglass that
-  the image steers (Bangunharcana et al., CoEx, IROS 2021).
+  the image guides (Bangunharcana et al., CoEx, IROS 2021).
 - Disparity: the mean over the few best disparities (CoEx), enlarged by learned convex combinations
   of nine neighbours (Teed and Deng, RAFT, ECCV 2020), whose disparities are compared at half size.
 - Refinement: both views are compared around that disparity at half size, and a few convolutions
@@ -23,13 +23,13 @@ from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.enlargement import (
     STEM,
-    Described,
-    Enlargement,
+    ConvexUpsampling,
     Features,
     Maps,
     Quarter,
     Refinement,
     Seen,
+    ViewFeatures,
     enlarge,
     unit_groups,
 )
@@ -75,8 +75,8 @@ class LightFeatures(nn.Module):
     mean: Tensor
     deviation: Tensor
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Described:
-        """Describe each pixel by its surroundings near and far."""
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> ViewFeatures:
+        """Give features of each pixel with local and global context."""
         image = image.contiguous(memory_format=torch.channels_last)
         half = F.relu(self.stem(image))
         quarter = half
@@ -90,7 +90,7 @@ class LightFeatures(nn.Module):
         for layer, skip in zip(self.decoder, seen, strict=True):
             above = F.interpolate(levels[-1], scale_factor=2.0, mode="nearest")
             levels.append(F.relu(layer(torch.cat([above, skip], 1))))
-        return Described(half, tuple(levels[::-1]))
+        return ViewFeatures(half, tuple(levels[::-1]))
 
 
 def correlation_volume(
@@ -109,7 +109,7 @@ def correlation_volume(
 
 
 class Aggregation(nn.Module):
-    """Correlation volume to one score a voxel: an hourglass of three scales, led by the image."""
+    """Correlation volume to one score a voxel: an image-guided hourglass of three scales."""
 
     def __init__(self, config: LightConfig, guide_widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -165,7 +165,7 @@ class Aggregation(nn.Module):
 
 
 def _product(volume: Volume, guide: Volume) -> Volume:
-    """Weigh a volume by what the image says, in place where no gradient needs what it was."""
+    """Multiply a volume by its guide, in place where no gradient needs the old values."""
     return volume * guide if torch.is_grad_enabled() else volume.mul_(guide)
 
 
@@ -213,7 +213,9 @@ class LightStereo(StereoNetwork):
         self.features = LightFeatures(self.config)
         self.describe = nn.Conv2d(self.config.width, self.config.width, 1, bias=False)
         self.aggregation = Aggregation(self.config, self.features.widths)
-        self.enlargement = Enlargement(self.config.width, with_agreement=self.config.with_agreement)
+        self.enlargement = ConvexUpsampling(
+            self.config.width, with_agreement=self.config.with_agreement
+        )
         self.refinement = Refinement() if self.config.with_refinement else None
 
     @property
@@ -252,7 +254,7 @@ class LightStereo(StereoNetwork):
             left_quarter: Features,
             right_half: Features | None,
         ) -> Tensor:
-            near = Seen(Described(left_half, (left_quarter,)), right_half)
+            near = Seen(ViewFeatures(left_half, (left_quarter,)), right_half)
             weights = self.enlargement(near, quarters[:, 0])
             return torch.stack([enlarge(one, weights) for one in quarters.unbind(1)], 1)
 
@@ -266,7 +268,7 @@ class LightStereo(StereoNetwork):
             return found_px
 
         def refined(found_px: Maps, left_half: Features, right_half: Features) -> Maps:
-            return refinement(Seen(Described(left_half, ()), right_half), found_px)
+            return refinement(Seen(ViewFeatures(left_half, ()), right_half), found_px)
 
         half = None if self.rows is None else 2 * self.rows
         parts = (found_px, seen.left.half, seen.right_half)

@@ -13,7 +13,7 @@ from depthpose.depth.types import Match
 
 
 class LightMatcher(NetworkMatcher):
-    """The light network with the world around it: normalisation, padding, device.
+    """The light network with pre- and post-processing: normalisation, padding, device.
 
     The weights are copied: training ``network`` further does not change this matcher. Where the
     processor has no bf16, ``config`` says fp32 in its place.

@@ -1,7 +1,7 @@
 """A network as a matcher: images of any size in, disparity and confidence out.
 
 What every network with weights shares: normalisation, padding, the working focal length, tiles, the
-check from right to left.
+left-right check.
 """
 
 import math
@@ -45,7 +45,7 @@ AGREEMENT_PX = 3.0
 
 
 class StereoNetwork(nn.Module):
-    """A network of normalised pairs whose disparity maps, the last of which is the answer, train.
+    """A stereo network: a normalised pair to disparity maps for the losses; the last is the output.
 
     Attributes:
         config: its sizes and conventions; it has ``max_disparity_px``.
@@ -55,12 +55,12 @@ class StereoNetwork(nn.Module):
 
     @property
     def encoder(self) -> LiteEncoder | None:
-        """The part that may begin with weights of ImageNet, which a training treats with care."""
+        """The part that may begin with weights of ImageNet, which trains more slowly."""
         return None
 
 
 class NetworkMatcher(ABC):
-    """A network with the world around it: normalisation, padding, device, tiles.
+    """A network with pre- and post-processing: normalisation, padding, device, tiles.
 
     A kind of network adds :meth:`run`. Where the processor has no bf16, ``config`` says fp32 in its
     place.

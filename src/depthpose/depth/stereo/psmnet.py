@@ -1,6 +1,6 @@
 """PSMNet, stacked hourglass: a rectified pair to disparity (Chang and Chen, CVPR 2018).
 
-This is the network as it is trained, said plainly. ``inference`` runs the same weights faster
+This is the network as it is trained, in its plain form. ``inference`` runs the same weights faster
 and in bounded memory.
 
 The features of one view come first: residual layers and a spatial pyramid, at 1/4 size.
@@ -99,7 +99,7 @@ class FeatureExtractor(nn.Module):
         self.project = nn.Conv2d(4 * c, c, 1, bias=False)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h4 w4"]:
-        """Describe each pixel by its surroundings near and far."""
+        """Give features of each pixel with local and global context."""
         x = image
         for layer in self.stem:
             x = F.relu(layer(x))

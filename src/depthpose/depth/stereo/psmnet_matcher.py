@@ -9,7 +9,7 @@ from depthpose.depth.types import Match
 
 
 class PSMNetMatcher(NetworkMatcher):
-    """PSMNet with the world around it: normalisation, padding, device, memory.
+    """PSMNet with pre- and post-processing: normalisation, padding, device, memory.
 
     The weights are copied: training ``network`` further does not change this matcher. Where the
     processor has no bf16, ``config`` says fp32 in its place.

@@ -17,7 +17,7 @@ from torch import Tensor
 from depthpose.depth.stereo.folding import RowsConv
 
 View = Float[Tensor, "1 c h w"]
-Looked = Float[Tensor, "h w k"]
+ConvolvedView = Float[Tensor, "h w k"]
 
 
 class FirstLayer:
@@ -37,13 +37,13 @@ class FirstLayer:
         self._left = torch.stack([left * s for s in seen], 1)
         self._right = right
 
-    def look(self, left: View, right: View, bins: int) -> "LookedPair":
+    def look(self, left: View, right: View, bins: int) -> "ConvolvedPair":
         """Convolve both views once, for all disparities."""
-        return LookedPair(self, left, right, bins)
+        return ConvolvedPair(self, left, right, bins)
 
 
-class LookedPair:
-    """Both views convolved; hands out rows of the layer's output.
+class ConvolvedPair:
+    """Both views convolved; computes rows of the layer's output.
 
     Written with ``d' = d + i - 1`` for the plane that tap ``i`` along disparity sees, and
     ``v = x - d'`` for the right column there: the plane holds zeros where ``v < 0``.
@@ -70,7 +70,9 @@ class LookedPair:
         full = layer._left[:, 0]
         self._sums = [self._summed(left, full, taps) for taps in ((1, 2), (0, 1, 2), (0, 1))]
 
-    def _summed(self, left: View, weight: Tensor, taps: tuple[int, ...]) -> tuple[Looked, Looked]:
+    def _summed(
+        self, left: View, weight: Tensor, taps: tuple[int, ...]
+    ) -> tuple[ConvolvedView, ConvolvedView]:
         """What both views give where all ``taps`` meet the image: left at x, right at x - d."""
         left_sum = _look(left, weight[:, :, list(taps)].sum(2)) + self.bias
         right_sum = torch.zeros_like(left_sum)
@@ -124,7 +126,7 @@ class LookedPair:
             out[:, d, self.width - 1] -= self._last[i][y, self.width + 1 - d - i]
 
 
-def _look(view: View, weight: Tensor) -> Looked:
+def _look(view: View, weight: Tensor) -> ConvolvedView:
     """Convolve one view, 3x3; the answer has its channels last."""
     weight = weight.contiguous(memory_format=torch.channels_last)
     return F.conv2d(view, weight, padding=1)[0].permute(1, 2, 0)

@@ -1,4 +1,4 @@
-"""Left image to right image: a U-Net that paints (pix2pix), a network that selects (Deep3D)."""
+"""Left image to right image: a U-Net (pix2pix), or selection of disparities (Deep3D)."""
 
 from depthpose.depth.synthesis.generator import (
     PatchDiscriminator,
@@ -11,22 +11,22 @@ from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
     Drawn,
     Generator,
-    PaintingSynthesiser,
     SelectionSynthesiser,
     Synthesiser,
+    UNetSynthesiser,
     make_synthesiser,
 )
 
 __all__ = [
     "Drawn",
     "Generator",
-    "PaintingSynthesiser",
     "PatchDiscriminator",
     "PixelDiscriminator",
     "SelectionGenerator",
     "SelectionSynthesiser",
     "Synthesiser",
     "UNetGenerator",
+    "UNetSynthesiser",
     "make_discriminator",
     "make_synthesiser",
     "openvino_generator",

@@ -56,12 +56,12 @@ def openvino_generator(
     if not isinstance(generator, SelectionGenerator):
         raise InputError(
             "engine is 'openvino', which computes generators that select, and these weights hold "
-            "one that paints; leave engine away."
+            "a U-Net; omit engine."
         )
     if device != "cpu":
         raise InputError(
             f"engine is 'openvino', which computes on the processor, and device is {device!r}; "
-            "leave one of the two away."
+            "omit one of the two."
         )
     is_bf16 = usable_precision(precision, device) == "bf16"
     return OpenvinoGenerator(generator, "bf16" if is_bf16 else "fp32")

@@ -1,4 +1,4 @@
-"""The generators with the world around them: any size, [0, 1], test-time norm."""
+"""The generators with pre- and post-processing: any size, [0, 1], test-time norm."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -65,7 +65,7 @@ def make_synthesiser(generator: Generator, device: torch.device | str = "cpu") -
     """Put a generator of either kind to use."""
     if isinstance(generator, SelectionGenerator):
         return SelectionSynthesiser(generator, device)
-    return PaintingSynthesiser(generator, device)
+    return UNetSynthesiser(generator, device)
 
 
 class SelectionSynthesiser:
@@ -94,8 +94,8 @@ class SelectionSynthesiser:
         return Drawn(**{name: part.to(left.device) for name, part in parts.items()})
 
 
-class PaintingSynthesiser:
-    """Paints the right view of images of any size with pix2pix's U-Net.
+class UNetSynthesiser:
+    """Synthesises the right view of images of any size with pix2pix's U-Net.
 
     Norm and dropout follow ``config.test_mode``, which the weights record: ``running`` uses the
     statistics of training and no dropout; ``batch`` those of the image itself, as pix2pix tests,
@@ -117,7 +117,7 @@ class PaintingSynthesiser:
             InputError: an image is no such.
         """
         given = _checked(left, self.device)
-        # The statistics of test mode 'batch' are those of one image: company would change them.
+        # The statistics of test mode 'batch' are those of one image: a batch would change them.
         groups = given.split(1) if self.config.test_mode == "batch" else [given]
         drawn = [draw_right(self.generator, part) for part in groups]
         return Drawn(right=torch.cat(drawn).to(left.device))

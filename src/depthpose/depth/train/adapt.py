@@ -1,8 +1,8 @@
-"""A matcher gets used to one rig's pairs without truth, and is kept only if it became better.
+"""Self-supervised adaptation of a matcher to one rig's pairs; kept only if it is better.
 
-The loss looks the other view up by the disparity of each view and compares (Godard et al., CVPR
+The loss warps the other view by the disparity of each view and compares (Godard et al., CVPR
 2017), where the disparities of both views agree: elsewhere one of the two does not see the point.
-What the matcher knew before, where both views agreed at full size, holds it in place.
+Labels of the initial matcher, where both views agreed at full size, regularise it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Evidence, Turn, make_adam
+from depthpose.core.loop import Update, ValidationResult, make_adam
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import MatcherConfig, PairsConfig, StreetsConfig
 from depthpose.depth.datasets import Dataset, open_dataset
@@ -54,8 +54,8 @@ class AdaptTask:
         parameters = [p for p in matcher.parameters() if p.requires_grad]
         self.optimizers = {"matcher": (make_adam(parameters, config.adam), config.adam)}
 
-    def step(self, batch: TrainingPair) -> Iterator[Turn]:
-        """One turn: match both ways, look each view up in the other."""
+    def step(self, batch: TrainingPair) -> Iterator[Update]:
+        """One update: match both ways, warp each view to the other."""
         views = torch.cat([batch.left, batch.right.flip(-1)])
         others = torch.cat([batch.right, batch.left.flip(-1)])
         heads = [head.float() for head in self.matcher(normalise(views), normalise(others))]
@@ -69,11 +69,11 @@ class AdaptTask:
         loss = config.photometric_weight * error + config.smooth_weight * smooth
         loss = loss + config.label_weight * label
         facts = {"photometric": error.detach(), "smooth": smooth.detach(), "label": label.detach()}
-        yield Turn("matcher", loss, facts)
+        yield Update("matcher", loss, facts)
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Nothing: what was kept back is looked at once, at the end."""
-        return Evidence()
+        return ValidationResult()
 
 
 def _keep_statistics(matcher: nn.Module) -> None:
@@ -118,7 +118,7 @@ class AdaptMetrics:
     street_epe_px: float
 
 
-class Guard:
+class AdaptationCheck:
     """Measures a matcher before and after, and refuses what became worse.
 
     Args:

@@ -1,4 +1,4 @@
-"""Networks at the begin of a training: their config's, with the weights that it names."""
+"""Networks at the start of a training: their config's, with the weights that it names."""
 
 from typing import Any, cast
 
@@ -18,10 +18,10 @@ _FREE_OF_WEIGHTS = ("max_disparity_px", "least_confidence")
 """Settings that no weight depends on: a matcher searches any disparities in the same way, and below
 which confidence images are refused is chosen after a training, by ``depth calibrate``."""
 _CAN_BE_ADDED = ("with_agreement", "with_refinement")
-"""Parts that begin without effect, so weights without them can be trained on with them."""
+"""Parts initialised to zero, so weights without them can be trained on with them."""
 
 
-def refuse_fixed_chance(config: SelectTraining | StereoTraining) -> None:
+def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
     """Refuse to keep the first layers of an encoder that begins at random."""
     if config.with_fixed_start and config.encoder is None and config.start is None:
         raise InputError(
@@ -67,7 +67,7 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
             )
         load_encoder(matcher.encoder, find_weights(config.encoder))
     if matcher.encoder is not None:
-        refuse_fixed_chance(config)
+        refuse_frozen_random(config)
     if config.start is not None:
         start_from(matcher, read_matcher(find_weights(config.start)), config.start)
     return matcher

@@ -193,7 +193,7 @@ class StereoTraining:
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptTraining:
-    """A matcher gets used to the pairs of one rig, without truth (see ``train.adapt``)."""
+    """Self-supervised adaptation of a matcher to the pairs of one rig (see ``train.adapt``)."""
 
     start: str = "default"
     """Weights of the matcher that is adapted (or a whole set)."""

@@ -104,7 +104,7 @@ class TrainingPairs:
         return source.frames[place].name if isinstance(source, Dataset) else f"street {place}"
 
     def _check_baselines(self, wanted_m: float) -> None:
-        """Check every rig before any work: a pair of another one would teach other metres."""
+        """Check every rig before any work: another baseline would change the metric scale."""
         for name, rig in self._rigs():
             if rig is None:
                 raise InputError(

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
+from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
@@ -15,7 +15,7 @@ from depthpose.core.loop import (
     Run,
     Task,
     held_out_text,
-    leave_card,
+    write_card,
 )
 from depthpose.core.run import find_shard
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
@@ -23,8 +23,8 @@ from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.train.adapt import (
+    AdaptationCheck,
     AdaptTask,
-    Guard,
     adapted_text,
     fine_focal_px,
     label_folders,
@@ -32,7 +32,7 @@ from depthpose.depth.train.adapt import (
 )
 from depthpose.depth.train.begin import (
     make_matcher_network,
-    refuse_fixed_chance,
+    refuse_frozen_random,
     start_from,
 )
 from depthpose.depth.train.config import (
@@ -79,7 +79,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
-    refuse_fixed_chance(config)
+    refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     config = _at_virtual_focal(config, rig)
@@ -132,11 +132,11 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     labelled, kept = label_folders(config, run.folder / "labels")
     pairs = _pairs(labelled, config.loop, needs_truth=True)
     facts, seconds = _walk(AdaptTask(matcher, config), pairs, config, run)
-    facts = facts | {"truth": "none; what the start itself found holds it in place"}
+    facts = facts | {"truth": "none; pseudo-labels of the initial weights regularise it"}
     path = run.folder / "matcher.safetensors"
     if find_shard().rank:
         return path
-    guard = Guard(
+    guard = AdaptationCheck(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
     )
     before = read_matcher(find_weights(config.start))
@@ -144,7 +144,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)
-    leave_card(path, "depth train adapt", seconds, facts, adapted_text(*found))
+    write_card(path, "depth train adapt", seconds, facts, adapted_text(*found))
     return path
 
 
@@ -198,7 +198,7 @@ def _walk(
     if pairs.truths:
         more["truth"] = list(pairs.truths)
     facts = _facts(config, pairs.truths, tuple(named.values()))
-    say_terms(facts)
+    warn_of_terms(facts)
     run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
     return facts, run.train(task, pairs, config.loop)
 
@@ -241,7 +241,7 @@ def _leave(
         return path  # statistics of batch norm are rank 0's, and so is the file
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
     measured = held_out_text(run.folder, _MEASURED[stage])
-    leave_card(path, f"depth train {stage}", seconds, facts, measured)
+    write_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 
 
@@ -251,7 +251,7 @@ def _at_virtual_focal(
     """Bring all pairs, those held out too, to the rig that the generator imitates.
 
     The generator that selects may see them larger: it answers pixels of the image before it, and
-    these grow with the image. One that paints knows its own rig alone.
+    these grow with the image. A U-Net works for its own rig only.
 
     Raises:
         InputError: pairs are to have another focal length or size.

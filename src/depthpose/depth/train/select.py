@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
-from depthpose.core.loop import Evidence, Turn, make_adam, sample_generator
+from depthpose.core.loop import Update, ValidationResult, make_adam, sample_generator
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
@@ -117,8 +117,8 @@ class SelectTask:
         if self.config.with_fixed_start:
             self.generator.encoder.keep_statistics()
 
-    def step(self, batch: SelectionSample) -> Iterator[Turn]:
-        """One turn: say where everything is, draw the right view, compare."""
+    def step(self, batch: SelectionSample) -> Iterator[Update]:
+        """One update: predict disparity, warp the right view, compare."""
         planes = self.generator.planes
         left, right = self.generator(batch.seen)
         losses = [self._truth_loss(left, batch.left_px), self._truth_loss(right, batch.right_px)]
@@ -131,7 +131,7 @@ class SelectTask:
             view = (views * batch.has_right).sum() / batch.has_right.sum().clamp(min=1)
             loss = loss + self.config.view_weight * view
             facts["view"] = view.detach()
-        yield Turn("generator", loss, facts)
+        yield Update("generator", loss, facts)
 
     def _truth_loss(
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Float[Tensor, "b h w"]
@@ -149,10 +149,10 @@ class SelectTask:
         return loss + self.config.plane_weight * plane_loss(logits, coarse, planes)
 
     @torch.no_grad()
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Depth of held-out left images; of the first, drawn view and disparity as a picture."""
         if self.held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.generator.eval()
         device = next(self.generator.parameters()).device
         evidence = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
@@ -160,7 +160,7 @@ class SelectTask:
         return evidence
 
 
-def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> Evidence:
+def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> ValidationResult:
     """Relative error of depth (AbsRel), share within 25 % (d1), share of the sky that is missed."""
     rig = synthesiser.config
     far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
@@ -183,4 +183,4 @@ def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -
             missed.append(float((~is_sky[is_true_sky]).float().mean()))
     numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
     means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
-    return Evidence(numbers=means, pictures=pictures)
+    return ValidationResult(numbers=means, pictures=pictures)

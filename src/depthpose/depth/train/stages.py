@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
-from depthpose.core.loop import Evidence, Turn, make_adam
+from depthpose.core.loop import Update, ValidationResult, make_adam
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.losses import (
     adversarial_loss,
@@ -57,18 +57,18 @@ class StereoTask:
         if self._fixed is not None:
             self._fixed.keep_statistics()
 
-    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+    def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One turn: match and compare."""
         heads = self.matcher(normalise(batch.left), normalise(batch.right))
         reach = self.matcher.config.max_disparity_px
         heads = tuple(head.float() for head in heads)
         loss = heads_loss(heads, batch.left_px, reach, with_sky=self.config.with_sky)
-        yield Turn("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
+        yield Update("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Match held-out pairs: mean error and the share of bad pixels; the first as a picture."""
         if self.held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.matcher.eval()
         evidence = held_out_evidence(self.matcher, self.held_out)
         self._train()
@@ -79,7 +79,7 @@ def held_out_evidence(
     matcher: StereoNetwork,
     held_out: TrainingPairs,
     draw: Callable[[Tensor], Tensor] | None = None,
-) -> Evidence:
+) -> ValidationResult:
     """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws."""
     errors, bad, pictures = [], [], {}
     for index in range(len(held_out)):
@@ -98,7 +98,7 @@ def held_out_evidence(
         bad.append(float(is_bad.float().mean()))
     count = max(len(errors), 1)
     numbers = {"held_out/epe_px": sum(errors) / count, "held_out/d1": sum(bad) / count}
-    return Evidence(numbers=numbers, pictures=pictures)
+    return ValidationResult(numbers=numbers, pictures=pictures)
 
 
 @torch.no_grad()
@@ -147,28 +147,28 @@ class ViewTask:
                 config.discriminator_adam,
             )
 
-    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+    def step(self, batch: TrainingPair) -> Iterator[Update]:
         """Draw once; the discriminator learns from it, then scores it anew."""
         left, right = 2 * batch.left - 1, 2 * batch.right - 1
         drawn = self.generator(left)
         l1 = l1_loss(drawn, right)
         if self.config.discriminator == "none":
-            yield Turn("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
+            yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
         discriminator, mode = self.modules["discriminator"], self.config.gan_mode
         d_loss = discriminator_loss(
             discriminator(left, right), discriminator(left, drawn.detach()), mode
         )
-        yield Turn("discriminator", d_loss, {})
+        yield Update("discriminator", d_loss, {})
         fooled = adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = fooled + self.config.l1_weight * l1
-        yield Turn("generator", loss, {"l1": l1.detach(), "adversarial": fooled.detach()})
+        yield Update("generator", loss, {"l1": l1.detach(), "adversarial": fooled.detach()})
 
     @torch.no_grad()
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Draw held-out right views: L1 and PSNR, and the first as a picture."""
         if self.held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.generator.eval()
         errors, squares, pictures = [], [], {}
         for index in range(len(self.held_out)):
@@ -182,7 +182,9 @@ class ViewTask:
         self.generator.train()
         mean = sum(errors) / len(errors)
         psnr = sum(-10 * torch.log10(torch.tensor(s)).item() for s in squares) / len(squares)
-        return Evidence(numbers={"held_out/l1": mean, "held_out/psnr": psnr}, pictures=pictures)
+        return ValidationResult(
+            numbers={"held_out/l1": mean, "held_out/psnr": psnr}, pictures=pictures
+        )
 
 
 class FinetuneTask:
@@ -206,7 +208,7 @@ class FinetuneTask:
             "generator": (make_adam(generator.parameters(), config.adam), config.adam)
         }
 
-    def step(self, batch: TrainingPair) -> Iterator[Turn]:
+    def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One turn: draw, match, compare with the truth."""
         drawn = draw_right(self.generator, batch.left)
         (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
@@ -215,13 +217,13 @@ class FinetuneTask:
         loss = disparity_loss(found_px, batch.left_px, reach)
         l1 = l1_loss(2 * drawn, 2 * batch.right)
         facts = {"epe": mean_error_px(found_px, batch.left_px, reach), "l1": l1.detach()}
-        yield Turn("generator", loss + self.config.l1_weight * l1, facts)
+        yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
     @torch.no_grad()
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Depth of held-out left images; the first drawn view as a picture."""
         if self.held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.generator.eval()
         device = next(self.generator.parameters()).device
 

@@ -55,7 +55,7 @@ def nearest_point(
 def _refit(points_m: np.ndarray, n: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     try:
         return nearest_point(points_m[chosen], n[chosen])
-    except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all speak
+    except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
         A = len(n) * np.eye(3) - n.T @ n
         b = points_m.sum(0) - n.T @ (n * points_m).sum(1)
         return np.linalg.lstsq(A, b, rcond=None)[0]

@@ -38,11 +38,11 @@ class RefusalConfig:
     above its mean, weighed by its slope. That of 0 where there is none."""
 
     candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
-    """How much the logarithm of each signal speaks against a pose beside others that fit."""
+    """Weight of each signal's logarithm as evidence against a pose among several that fit."""
 
     min_hold: float = 0.02
-    """A motion that no declared symmetry excuses must carry the seen surface across itself by this
-    share of what it moves the object's points; one that only moves it along itself (a plane, a
+    """A motion that no symmetry allows must move the seen surface along its normals by this
+    share of what it moves the object's points; one that moves it within itself (of a plane or
     ball) is not observable."""
 
     max_scale_error: float = 0.03

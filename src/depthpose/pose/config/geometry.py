@@ -164,7 +164,7 @@ class IcpConfig:
     """At most so many exact steps from one start; half of them after the best of several."""
 
     start_distance_diameters: float = 0.1
-    """Points farther from the surface have no say in the first step."""
+    """Points farther from the surface have weight 0 in the first step."""
 
     end_distance_diameters: float = 0.05
     """The same in the last: the limit shrinks from step to step. Below the sensor's noise the

@@ -26,7 +26,7 @@ class SensorConfig:
     """Times the noise of the kind."""
 
     alike_px: tuple[float, float] | None = None
-    """Deviation of the Gaussian by which neighbouring pixels have the same noise, in pixels of the
+    """Correlation length of the noise (deviation of the Gaussian that smooths it), in pixels of the
     full image; None: 3 to 6 for ``active stereo``, else every pixel has its own. Measured on planes
     by ``bench/sensors.py``: a Kinect 3, a RealSense 5."""
 

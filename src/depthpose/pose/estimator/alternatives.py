@@ -35,12 +35,12 @@ _LONGER = 1.15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Copies:
-    """How a model may be confused with itself.
+    """Pose ambiguities of a model.
 
     Attributes:
         same: ``model_from_model`` of the copies that are one answer, the identity first.
         near: of those that are another answer and look nearly alike.
-        trained: of those that the network was taught to take for one, the identity first.
+        trained: of those that the network was trained to treat as one, the identity first.
         points_m: of the model, by which poses are compared.
         middle_m: of its box.
         axes: rows: its principal axes, from the longest.

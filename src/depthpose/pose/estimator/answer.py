@@ -16,7 +16,7 @@ from depthpose.pose.estimator.alternatives import (
     alternatives_among,
     share_out,
 )
-from depthpose.pose.estimator.doubt import Posed, find_doubt
+from depthpose.pose.estimator.doubt import Posed, find_refusal
 from depthpose.pose.estimator.evidence import without_motions
 from depthpose.pose.estimator.prepare import Refusal
 from depthpose.pose.estimator.refusal import risk_of
@@ -40,7 +40,7 @@ class Clock:
 
 
 class Found(NamedTuple):
-    """A pose, its covariance and residual, what speaks against it, and which others fit."""
+    """A pose, its covariance and residual, the evidence against it, and which others fit."""
 
     pose: Rigid
     covariance: Float[Tensor, "6 6"]
@@ -64,7 +64,7 @@ def choose(
     copies: Copies,
     refusal: RefusalConfig,
 ) -> Found:
-    """Choose among the poses that fit by what speaks against each."""
+    """Choose among the poses that fit by the evidence against each."""
     shares = share_out(evidence, refusal.candidate_slopes)
     number = int(shares.argsort(descending=True, stable=True)[0])
     alternatives = alternatives_among(candidates, evidence, shares, copies)
@@ -100,7 +100,7 @@ def checked(
     with_icp: bool = True,
 ) -> PoseEstimate:
     """Withhold an answer that is doubtful; its signals gain those that are measured last."""
-    reason = find_doubt(posed, found.signals, refusal, with_icp=with_icp)
+    reason = find_refusal(posed, found.signals, refusal, with_icp=with_icp)
     clock.note("check")
     risk = risk_of(found.signals, refusal)
     if reason is not None:

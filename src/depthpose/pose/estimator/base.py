@@ -19,7 +19,7 @@ from depthpose.pose.estimator.given import (
     view_input,
 )
 from depthpose.pose.estimator.prepare import AnyInput, Refusal
-from depthpose.pose.estimator.track import Followed, track
+from depthpose.pose.estimator.track import TrackedObject, track
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
@@ -223,7 +223,7 @@ class PoseEstimator(ABC):
     ) -> Iterator[PoseEstimate]:
         """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked."""
         number = self._number(object)
-        followed = Followed(
+        followed = TrackedObject(
             model=self.models[number],
             surface=self._surface(number),
             refusal=self.refusal,

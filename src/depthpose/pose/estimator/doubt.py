@@ -41,17 +41,17 @@ class Posed(NamedTuple):
     free: Float[Tensor, "m 6"]
 
 
-def find_doubt(
+def find_refusal(
     posed: Posed, signals: dict[str, float], config: RefusalConfig, *, with_icp: bool
 ) -> Refusal | None:
-    """Say why a pose is withheld; None where nothing speaks against it.
+    """Say why a pose is withheld; None where there is no evidence against it.
 
     What a depth image shows about the object and signals that take long are measured here, and
     added to ``signals``.
 
     Args:
         posed: the pose.
-        signals: what speaks against it.
+        signals: the evidence against it.
         config: the limits.
         with_icp: whether ICP refined it; else neither its size nor its mirror image is tested.
     """
@@ -83,8 +83,8 @@ def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
     what = "turn" if turn > math.sqrt(0.5) else "shift"
     return Refusal(
         status="not observable",
-        reason=f"the seen part of the object may {what} along itself: that moves its surface "
-        f"across itself by {observable:.1%} of the motion alone, and no declared symmetry allows "
+        reason=f"the seen part of the object leaves one {what} undetermined: it moves the surface "
+        f"along its normals by {observable:.1%} of the motion only; no declared symmetry allows "
         "it. Declare the symmetry, or look from a side that shows more",
     )
 

@@ -1,4 +1,4 @@
-"""What speaks for and against a pose: signals that need no truth.
+"""Evidence for and against a pose: signals that need no truth.
 
 Each is larger where the pose is worse, but for those of :data:`CONTEXT`.
 """
@@ -48,7 +48,7 @@ SIGNALS: dict[str, str] = {
 }
 """Name of each signal, and what it says to people."""
 CONTEXT = ("rough",)
-"""Signals that speak neither for nor against a pose, but say how much others mean: under a noisy
+"""Signals that are neither for nor against a pose, but say how much others mean: under a noisy
 sensor the normals of a right pose differ from the cloud's as well. A refusal never names them."""
 _SMOOTH = 0.1
 """Below this roughness a sensor counts as without noise: what is smoother says nothing more."""
@@ -160,7 +160,7 @@ def _tilt_and_roughness(
 ) -> tuple[float, float]:
     """Give the mean of 1 - |cosine| between normals of the cloud and of the posed surface near it.
 
-    And the median curvature of the cloud, which tells how noisy the sensor is.
+    And the median curvature of the cloud, which shows how noisy the sensor is.
     """
     thinned_m = take_evenly(cloud_m, _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)

@@ -1,4 +1,4 @@
-"""Known objects in a depth image without a mask: regions, questions, and answers that agree."""
+"""Known objects in a depth image without a mask: regions, hypotheses, and answers that agree."""
 
 import math
 from collections import Counter
@@ -22,7 +22,7 @@ _SMALLEST, _LARGEST = 0.25, 1.25
 _TOGETHER = 1.1
 """Two regions may be parts of one object where together they are no longer than this."""
 _MOST_PAIRS = 20
-_CRUMB = 0.03
+_FRAGMENT = 0.03
 """A region of fewer points than this share of another adds nothing to it."""
 _HIDDEN = 0.5
 """Of the surface that faces the camera: where more is unseen, the rest fits too many places."""
@@ -39,7 +39,7 @@ _ONE = 0.8
 """Where no object among several has so large a share of the probability, none is answered."""
 _WHOLE, _HALF = 0.96, 0.5
 """An answer explains so much of its region, or half of it and leaves enough for another object:
-what has a little more to it than the object is another thing."""
+a region slightly larger than the object is another object."""
 
 EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
 
@@ -96,7 +96,7 @@ def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
 
     Regions are tried for every object whose size they may have; so are pairs of them that may be
     parts of one object, and parts of one that is too long. Where several objects answer they share
-    the probability of one by what speaks against each. What an answer leaves unexplained of its
+    the probability of one by the evidence against each. What an answer leaves unexplained of its
     region is tried once more. An answer is left out through whose surface the camera saw, or that
     lies behind a plane that was seen, or that explains not quite all of its region; of answers that
     explain the same points the best stays.
@@ -110,11 +110,11 @@ def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
     regions, is_plane = find_regions(depth_m, view.K, largest_m)
     clouds = [*regions, *_pairs(regions, largest_m), *_parts(regions, largest_m)]
     scene = _Scene(view=view, is_plane=is_plane)
-    answers = _ask(clouds, scene, known)
+    answers = _estimate_regions(clouds, scene, known)
     rest = [answer.points_m[~answer.explained] for answer in answers]
     again = [cloud for cloud, answer in zip(rest, answers, strict=True)
              if len(cloud) >= max(_LEAST_POINTS, _REST * len(answer.points_m))]  # fmt: skip
-    answers += _ask(again, scene, known)
+    answers += _estimate_regions(again, scene, known)
     kept = _without_overlap([a for a in answers if a.is_whole], known)
     return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
 
@@ -137,7 +137,7 @@ def _pairs(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     for a, first in enumerate(clouds):
         for second in clouds[a + 1 :]:
             apart_m = float((first.median(0).values - second.median(0).values).norm())
-            if apart_m > largest_m or len(second) < _CRUMB * len(first):
+            if apart_m > largest_m or len(second) < _FRAGMENT * len(first):
                 continue
             both = torch.cat([first, second])
             if extent_m(both) <= _TOGETHER * largest_m:
@@ -155,8 +155,8 @@ def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     return [part for part in parts if len(part) >= _LEAST_POINTS]
 
 
-def _ask(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
-    """Ask every cloud for every object of its size; give the best answer of each cloud."""
+def _estimate_regions(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
+    """Estimate every object of its size from every cloud; give the best of each cloud."""
     view, inputs = scene.view, list[tuple[int, CloudInput]]()
     for k, cloud in enumerate(clouds):
         size_m = extent_m(cloud)

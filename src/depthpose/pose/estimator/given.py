@@ -31,7 +31,7 @@ AnyArray = str | Path | np.ndarray | Tensor
 AnyMask = AnyArray | Mapping[str, Any]
 """A mask, its file, or COCO's run lengths."""
 _SMALLEST_INSTANCE = 0.2
-"""Pieces of a mask below this share of the largest are crumbs of a segmentation, not objects."""
+"""Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
 
 
 def cloud_input(cloud: AnyArray, unit: Unit, object: str, name: str) -> CloudInput:
@@ -90,9 +90,9 @@ def view_input(
 
 
 def split_instances(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
-    """Split a mask into its connected pieces, from the largest down; crumbs are left out.
+    """Split a mask into its connected pieces, from the largest down; fragments are left out.
 
-    Pixels that touch at a corner are connected. A piece below a fifth of the largest is a crumb.
+    Pixels that touch at a corner are connected. A piece below a fifth of the largest is a fragment.
     """
     label, pixels = label_parts(mask)
     order = pixels.argsort(descending=True, stable=True)
@@ -124,7 +124,7 @@ def _metres(
     if given_m is not None and said_m is not None and given_m != said_m:
         raise InputError(
             f"{name}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m {said_m:g}; "
-            "leave one of the two away"
+            "omit one of the two"
         )
     unit_m = said_m if given_m is None else given_m
     if unit_m is None:

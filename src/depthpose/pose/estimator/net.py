@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator.inference import PoseInference
 from depthpose.pose.weights import read_pose_weights
@@ -37,7 +37,7 @@ class GeoPoseNet(PoseInference):
             InputError: no such weights, or none of a pose network.
         """
         found = read_pose_weights(find_weights(weights))
-        say_terms(found.facts)
+        warn_of_terms(found.facts)
         net = cls(found, config)
         net.name = str(weights)
         return net

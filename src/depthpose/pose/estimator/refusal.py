@@ -62,7 +62,7 @@ def reason_of(signals: Mapping[str, float], risk: float, config: RefusalConfig) 
         if slope > 0 and name in signals and name not in CONTEXT
     ]
     worst = max(named, key=excess, default=None)
-    what = "no single sign, but all of them together speak against it"
+    what = "no single sign, but all of them together are evidence against it"
     if worst is not None and excess(worst) > 0:
         what = SIGNALS[worst].format(signals[worst])
     return (
@@ -181,7 +181,7 @@ def _refuse_settings(
 
 
 def _risks_by_others(x: np.ndarray, wrong: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Give each row the risk that the other four fifths teach."""
+    """Give each row the risk fitted on the other four fifths."""
     # Views go round the objects: in order, a fold would be an object.
     fold = np.random.default_rng(0).permutation(len(x)) % _FOLDS
     risks = np.empty(len(x))

@@ -57,7 +57,7 @@ _SMOOTHED = 1500
 class Registration(PoseEstimator):
     """Poses of objects whose models are seen for the first time.
 
-    Pairs of points of the cloud propose poses, ICP refines them, and what speaks against the best
+    Pairs of points of the cloud propose poses, ICP refines them, and the evidence against the best
     decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`; the risk was
     calibrated on other parts (``bench/calibrate_register.py``).
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -52,7 +52,7 @@ class DepthImageRegressor:
             InputError: no such weights, or of another kind.
         """
         found = read_pose_weights(find_weights(weights))
-        say_terms(found.facts)
+        warn_of_terms(found.facts)
         return cls(found, config)
 
     @property

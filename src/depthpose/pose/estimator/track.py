@@ -1,4 +1,4 @@
-"""One object through a sequence of frames: ICP from the last pose, and a new look where it is lost.
+"""One object through a sequence of frames: ICP from the last pose, and detection where it is lost.
 
 A frame costs ICP alone as long as what was seen agrees with the pose that comes out.
 """
@@ -29,13 +29,13 @@ _SEEN = 0.35
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Followed:
+class TrackedObject:
     """What is followed, and how it is looked for.
 
     Attributes:
         model: the object.
         surface: of the model.
-        refusal: when a pose is not believed.
+        refusal: when a pose is refused.
         icp: of the first steps.
         look: an estimate of the object in a frame about which nothing is known.
     """
@@ -57,7 +57,7 @@ class _Last:
 
 
 def track(
-    frames: Iterable[AnyInput], known: Followed, first: Rigid | None = None
+    frames: Iterable[AnyInput], known: TrackedObject, first: Rigid | None = None
 ) -> Iterator[PoseEstimate]:
     """Estimate one object in frame after frame, each from the pose of the frame before.
 
@@ -85,7 +85,7 @@ def track(
         yield estimate
 
 
-def _next(given: AnyInput, last: _Last | None, known: Followed) -> PoseEstimate:
+def _next(given: AnyInput, last: _Last | None, known: TrackedObject) -> PoseEstimate:
     """Follow the object into a frame, or look for it there."""
     seconds = {}
     if last is not None:
@@ -134,7 +134,7 @@ def _contradiction(shares: tuple[float, float, float]) -> Refusal | None:
     )
 
 
-def _follow(given: AnyInput, last: _Last, known: Followed) -> PoseEstimate | Refusal:
+def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate | Refusal:
     """Refine the last pose and the predicted one, and check the better."""
     surface = known.surface
     starts = _starts(last)
@@ -150,7 +150,7 @@ def _follow(given: AnyInput, last: _Last, known: Followed) -> PoseEstimate | Ref
 
 
 def _accepted(
-    refined: Refined, scene_m: Float64[Tensor, "n 3"], known: Followed, last: _Last
+    refined: Refined, scene_m: Float64[Tensor, "n 3"], known: TrackedObject, last: _Last
 ) -> PoseEstimate | Refusal:
     """Accept a pose that the scene agrees with and that is observable."""
     surface, pose = known.surface, _doubled(refined.camera_from_model)
@@ -175,7 +175,7 @@ def _answer(
     refined: Refined,
     free: Tensor,
     signals: dict[str, float],
-    known: Followed,
+    known: TrackedObject,
     last: _Last,
 ) -> PoseEstimate:
     """Give the pose; what else it may be stays what it was where the object was found."""

@@ -43,7 +43,7 @@ _MARGIN_PX = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ruler:
-    """What the errors of an object are measured with; computed once.
+    """What the errors of an object depend on; computed once.
 
     Attributes:
         model: the object.

@@ -1,4 +1,4 @@
-"""How far the mirror image of a model is from it: what tells a left part from a right one."""
+"""How far the mirror image of a model is from it: whether a left and a right part differ."""
 
 import math
 from functools import lru_cache

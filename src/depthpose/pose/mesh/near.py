@@ -23,7 +23,7 @@ _TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
-_SHADOW_RAD = math.radians(35)
+_SUPPRESSION_RAD = math.radians(35)
 """Turns nearer to each other are one: ICP goes from one to the other."""
 _STEP = math.pi / 8
 """An axis that nearly is one of revolution counts as eight turns."""
@@ -149,7 +149,7 @@ def _starts(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     for R in promising_turns(surface):
         if len(starts) == _STARTS:
             break
-        if all(float(geodesic_rad(R, other)) > _SHADOW_RAD for other in [eye, *starts]):
+        if all(float(geodesic_rad(R, other)) > _SUPPRESSION_RAD for other in [eye, *starts]):
             starts.append(R)
     return starts
 
@@ -185,4 +185,4 @@ def _is_new(
 ) -> bool:
     """Whether a turn is far from the others and from all copies of them that look alike."""
     every = torch.cat([other @ same for other in others])
-    return float(geodesic_rad(R.expand_as(every), every).min()) > _SHADOW_RAD
+    return float(geodesic_rad(R.expand_as(every), every).min()) > _SUPPRESSION_RAD

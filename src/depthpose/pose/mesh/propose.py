@@ -23,7 +23,7 @@ _COARSE = 0.04
 """Deviation, in diameters, from which following the surface may still find a symmetry: an axis
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
-_SHADOW_RAD = 0.25
+_SUPPRESSION_RAD = 0.25
 SURE = 0.5
 """Certainty from which a proposal is taken: that of a copy that is off by the tolerance."""
 _MOST_AXES = 40
@@ -279,8 +279,8 @@ def _measure(
     kept: list[SymmetryProposal] = []
     for i in deviation.argsort().tolist():
         angle, value = float(angles[i]), float(deviation[i])
-        # A turn beside a better one is its shadow, not another symmetry.
-        is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SHADOW_RAD for p in kept)
+        # A turn near a better one is the same symmetry (non-maximum suppression).
+        is_shadow = any(abs(angle - (p.angle_rad or 0)) < _SUPPRESSION_RAD for p in kept)
         if value <= limit and not is_shadow:
             kept.append(_proposal("discrete", axis, angle, value, tolerance))
     return found + kept

@@ -38,7 +38,7 @@ def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor,
             )
         chosen.append(farthest)
         distance = ((points - points[farthest]) ** 2).sum(-1)
-        # All are measured to the chosen ones alone: the centre has no say after the first.
+        # All are measured to the chosen ones alone: the centre decides the first alone.
         nearest = distance if len(chosen) == 1 else np.minimum(nearest, distance)
     return torch.tensor(chosen)
 

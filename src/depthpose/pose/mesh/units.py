@@ -1,4 +1,4 @@
-"""The unit doctor: the commonest mistake with models and clouds, said before anything runs."""
+"""Unit check: the commonest mistake with models and clouds, reported before anything runs."""
 
 from jaxtyping import Float
 from torch import Tensor

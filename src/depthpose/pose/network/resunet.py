@@ -30,7 +30,7 @@ class ResUNetConfig:
 
     norm: Literal["batch", "none"] = "batch"
     """batch trains within hundreds of steps and is folded for use; none is the published network,
-    which barely leaves the start, though its residual branches begin scaled down."""
+    which hardly trains, though its residual branches are initialised smaller."""
 
     with_bias: bool = False
     """A bias for each inner convolution, as folding batch norm leaves one."""
@@ -82,7 +82,7 @@ class ResUNetConfig:
 
 BRANCH_SCALE = 0.25
 """Without norms the second convolution of each block begins this much smaller: seven blocks in a
-row then neither blow up nor drown what passes beside them (in the spirit of Fixup, Zhang 2019)."""
+row then neither explode nor dominate the shortcuts (in the spirit of Fixup, Zhang 2019)."""
 
 NORMED_SCALE = 0.3
 """With batch norm the size of a weight changes no output, only how far a step of Adam turns it:

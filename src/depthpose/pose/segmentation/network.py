@@ -25,7 +25,7 @@ class SegmentationConfig:
     """The network, how an image is brought to it, and what becomes of its answer."""
 
     stride: Literal[8, 16, 32] = 8
-    """FCN-8s, 16s or 32s: size in pixels of the finest features that have a say."""
+    """FCN-8s, 16s or 32s: stride in pixels of the finest features that are used."""
 
     widths: tuple[int, int, int, int] = (64, 128, 256, 512)
     """Channels of the encoder's stages; published weights have these."""

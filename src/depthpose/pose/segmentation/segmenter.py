@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from depthpose.core.arrays import Image, check_image
-from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import usable_device
 from depthpose.pose.resnet import normalise_colors
 from depthpose.pose.segmentation.network import (
@@ -66,7 +66,7 @@ class Segmenter:
             InputError: there is no such file, or it holds something else.
         """
         weights = read_segmentation(find_weights(name))
-        say_terms(weights.facts)
+        warn_of_terms(weights.facts)
         return cls(weights, device)
 
     @property

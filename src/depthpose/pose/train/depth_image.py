@@ -12,14 +12,14 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.loop import (
-    Evidence,
     Run,
-    Turn,
+    Update,
+    ValidationResult,
     held_out_text,
-    leave_card,
     make_adam,
     sample_generator,
     shuffled_index,
+    write_card,
 )
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_shard
@@ -132,7 +132,7 @@ class DepthImageTask:
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
         self._views: dict[float, list[ViewSample]] = {}
 
-    def step(self, batch: CropSample) -> Iterator[Turn]:
+    def step(self, batch: CropSample) -> Iterator[Update]:
         """One turn: regress, move the model's points, compare; in diameters."""
         which, device = batch.class_of, batch.R.device
         outputs = self.network(batch.crop.image, which).float()
@@ -140,10 +140,10 @@ class DepthImageTask:
         points_m = self._points_m.to(device)[which]
         truth = Rigid(batch.R, batch.t_m)
         error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
-        yield Turn("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
+        yield Update("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
 
     @torch.no_grad()
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Pose held-out views with the current network, without ICP."""
         cpu = DepthImageNet(self.network.config)
         cpu.load_state_dict(self.network.state_dict())
@@ -161,7 +161,7 @@ class DepthImageTask:
             place = f"held_out/occluded_{round(100 * occlusion)}/regressed"
             numbers[f"{place}_add_10"] = float(is_within_diameter(errors).float().mean())
             numbers[f"{place}_median"] = float(errors.median())
-        return Evidence(numbers=numbers)
+        return ValidationResult(numbers=numbers)
 
     def _held_out(self, occlusion: float) -> list[ViewSample]:
         if occlusion not in self._views:
@@ -195,7 +195,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     weights = packed(network, models, config)
     write_pose_weights(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, _MEASURED)
-    leave_card(path, train_words("depth-image", config), seconds, card_facts(weights), measured)
+    write_card(path, train_words("depth-image", config), seconds, card_facts(weights), measured)
     return path
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Evidence, sample_generator
+from depthpose.core.loop import ValidationResult, sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig, RefusalConfig
@@ -57,7 +57,7 @@ class HeldOut:
         self._clouds: dict[float, list[Cloud]] = {}
 
     @torch.no_grad()
-    def look(self, network: DirectionNet) -> Evidence:
+    def look(self, network: DirectionNet) -> ValidationResult:
         """Share of ADD(-S) below a tenth of the diameter, and the median in percent of it."""
         numbers: dict[str, float] = {}
         for occlusion in self.config.occlusions:
@@ -65,7 +65,7 @@ class HeldOut:
                 place = f"held_out/occluded_{round(100 * occlusion)}/{method}"
                 numbers[f"{place}_add_10"] = float(is_within_diameter(errors).float().mean())
                 numbers[f"{place}_median"] = float(errors.median())
-        return Evidence(numbers=numbers)
+        return ValidationResult(numbers=numbers)
 
     def _errors(self, network: DirectionNet, occlusion: float) -> dict[str, Float[Tensor, " n"]]:
         methods = ["lines", "ransac"] if self.config.with_ransac else ["lines"]

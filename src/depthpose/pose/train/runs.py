@@ -6,11 +6,11 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from depthpose.core.checkpoint import find_weights, say_terms
+from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
-from depthpose.core.loop import Run, leave_card
+from depthpose.core.loop import Run, write_card
 from depthpose.core.run import find_shard
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
@@ -34,10 +34,15 @@ from depthpose.pose.train.task import (
     with_classes,
 )
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+from depthpose.pose.weights import (
+    PoseWeights,
+    read_pose_network,
+    read_pose_weights,
+    write_pose_weights,
+)
 
-_LIKE_THOSE_TO_COME = 64
-"""Clouds whose statistics stand in for those that folding took."""
+_STATISTICS_CLOUDS = 64
+"""Clouds from which batch norm statistics, lost by folding, are computed again."""
 
 
 def train_pose(config: PoseTraining, run: Run) -> Path:
@@ -87,7 +92,7 @@ def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
     if config.calibration.number == 0:
         raise InputError("calibration.number is 0, so there is nothing to choose by; take 600")
     found = read_pose_weights(weights)
-    say_terms(found.facts)
+    warn_of_terms(found.facts)
     chosen = calibrated(found, config.objects, config.calibration)
     if chosen is found:
         raise InputError(
@@ -123,7 +128,7 @@ def _leave(
     write_pose_weights(path, weights, with_half=config.with_half)
     table = score_held_out(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
-    leave_card(
+    write_card(
         path, train_words(path.stem, config), seconds, card_facts(weights), table_text(table)
     )
     return path
@@ -144,15 +149,15 @@ def _network_of(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
 def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
     """Copy weights; of other objects, all but the last layer.
 
-    Written weights are folded: they have no norms, but biases. Batch norm takes both up. What they
-    were not given for a voxel, they are ignored at first.
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up. New
+    input features of a voxel get weights of zero.
 
     Raises:
         InputError: a network of another shape.
     """
-    found = read_pose_weights(find_weights(start)).network
+    found = read_pose_network(find_weights(start))
     if isinstance(found, ResUNet) and isinstance(network, ResUNet):
-        found = _listening(found, network.config.inputs)
+        found = _with_inputs(found, network.config.inputs)
     wanted, given = config_to_dict(network.config), config_to_dict(found.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
@@ -167,7 +172,7 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
         and isinstance(found, ResUNet)
         and network.config.norm != "none"
     ):
-        batch = clouds.collate([clouds[index] for index in range(_LIKE_THOSE_TO_COME)])
+        batch = clouds.collate([clouds[index] for index in range(_STATISTICS_CLOUDS)])
         unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
         return
     state = found.state_dict()
@@ -176,8 +181,8 @@ def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds)
     network.load_state_dict(state)
 
 
-def _listening(network: ResUNet, inputs: int) -> ResUNet:
-    """Give a network more inputs, to which it does not listen yet."""
+def _with_inputs(network: ResUNet, inputs: int) -> ResUNet:
+    """Give a network more inputs, with weights of zero."""
     more = inputs - network.config.inputs
     if more <= 0:
         return network

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
-from depthpose.core.loop import Evidence, Run, Turn, held_out_text, leave_card, make_adam
+from depthpose.core.loop import Run, Update, ValidationResult, held_out_text, make_adam, write_card
 from depthpose.core.run import find_shard
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.resnet import KIND, normalise_colors, read_encoder_state
@@ -40,18 +40,18 @@ class SegmentationTask:
         if config.held_out is not None:
             self._held_out = AnnotatedImages(config.held_out, objects)
 
-    def step(self, batch: LabelledImage) -> Iterator[Turn]:
+    def step(self, batch: LabelledImage) -> Iterator[Update]:
         """One turn: label and compare."""
         logits = self.network(normalise_colors(batch.image)).float()
         loss = mask_loss(logits, batch.labels, self.config.object_weight)
         overlap = Overlap(self.network.classes)
         overlap.add(logits.argmax(1), batch.labels)
-        yield Turn("network", loss, {"iou": overlap.iou()[1:].nanmean().nan_to_num(0.0)})
+        yield Update("network", loss, {"iou": overlap.iou()[1:].nanmean().nan_to_num(0.0)})
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Intersection over union on held-out images; the first with its labels as a picture."""
         if self._held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.network.eval()
         overlap = Overlap(self.network.classes)
         pictures = {}
@@ -71,7 +71,7 @@ class SegmentationTask:
             if bool(value.isfinite())
         }
         numbers["held_out/iou_objects"] = float(iou[1:].nanmean())
-        return Evidence(numbers=numbers, pictures=pictures)
+        return ValidationResult(numbers=numbers, pictures=pictures)
 
 
 def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
@@ -101,7 +101,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     write_segmentation(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
     known = {"objects": ", ".join(weights.objects), **weights.facts}
-    leave_card(path, "pose train --what segmentation", seconds, known, measured)
+    write_card(path, "pose train --what segmentation", seconds, known, measured)
     return path
 
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, say_terms
-from depthpose.core.loop import Evidence, Run, Turn, make_adam
+from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
+from depthpose.core.loop import Run, Update, ValidationResult, make_adam
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
@@ -45,7 +45,7 @@ class PoseTask:
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._copies_m = keypoint_copies(models)
 
-    def step(self, batch: CloudBatch) -> Iterator[Turn]:
+    def step(self, batch: CloudBatch) -> Iterator[Update]:
         """One turn of the loop: all clouds at once."""
         instance = batch.instance
         outputs = self.network.directions(batch.seen).float()
@@ -55,12 +55,12 @@ class PoseTask:
         if self.network.config.with_confidence:
             trust = self._confidence(outputs, batch, copies_m)
             loss, facts["confidence"] = loss + self.config.confidence_weight * trust, trust.detach()
-        yield Turn("network", loss, facts)
+        yield Update("network", loss, facts)
 
-    def validate(self) -> Evidence:
+    def validate(self) -> ValidationResult:
         """Pose held-out views with the current network."""
         if self.held_out is None:
-            return Evidence()
+            return ValidationResult()
         self.network.eval()
         evidence = self.held_out.look(self.network)
         self.network.train()
@@ -109,7 +109,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     more: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
         more["start_sha256"] = file_sha256(find_weights(config.start))
-        say_terms(bound_facts({}, [config.start]))
+        warn_of_terms(bound_facts({}, [config.start]))
     weights = ("pose", "pointnet", "depth-image", "segmentation")
     run.claim(config, weights, more, without=("held_out", "calibration"))
 
