@@ -42,7 +42,7 @@ COMMANDS = {
     "depth predict": ("depth.commands:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
         "depth.training:train",
-        "stages view, select, stereo, finetune: generator, matcher, both together",
+        "stages view, select, stereo, adapt, finetune of generator and matcher",
     ),
     "depth calibrate": (
         "depth.training:calibrate",

@@ -28,7 +28,7 @@ def serve(page: ServeOptions = ServeOptions()) -> int:
 
     Tab Depth: depth, the synthesised right view, confidence and a cloud. Tab Pose: votes, the posed
     model and its covariance, or the reason for a refusal. All results can be downloaded. It needs
-    no network, sends nothing anywhere, keeps nothing on the disk, and by default answers this
+    no network, sends nothing anywhere, leaves nothing on the disk, and by default answers this
     machine alone. Needs the extra 'serve'. Ctrl+C stops it.
 
         depthpose serve

@@ -13,7 +13,7 @@ def list_weights(folder: Path | None = None) -> int:
     """List the weights that came with depthpose, or those in a folder.
 
     Args:
-        folder: list this one instead.
+        folder: list the weights in this folder instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.report.tables import plain_table

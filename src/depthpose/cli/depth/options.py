@@ -42,7 +42,7 @@ class PairOptions(MatcherOptions):
 
     speed: Speed = "fine"
     """quick: at the focal length that the weights were trained at; fine: at up to 280,000 pixels
-    (PSMNet) or 650,000 (light), for KITTI in 3 to 5 times the time."""
+    (PSMNet) or 650,000 (light), for KITTI in about 3 times the time."""
 
     @property
     def config(self) -> MatcherConfig:

@@ -87,7 +87,7 @@ def train(
     beginning: BeginningOptions = BeginningOptions(),
     training: TrainingOptions = TrainingOptions(),
 ) -> int:
-    """Train a generator, the matcher, or the first through the second, by stages.
+    """Train a generator, a matcher, or a generator through a matcher, in stages.
 
         view      the thesis's generator, a U-Net (pix2pix) for the right view; needs pairs
         select    a generator that warps the left image to the right view, and estimates depth

@@ -147,7 +147,7 @@ def evaluate(
         csv: BOP results of any method.
         predictions: folders with poses.json.
         objects: keep these alone, by name or number.
-        adds: declared: ADD-S for objects declared symmetric (of LineMOD eggbox and glue); all.
+        adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
     from depthpose.cli.pose import evaluating
     from depthpose.cli.pose.masks import find_masks

@@ -80,7 +80,7 @@ class RegisterOptions:
     method: Literal["network", "register"] = "network"
     """network: trained weights. register: the CAD file alone, after a few seconds for each part."""
     cad: tuple[str, ...] = ()
-    """of register: STL, PLY, OBJ or GLB files; an object is called as its file. A data set has its
+    """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
     own models."""
     cad_unit: Unit | None = None
     """of the CAD files; as --unit by default."""

@@ -60,7 +60,7 @@ def track(
 ) -> int:
     """Follow a known object through depth images, clouds or the scenes of a data set.
 
-    Each frame starts from the pose of the one before and costs ICP alone. Where what was seen
+    Each frame starts from the pose of the one before and needs ICP alone. Where the depth
     contradicts the pose, the object is detected again in that frame; where that fails too,
     the frame is lost, and the next is searched. poses.json says of each frame which of the three it
     was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
