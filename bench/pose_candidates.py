@@ -19,7 +19,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import GeoPoseNet, fit_candidate_slopes
-from depthpose.pose.estimator.alternatives import Copies, find_copies, share_out
+from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies, share_out
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights
@@ -30,7 +30,7 @@ BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.01))
 Case = tuple[list[dict[str, float]], int]
 
 
-def add_of(pose: Rigid, truth: Rigid, copies: Copies) -> float:
+def add_of(pose: Rigid, truth: Rigid, copies: PoseAmbiguities) -> float:
     """ADD in diameters to the nearest true copy."""
     double = Rigid(truth.R.double(), truth.t_m.double()) @ copies.same
     there_m = Rigid(pose.R.double(), pose.t_m.double()).apply(copies.points_m)
@@ -38,7 +38,7 @@ def add_of(pose: Rigid, truth: Rigid, copies: Copies) -> float:
     return float(gap_m.norm(dim=-1).mean(-1).min()) / copies.diameter_m
 
 
-def case_of(found: PoseEstimate, truth: Rigid, copies: Copies) -> Case | None:
+def case_of(found: PoseEstimate, truth: Rigid, copies: PoseAmbiguities) -> Case | None:
     """Give the signals of all candidates and the index of the right one, if there is one."""
     if found.camera_from_model is None or not found.alternatives:
         return None

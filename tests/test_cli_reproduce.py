@@ -14,7 +14,7 @@ from tests.synthetic_street import make_street
 from depthpose.cli import main
 from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.methods import Method
-from depthpose.cli.thesis.depth_tables import Order, reproduce_table, write_figure
+from depthpose.cli.thesis.depth_tables import TableSpec, reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.depth.datasets import open_dataset
@@ -69,8 +69,8 @@ def reproduce(table: str, street: Path, out: Path, *more: str) -> int:
     return main([*given, *CAMERA_Z, *more])
 
 
-def order_of(table: str, street: Path, caps_m: tuple[float, ...] = (80.0, 50.0)) -> Order:
-    return Order(
+def order_of(table: str, street: Path, caps_m: tuple[float, ...] = (80.0, 50.0)) -> TableSpec:
+    return TableSpec(
         table=find_table(table),
         dataset=open_dataset(street),
         protocol="eigen-raw-camera",

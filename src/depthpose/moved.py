@@ -4,6 +4,7 @@ import sys
 
 MOVED = {
     "cli.viewing": "report.viewer",
+    "core.hold": "core.lock",
     "core.raster": "core.render",
     "core.report": "report.tables",
     "core.scene": "report.scene",

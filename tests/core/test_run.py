@@ -4,11 +4,11 @@ import pytest
 
 from depthpose.core.errors import InputError
 from depthpose.core.run import (
-    Shard,
+    ProcessRank,
     claim_folder,
     claim_names,
     environment,
-    find_shard,
+    find_rank,
     own_device,
     read_settings,
     refuse_among_inputs,
@@ -110,20 +110,20 @@ def test_the_environment_names_versions_and_date() -> None:
 
 
 def test_shards_share_everything_once() -> None:
-    shares = [list(Shard(rank=rank, world=3).share(10)) for rank in range(3)]
+    shares = [list(ProcessRank(rank=rank, world=3).share(10)) for rank in range(3)]
     assert sorted(k for share in shares for k in share) == list(range(10))
-    assert list(Shard().share(4)) == [0, 1, 2, 3]
+    assert list(ProcessRank().share(4)) == [0, 1, 2, 3]
 
 
 def test_the_shard_is_read_from_the_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
         monkeypatch.delenv(name, raising=False)
-    assert find_shard() == Shard(rank=0, world=1)
+    assert find_rank() == ProcessRank(rank=0, world=1)
     assert own_device("cuda") == "cuda"
     monkeypatch.setenv("RANK", "2")
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.setenv("LOCAL_RANK", "1")
-    assert find_shard() == Shard(rank=2, world=4)
+    assert find_rank() == ProcessRank(rank=2, world=4)
     assert [own_device(name) for name in ("cuda", "cuda:3", "cpu")] == ["cuda:1", "cuda:3", "cpu"]
 
 
@@ -134,7 +134,7 @@ def test_a_rank_that_cannot_be_is_refused(
     monkeypatch.setenv("RANK", rank)
     monkeypatch.setenv("WORLD_SIZE", world)
     with pytest.raises(InputError, match="let torchrun or accelerate launch set them"):
-        find_shard()
+        find_rank()
 
 
 def test_waiting_ends_when_all_is_there() -> None:

@@ -478,7 +478,9 @@ def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     assert known.familiarity == pytest.approx(0.7)
     assert known.warning == ""
     synthesiser = make_synthesiser(unsure(0.8))
-    with pytest.raises(InputError, match=r"cup: out of distribution .* below 0\.80\), .* with_unlike=True"):
+    with pytest.raises(
+        InputError, match=r"cup: out of distribution .* below 0\.80\), .* with_unlike=True"
+    ):
         FakestereoNet(None, synthesiser).estimate(image, lens, name="cup")
     guess = FakestereoNet(None, synthesiser, with_unlike=True).estimate(image, lens, name="cup")
     assert guess.warning.startswith("out of distribution for these weights")

@@ -23,7 +23,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, is_bop, open_bop
 from depthpose.pose.datasets.frames import bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
-from depthpose.pose.evaluate.errors import Ruler
+from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
 from depthpose.pose.mesh import mesh_suffixes, read_model
 from depthpose.pose.mesh.models import MESH_READERS
@@ -100,7 +100,7 @@ def test_extending_layouts(
     assert "own: 1 images, 2 instances" in capsys.readouterr().out
 
 
-def add_median(estimated: Rigid, instance: Instance, ruler: Ruler) -> float:
+def add_median(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
     """A metric of our own: the median distance of a model point [m]."""
     points_m = ruler.model.vertices_m.double()
     true = instance.camera_from_model

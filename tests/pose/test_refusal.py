@@ -222,8 +222,8 @@ def test_a_plane_is_unobservable_and_a_corner_is_not() -> None:
     flat = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     side = flat * torch.tensor([0.19, 0.05, 0]) + torch.tensor([0.0, 0, -0.025])
     none = torch.zeros(0, 6)
-    hold, motion = observability(pose.apply(side.double()), pose, surface, none)
-    assert hold < 1e-6
+    lock_folder, motion = observability(pose.apply(side.double()), pose, surface, none)
+    assert lock_folder < 1e-6
     assert float(motion.norm()) == pytest.approx(1)
     whole, _ = observability(pose.apply(surface.points_m), pose, surface, none)
     assert whole > 0.15

@@ -162,8 +162,8 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
-        if "depthpose.core.hold" in sys.modules:
-            sys.modules["depthpose.core.hold"].release_folders()
+        if "depthpose.core.lock" in sys.modules:
+            sys.modules["depthpose.core.lock"].release_folders()
 
 
 def _fail(reason: str, code: int = 2) -> int:

@@ -20,11 +20,11 @@ def progress_bar(view: str | None = None) -> Iterator[Callable[[Any], None]]:
     """A bar with time left and the latest numbers; with ``view``, curves of them in Rerun too."""
     from tqdm import tqdm
 
-    from depthpose.core.run import find_shard
+    from depthpose.core.run import find_rank
     from depthpose.report.viewer import open_viewer
 
     # Opened before the length is known; other processes than the first never show a step.
-    is_first = find_shard().rank == 0
+    is_first = find_rank().rank == 0
     is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
     with (
         tqdm(unit=" steps", disable=None if is_first else True) as bar,

@@ -16,7 +16,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, remove_parts, write_json
-from depthpose.core.hold import hold, write_once
+from depthpose.core.lock import lock_folder, write_once
 
 RECORD = "run.json"
 _SOURCES = "sources.json"
@@ -25,7 +25,7 @@ _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shard:
+class ProcessRank:
     """Rank of this process among several that share the work through files.
 
     Attributes:
@@ -41,7 +41,7 @@ class Shard:
         return range(self.rank, total, self.world)
 
 
-def find_shard() -> Shard:
+def find_rank() -> ProcessRank:
     """Read RANK and WORLD_SIZE, as ``torchrun`` and ``accelerate launch`` set them.
 
     Raises:
@@ -53,7 +53,7 @@ def find_shard() -> Shard:
             f"RANK is {said[0]!r} and WORLD_SIZE {said[1]!r}, but a rank is 0 .. WORLD_SIZE - 1; "
             "let torchrun or accelerate launch set them, or unset both"
         )
-    return Shard(rank=int(said[0]), world=int(said[1]))
+    return ProcessRank(rank=int(said[0]), world=int(said[1]))
 
 
 def own_device(device: str) -> str:
@@ -107,7 +107,7 @@ def claim_folder(
 ) -> None:
     """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
-    It is this process's until :func:`depthpose.core.hold.release_folders`, and that of all
+    It is this process's until :func:`depthpose.core.lock.release_folders`, and that of all
     processes of one launch. What a killed run left half written in it is removed.
 
     Args:
@@ -130,7 +130,7 @@ def claim_folder(
     if not record.exists():
         write_once(record, run_record(settings))
     refuse_other_settings(folder, read_json(record), settings)
-    if hold(record, is_shared=find_shard().world > 1):
+    if lock_folder(record, is_shared=find_rank().world > 1):
         remove_parts(folder)
 
 

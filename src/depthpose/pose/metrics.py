@@ -35,7 +35,7 @@ class View:
     Attributes:
         depth_m: measured; NaN or 0 where there is no reading.
         K: intrinsic matrix of that image.
-        render: depth of the object at a pose, in this camera; with ``core.raster``
+        render: depth of the object at a pose, in this camera; with ``core.render``
             ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
     """
 

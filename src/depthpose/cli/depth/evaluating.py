@@ -13,7 +13,7 @@ from depthpose.cli.depth.methods import Method, baseline_method, named_method, s
 from depthpose.cli.depth.options import MethodOptions
 from depthpose.cli.depth.page import frame_sections
 from depthpose.core.errors import InputError
-from depthpose.core.run import environment, find_shard, read_settings, wait_for
+from depthpose.core.run import environment, find_rank, read_settings, wait_for
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
 from depthpose.depth.evaluate import (
@@ -64,7 +64,7 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
         for i, frame in frames
         if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
     ]
-    shard = find_shard()
+    shard = find_rank()
     mine = [usable[k] for k in shard.share(len(usable))]
     names = [dataset.frames[i].name for i in mine]
     readers = [partial(_read, dataset, i, method.with_right) for i in mine]
@@ -113,7 +113,7 @@ def measure(
     ready: Sequence[Evaluation] = (),
 ) -> int:
     """Measure, write rows, a table and a page, and print; rows that are ``ready`` come last."""
-    if find_shard().rank > 0:
+    if find_rank().rank > 0:
         return 0
     each = measure_each(dataset, folders, protocol, caps_m)
     measured = join([*each, *ready])

@@ -13,7 +13,7 @@ from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
-from depthpose.core.run import claim_folder, claim_names, find_shard
+from depthpose.core.run import claim_folder, claim_names, find_rank
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.predictions import (
     ENDINGS,
@@ -99,7 +99,7 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     claim_folder(out, {**method.settings, "camera": rig}, [PAGE])
     claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
     failures: list[str] = []
-    mine = find_shard().share(len(pairs.left))
+    mine = find_rank().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):
         name = pairs.left[index].stem
         if is_finished(out, name) and (not with_cloud or has_cloud(out, name)):
@@ -116,7 +116,7 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
-    if find_shard().rank == 0:
+    if find_rank().rank == 0:
         _write_page(pairs, out, failures)
     return 1 if failures else 0
 

@@ -27,7 +27,7 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.run import claim_folder, claim_names, find_shard, refuse_among_inputs
+from depthpose.core.run import claim_folder, claim_names, find_rank, refuse_among_inputs
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import (
     ENDINGS,
@@ -114,9 +114,9 @@ def predict_all(
     videos = [source.stem for source in sources if _is_video(source)]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     claim_names(out, {source.stem: source for source in sources}, endings, videos)
-    mine = [sources[k] for k in find_shard().share(len(sources))]
+    mine = [sources[k] for k in find_rank().share(len(sources))]
     assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
-    with open_viewer(None if find_shard().rank else look.view) as viewer:
+    with open_viewer(None if find_rank().rank else look.view) as viewer:
         predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
         images = {path.stem: path for path in mine if not _is_video(path)}
         done = predictor.predict_images(images)
@@ -128,7 +128,7 @@ def predict_all(
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{done} depth maps are in {out}")
-    if find_shard().rank == 0:
+    if find_rank().rank == 0:
         _write_page(sources, lens, out, look, [str(failure) for failure in failures])
     return 1 if failures else 0
 

@@ -112,7 +112,7 @@ def train(
     """
     from depthpose.core.config import read_config
     from depthpose.core.loop import Run
-    from depthpose.core.run import find_shard
+    from depthpose.core.run import find_rank
     from depthpose.depth.train import STAGES
 
     kind, run_stage = STAGES[stage]
@@ -122,7 +122,7 @@ def train(
     with progress_bar(training.view) as on_step:
         run = Run(folder=out, resume=training.resume, finish=training.finish, on_step=on_step)
         path = run_stage(chosen, run)
-    if find_shard().rank == 0:
+    if find_rank().rank == 0:
         say_trained(path)
     return 0
 

@@ -13,7 +13,7 @@ from depthpose.cli.pose.page import write_pose_page
 from depthpose.cli.pose.predicting import claim, say_result, write_files
 from depthpose.core.errors import InputError
 from depthpose.core.files import list_images
-from depthpose.core.run import find_shard, refuse_among_inputs
+from depthpose.core.run import find_rank, refuse_among_inputs
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import view_input
@@ -54,7 +54,7 @@ def find_all(
 def _refuse_unable(method: PoseMethod) -> None:
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
-    if find_shard().world > 1:
+    if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
 
 

@@ -22,10 +22,10 @@ from depthpose.core.files import (
 )
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
-    Shard,
+    ProcessRank,
     claim_folder,
     claim_names,
-    find_shard,
+    find_rank,
     wait_for,
 )
 from depthpose.pose.cloud import object_points
@@ -86,7 +86,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     Returns:
         All predictions in the order of the jobs; None in a process that is not the first.
     """
-    shard = find_shard()
+    shard = find_rank()
     home = out if shard.world == 1 else out / f"part-{shard.rank}"
     done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
     left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
@@ -204,7 +204,7 @@ def _known(out: Path) -> dict[str, Prediction]:
     return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
-def _gather(jobs: list[Job[Any]], out: Path, shard: Shard) -> list[Prediction]:
+def _gather(jobs: list[Job[Any]], out: Path, shard: ProcessRank) -> list[Prediction]:
     if shard.world > 1:
         seen: dict[str, Any] = {"at": -10.0, "names": set()}
 

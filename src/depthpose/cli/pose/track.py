@@ -37,13 +37,13 @@ class SequenceOptions:
         Raises:
             InputError: which, and the rule.
         """
-        from depthpose.core.run import find_shard
+        from depthpose.core.run import find_rank
 
         if sum(given is not None for given in (self.depth, self.cloud, self.bop)) != 1:
             raise InputError("give one of --depth with --camera, --cloud and --bop")
         if self.depth is not None and self.camera is None:
             raise InputError("--depth needs --camera beside it")
-        if find_shard().world > 1:
+        if find_rank().world > 1:
             raise InputError("a sequence is followed by one process; start one")
 
     @property

@@ -91,7 +91,7 @@ def train(
     """
     from depthpose.core.config import read_config
     from depthpose.core.loop import Run
-    from depthpose.core.run import find_shard
+    from depthpose.core.run import find_rank
     from depthpose.pose.train import STAGES
 
     kind, run_stage = STAGES[learnt.what]
@@ -100,7 +100,7 @@ def train(
         raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
     chosen = dataclasses.replace(chosen, loop=training.applied(chosen.loop, workers=workers))
     chosen = learnt.applied(chosen, config)
-    is_first = find_shard().rank == 0
+    is_first = find_rank().rank == 0
     with progress_bar(training.view) as on_step:
         tell = partial(print, flush=True) if is_first else None
         run = Run(

@@ -13,7 +13,7 @@ from depthpose.cli.depth import evaluating
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, environment, find_shard
+from depthpose.core.run import claim_folder, environment, find_rank
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import Dataset, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
@@ -46,7 +46,7 @@ _RESULTS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class TableSpec:
     """What to make: a table, on which frames, measured how."""
 
     table: PublishedTable
@@ -96,13 +96,13 @@ def own_methods(
     return chosen
 
 
-def reproduce_table(order: Order, methods: Sequence[tuple[str, Method]], out: Path) -> int:
+def reproduce_table(order: TableSpec, methods: Sequence[tuple[str, Method]], out: Path) -> int:
     """Predict what is missing, measure, join with the published rows, and write everything."""
     claim_folder(out, _settings(order, [method for _, method in methods]), _RESULTS)
     rule = find_protocol(order.protocol)
     home = out / "predictions"
     folders = [evaluating.predict_all(order.dataset, m, rule, home) for _, m in methods]
-    if find_shard().rank > 0:
+    if find_rank().rank > 0:
         return 0
     measured = evaluating.measure_all(order.dataset, folders, order.protocol, order.caps_m)
     of_each = len(order.caps_m)
@@ -194,7 +194,7 @@ def _draw_column(number: str, dataset: Dataset, index: int, method: Method) -> l
     return draw_figure_2_1(pair, lidar_m, estimate, method.net.estimate_pair(pair))
 
 
-def _picture_sections(order: Order, methods: Sequence[Method], out: Path) -> list[Section]:
+def _picture_sections(order: TableSpec, methods: Sequence[Method], out: Path) -> list[Section]:
     """Draw some frames of each method, from the files that were measured."""
     if order.pictures < 1:
         return []
@@ -237,7 +237,7 @@ def _lidar(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | None:
     return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
 
 
-def _settings(order: Order, methods: Sequence[Method]) -> dict[str, Any]:
+def _settings(order: TableSpec, methods: Sequence[Method]) -> dict[str, Any]:
     """What decides the results; the files of a run of other settings are not touched."""
     return {
         "table": order.table.number,
@@ -257,7 +257,7 @@ def _setting_rows(methods: Sequence[Method]) -> list[dict[str, Any]]:
     ]
 
 
-def _say_how(order: Order) -> str:
+def _say_how(order: TableSpec) -> str:
     how = evaluating.describe_protocol(order.protocol)
     return (
         f"Ours: {how} The printed rows are of the 697 frames of eigen-test. Difference: ours minus "

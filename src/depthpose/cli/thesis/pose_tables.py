@@ -37,7 +37,7 @@ _RESULTS = (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Order:
+class TableSpec:
     """What to make: a table, of which instances, with how many pictures."""
 
     number: str
@@ -45,7 +45,7 @@ class Order:
     pictures: int
 
 
-def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Order:
+def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> TableSpec:
     """Open the one data set that was named.
 
     Raises:
@@ -54,11 +54,11 @@ def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Ord
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
     dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
-    return Order(number=number, dataset=dataset, pictures=how.pictures)
+    return TableSpec(number=number, dataset=dataset, pictures=how.pictures)
 
 
 def reproduce_by_object(
-    order: Order,
+    order: TableSpec,
     weights: Sequence[str],
     how: PoseTableOptions,
     out: Path,
@@ -120,7 +120,7 @@ def _write(title: str, sections: Sequence[Section], out: Path) -> int:
 
 
 def _settings(
-    order: Order, methods: Sequence[pose_methods.PoseMethod], how: PoseTableOptions
+    order: TableSpec, methods: Sequence[pose_methods.PoseMethod], how: PoseTableOptions
 ) -> dict[str, Any]:
     """What decides the results; the files of a run of other settings are not touched."""
     return {
@@ -131,7 +131,7 @@ def _settings(
     }
 
 
-def _say_how(order: Order) -> str:
+def _say_how(order: TableSpec) -> str:
     ours = (
         "Percent of instances whose ADD (ADD-S where there is a star, or a declared symmetry) is "
         "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "

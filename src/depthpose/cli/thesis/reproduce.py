@@ -92,7 +92,7 @@ def reproduce(
     reproducing.refuse_wrong_count(published, rows.weights, rows.matcher)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
     chosen = rows.methods(published, matching.config)
-    order = reproducing.Order(
+    order = reproducing.TableSpec(
         table=published,
         dataset=dataset,
         protocol=comparison.protocol,

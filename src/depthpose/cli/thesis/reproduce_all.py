@@ -89,11 +89,11 @@ def reproduce_all(
         protocol: how depth is compared; eigen-raw is the thesis's.
         device: auto: a GPU where there is one; cpu: none.
     """
-    from depthpose.core.run import find_shard
+    from depthpose.core.run import find_rank
 
     if kitti is None and linemod is None:
         raise InputError("there is nothing to reproduce from: give --kitti or --linemod FOLDER.")
-    if find_shard().world > 1:
+    if find_rank().world > 1:
         raise InputError(
             "'reproduce all' runs its steps one after the other in one process; launch the "
             "trainings that it prints one by one, then run it again"

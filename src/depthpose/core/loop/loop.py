@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
-from depthpose.core.hold import release_folders
+from depthpose.core.lock import release_folders
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.host import (
     Arithmetic,

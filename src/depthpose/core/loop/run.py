@@ -10,7 +10,7 @@ from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.journal import run_files
 from depthpose.core.loop.loop import Progress, train
 from depthpose.core.loop.task import Samples, Task
-from depthpose.core.run import claim_folder, find_shard
+from depthpose.core.run import claim_folder, find_rank
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Settings of the loop that change no weight: a resumed run may have others."""
@@ -55,7 +55,7 @@ class Run:
         """
         settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
         decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
-        settings["loop"] = decisive | {"processes": find_shard().world}
+        settings["loop"] = decisive | {"processes": find_rank().world}
         kept = {k: v for k, v in settings.items() if k not in without}
         claim_folder(self.folder, kept, [file for name in weights for file in run_files(name)])
         write_config(self.folder / "config.yaml", config)

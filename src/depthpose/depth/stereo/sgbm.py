@@ -33,7 +33,7 @@ class SGBMMatcher:
         self._cv2 = import_opencv("matching with StereoSGBM")
 
     def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair. The confidence, 1 or 0, only says which pixels were filled.
+        """Match one pair. With filled holes the confidence is 0 there and 1 elsewhere; else None.
 
         Raises:
             InputError: unusable images, or images narrower than the disparity range.

@@ -24,7 +24,7 @@ class Sight:
         raster: visibility at the pixel centres.
         K: intrinsic matrix.
         eye: position of the camera in the left camera's frame [m]; it looks along z.
-        edges: edge functions of all triangles; see ``core.raster``.
+        edges: edge functions of all triangles; see ``core.render``.
         volume: what they are divided by.
     """
 

@@ -1,4 +1,4 @@
-"""A config to a trained weights file: the three stages as commands run them."""
+"""A config to a trained weights file: the stages as commands run them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -17,7 +17,7 @@ from depthpose.core.loop import (
     held_out_text,
     write_card,
 )
-from depthpose.core.run import find_shard
+from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import StereoNetwork
@@ -73,7 +73,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
-    facts, seconds = _walk(ViewTask(generator, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(ViewTask(generator, config, held_out), pairs, config, run)
     return _leave(run, "view", facts, seconds, generator=generator)
 
 
@@ -101,7 +101,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     if config.start is not None:
         start_from(generator, read_generator(find_weights(config.start)), config.start)
     held_out = _held_out(config.held_out, needs_truth=True)
-    facts, seconds = _walk(SelectTask(generator, config, held_out), samples, config, run)
+    facts, seconds = _run_stage(SelectTask(generator, config, held_out), samples, config, run)
     return _leave(run, "select", facts, seconds, generator=generator)
 
 
@@ -112,7 +112,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     pairs = _pairs(config.pairs, config.loop, needs_truth=True)
     held_out = _held_out(config.held_out, needs_truth=True)
     matcher = make_matcher_network(config)
-    facts, seconds = _walk(StereoTask(matcher, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
 
 
@@ -131,10 +131,10 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
         config = replace(config, pairs=pairs)
     labelled, kept = label_folders(config, run.folder / "labels")
     pairs = _pairs(labelled, config.loop, needs_truth=True)
-    facts, seconds = _walk(AdaptTask(matcher, config), pairs, config, run)
+    facts, seconds = _run_stage(AdaptTask(matcher, config), pairs, config, run)
     facts = facts | {"truth": "none; pseudo-labels of the initial weights regularise it"}
     path = run.folder / "matcher.safetensors"
-    if find_shard().rank:
+    if find_rank().rank:
         return path
     guard = AdaptationCheck(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
@@ -166,7 +166,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     pairs = _pairs(config.pairs, config.loop, needs_truth=True, baseline_m=rig_m)
     held_out = _held_out(config.held_out, needs_truth=True)
     task = FinetuneTask(generator, matcher, config, held_out)
-    facts, seconds = _walk(task, pairs, config, run)
+    facts, seconds = _run_stage(task, pairs, config, run)
     return _leave(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
 
@@ -180,7 +180,7 @@ STAGES = {
 """Config and function of each stage, by its name on the command line."""
 
 
-def _walk(
+def _run_stage(
     task: Task,
     pairs: TrainingPairs | SelectionSamples,
     config: Any,  # noqa: ANN401
@@ -237,7 +237,7 @@ def _leave(
     """Write the weights and their card."""
     names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]
     path = run.folder / f"{names[0] if len(names) == 1 else 'fakestereo'}.safetensors"
-    if find_shard().rank:
+    if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
     measured = held_out_text(run.folder, _MEASURED[stage])

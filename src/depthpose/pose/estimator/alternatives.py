@@ -34,7 +34,7 @@ _LONGER = 1.15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Copies:
+class PoseAmbiguities:
     """Pose ambiguities of a model.
 
     Attributes:
@@ -66,7 +66,7 @@ class Candidate(NamedTuple):
     residual_m: float
 
 
-def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> Copies:
+def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     """Search a model for its near-symmetries, or count them as one answer with the true ones.
 
     Args:
@@ -88,7 +88,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> Copies:
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
-    return Copies(
+    return PoseAmbiguities(
         same=same,
         near=turns,
         trained=Rigid(trained.R.double(), trained.t_m.double()),
@@ -114,7 +114,7 @@ def find_candidates(
     cloud_m: Float[Tensor, "n 3"],
     best: Candidate,
     others: Rigid,
-    copies: Copies,
+    copies: PoseAmbiguities,
     surface: Surface,
     config: IcpConfig | None,
 ) -> list[Candidate]:
@@ -166,7 +166,9 @@ def _refined(
     ]
 
 
-def is_same_pose(first: Rigid, second: Rigid, copies: Copies, limit: float = _SAME) -> bool:
+def is_same_pose(
+    first: Rigid, second: Rigid, copies: PoseAmbiguities, limit: float = _SAME
+) -> bool:
     """Whether two poses, or a copy of one that counts as it, carry the model to one place."""
     every = second @ copies.same
     gap_m = first.apply(copies.points_m) - every.apply(copies.points_m.expand(len(every.R), -1, -1))
@@ -174,7 +176,7 @@ def is_same_pose(first: Rigid, second: Rigid, copies: Copies, limit: float = _SA
 
 
 def evidence_of(
-    voted: Voted, pose: Rigid, model: ObjectModel, copies: Copies, surface: Surface
+    voted: Voted, pose: Rigid, model: ObjectModel, copies: PoseAmbiguities, surface: Surface
 ) -> dict[str, float]:
     """Give the signals by which candidates are compared.
 
@@ -202,7 +204,7 @@ def alternatives_among(
     candidates: Sequence[Candidate],
     evidence: Sequence[dict[str, float]],
     shares: Float64[Tensor, " b"],
-    copies: Copies,
+    copies: PoseAmbiguities,
 ) -> tuple[Alternative, ...]:
     """Name the candidates beside the best, the likeliest first; unlikely ones are left out.
 
@@ -223,7 +225,7 @@ def alternatives_among(
     )
 
 
-def difference_of(pose: Rigid, from_pose: Rigid, copies: Copies) -> str:
+def difference_of(pose: Rigid, from_pose: Rigid, copies: PoseAmbiguities) -> str:
     """Say how a pose differs from another: by which turn about which axis of the model."""
     turn = from_pose.R.double().mT @ pose.R.double()
     angle = math.degrees(float(geodesic_rad(turn, torch.eye(3, dtype=torch.float64))))
@@ -235,7 +237,7 @@ def difference_of(pose: Rigid, from_pose: Rigid, copies: Copies) -> str:
     return words
 
 
-def _axis_words(turn: Float64[Tensor, "3 3"], copies: Copies) -> str:
+def _axis_words(turn: Float64[Tensor, "3 3"], copies: PoseAmbiguities) -> str:
     axis = _axis_of(turn)
     lengths = copies.lengths_m
     names = {}

@@ -12,7 +12,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.alternatives import (
     Candidate,
-    Copies,
+    PoseAmbiguities,
     alternatives_among,
     share_out,
 )
@@ -61,7 +61,7 @@ def choose(
     candidates: Sequence[Candidate],
     evidence: Sequence[dict[str, float]],
     signals: dict[str, float],
-    copies: Copies,
+    copies: PoseAmbiguities,
     refusal: RefusalConfig,
 ) -> Found:
     """Choose among the poses that fit by the evidence against each."""

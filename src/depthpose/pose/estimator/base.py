@@ -9,8 +9,8 @@ from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, Unit
-from depthpose.pose.estimator.alternatives import Copies, find_copies
-from depthpose.pose.estimator.find import Known, find_objects, nothing_found, which_object
+from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
 from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
@@ -42,7 +42,7 @@ class PoseEstimator(ABC):
         self.config = EstimateConfig() if config is None else config
         self._numbers = {model.name: k for k, model in enumerate(models)}
         self._surfaces: dict[int, Surface] = {}
-        self._copies: dict[int, Copies] = {}
+        self._copies: dict[int, PoseAmbiguities] = {}
 
     @property
     @abstractmethod
@@ -170,7 +170,7 @@ class PoseEstimator(ABC):
 
     def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view; its mask limits where is looked."""
-        known = Known(
+        known = SearchTargets(
             models={name: self.models[self._number(name)] for name in objects},
             surface_of=lambda name: self._surface(self._number(name)),
             refusal=self.refusal,
@@ -258,7 +258,7 @@ class PoseEstimator(ABC):
             self._surfaces[number] = prepare_surface(model, self.config.icp.surface_points)
         return self._surfaces[number]
 
-    def _copies_of(self, number: int) -> Copies:
+    def _copies_of(self, number: int) -> PoseAmbiguities:
         if number not in self._copies:
             up_to_symmetry = self.config.up_to_symmetry
             self._copies[number] = find_copies(self.models[number], up_to_symmetry=up_to_symmetry)

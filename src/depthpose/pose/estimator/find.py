@@ -45,7 +45,7 @@ EstimateMany = Callable[[Sequence[CloudInput]], list[PoseEstimate]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Known:
+class SearchTargets:
     """What is looked for.
 
     Attributes:
@@ -91,7 +91,7 @@ class _Answer:
         return (1 - risk) * self.share * float(self.explained.double().mean())
 
 
-def find_objects(view: ViewInput, known: Known) -> list[PoseEstimate]:
+def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
     Regions are tried for every object whose size they may have; so are pairs of them that may be
@@ -155,7 +155,9 @@ def _parts(clouds: Sequence[Tensor], largest_m: float) -> list[Tensor]:
     return [part for part in parts if len(part) >= _LEAST_POINTS]
 
 
-def _estimate_regions(clouds: Sequence[Tensor], scene: _Scene, known: Known) -> list[_Answer]:
+def _estimate_regions(
+    clouds: Sequence[Tensor], scene: _Scene, known: SearchTargets
+) -> list[_Answer]:
     """Estimate every object of its size from every cloud; give the best of each cloud."""
     view, inputs = scene.view, list[tuple[int, CloudInput]]()
     for k, cloud in enumerate(clouds):
@@ -217,7 +219,7 @@ def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEst
     return replace(estimate, certainty=certainty, alternatives=others), share
 
 
-def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: Known) -> _Answer:
+def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: SearchTargets) -> _Answer:
     """Choose among objects that answered for one cloud; the others lower its certainty."""
     shares = share_out([estimate.signals for estimate in some], known.refusal.candidate_slopes)
     estimate, share = _given_others(some, shares)
@@ -250,7 +252,7 @@ def explained_mask(view: ViewInput, pose: Rigid, model: ObjectModel) -> Bool[Ten
     return explained
 
 
-def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
+def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) -> bool:
     """Whether the camera saw enough of the surface, not through it, and no plane before it."""
     pose, signals = estimate.camera_from_model, estimate.signals
     assert pose is not None
@@ -270,7 +272,7 @@ def _is_possible(scene: _Scene, estimate: PoseEstimate, known: Known) -> bool:
     return float(is_sunk[is_read].double().mean()) <= _SUNK
 
 
-def _without_overlap(answers: Sequence[_Answer], known: Known) -> list[_Answer]:
+def _without_overlap(answers: Sequence[_Answer], known: SearchTargets) -> list[_Answer]:
     """Keep answers from the best down that explain points which none before does."""
     kept: list[_Answer] = []
     for answer in sorted(answers, key=lambda a: -a.worth):

@@ -4,7 +4,7 @@ import torch
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, VotingConfig
-from depthpose.pose.estimator.alternatives import Copies, evidence_of, find_candidates
+from depthpose.pose.estimator.alternatives import PoseAmbiguities, evidence_of, find_candidates
 from depthpose.pose.estimator.answer import (
     Clock,
     Found,
@@ -31,7 +31,7 @@ def pose_from_directions(
     voted: Voted,
     model: ObjectModel,
     surface: Surface,
-    copies: Copies,
+    copies: PoseAmbiguities,
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> PoseEstimate:
@@ -109,7 +109,7 @@ def _fits(
 def _refine(
     voted: Voted,
     fits: PoseFit,
-    known: tuple[ObjectModel, Surface, Copies],
+    known: tuple[ObjectModel, Surface, PoseAmbiguities],
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> Found:

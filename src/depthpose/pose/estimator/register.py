@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, Unit
-from depthpose.pose.estimator.alternatives import Copies, find_candidates
+from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_candidates
 from depthpose.pose.estimator.answer import (
     Clock,
     answer_of,
@@ -160,7 +160,7 @@ class Registration(PoseEstimator):
 def pose_from_proposals(
     cloud: Prepared,
     proposals: Rigid,
-    known: tuple[ObjectModel, Surface, Copies],
+    known: tuple[ObjectModel, Surface, PoseAmbiguities],
     refusal: RefusalConfig,
     config: EstimateConfig,
 ) -> PoseEstimate:

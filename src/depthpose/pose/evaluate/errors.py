@@ -42,7 +42,7 @@ _MARGIN_PX = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ruler:
+class ErrorContext:
     """What the errors of an object depend on; computed once.
 
     Attributes:
@@ -64,9 +64,9 @@ class Ruler:
 
 def make_ruler(
     model: ObjectModel, diameter_m: float, *, is_adds: bool, vsd_delta_m: float | None
-) -> Ruler:
+) -> ErrorContext:
     """Prepare the errors of an object."""
-    return Ruler(
+    return ErrorContext(
         model=model,
         diameter_m=diameter_m,
         symmetries=symmetry_transforms(model.symmetries),
@@ -93,14 +93,14 @@ class Metric:
         has_median: whether rows of objects hold the median of the answers, as ``NAME_median``.
     """
 
-    measure: Callable[[Rigid, Instance, Ruler], Errors | Tensor | float]
+    measure: Callable[[Rigid, Instance, ErrorContext], Errors | Tensor | float]
     missing: tuple[float, ...] = (math.inf,)
-    is_wanted: Callable[[Ruler], bool] = lambda _: True
+    is_wanted: Callable[[ErrorContext], bool] = lambda _: True
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
     has_median: bool = False
 
 
-def measure(estimated: Rigid | None, instance: Instance, ruler: Ruler) -> dict[str, Errors]:
+def measure(estimated: Rigid | None, instance: Instance, ruler: ErrorContext) -> dict[str, Errors]:
     """Measure one estimate by every metric of ``METRICS`` that is wanted.
 
     Args:
@@ -118,34 +118,34 @@ def measure(estimated: Rigid | None, instance: Instance, ruler: Ruler) -> dict[s
     return found
 
 
-def _add(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+def _add(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
     """ADD, or ADD-S where that decides a success [m]."""
     error_m = adds_m if ruler.is_adds else add_m
     return error_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
 
 
-def _adds(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+def _adds(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
     return adds_m(estimated, instance.camera_from_model, ruler.model.vertices_m)
 
 
-def _mssd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+def _mssd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
     true = instance.camera_from_model
     return mssd_m(estimated, true, ruler.model.vertices_m, ruler.symmetries)
 
 
-def _mspd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+def _mspd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
     """MSPD, scaled to an image 640 wide [px]."""
     true, points_m = instance.camera_from_model, ruler.model.vertices_m
     scale = BOP_WIDTH_PX / image_size(instance.depth)[0]
     return scale * mspd_px(estimated, true, points_m, ruler.symmetries, instance.K)
 
 
-def _rotation(estimated: Rigid, instance: Instance, ruler: Ruler) -> float:
+def _rotation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
     copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
     return math.degrees(float(rotation_error_rad(estimated, copy)))
 
 
-def _translation(estimated: Rigid, instance: Instance, ruler: Ruler) -> Tensor:
+def _translation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
     copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
     return translation_error_m(estimated, copy)
 
@@ -165,7 +165,7 @@ def nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> Rigid:
     return Rigid(copies.R[nearest], copies.t_m[nearest])
 
 
-def _vsd(estimated: Rigid, instance: Instance, ruler: Ruler) -> Float[Tensor, "10"]:
+def _vsd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Float[Tensor, "10"]:
     assert ruler.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)

@@ -7,7 +7,7 @@ from pathlib import Path
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance
-from depthpose.pose.evaluate.errors import Ruler, make_ruler, match, measure
+from depthpose.pose.evaluate.errors import ErrorContext, make_ruler, match, measure
 from depthpose.pose.evaluate.rows import Conditions, InstanceRow, ObjectRow, Origin, RiskRow
 from depthpose.pose.evaluate.summary import (
     diameter_of,
@@ -99,7 +99,7 @@ def evaluate(
     )
 
 
-def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
+def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, ErrorContext]:
     return {
         number: make_ruler(
             model,
@@ -112,7 +112,7 @@ def _rulers(dataset: BopDataset, config: EvaluationConfig) -> dict[int, Ruler]:
 
 
 def _instance_row(
-    instance: Instance, estimate: PoseEstimate | None, ruler: Ruler, stages: list[str]
+    instance: Instance, estimate: PoseEstimate | None, ruler: ErrorContext, stages: list[str]
 ) -> InstanceRow:
     pose = None if estimate is None else estimate.camera_from_model
     errors = measure(pose, instance, ruler)
@@ -141,7 +141,7 @@ def _stages_of(predictions: Sequence[Prediction]) -> list[str]:
 
 
 def _sum_up(
-    dataset: BopDataset, rows: list[InstanceRow], rulers: dict[int, Ruler]
+    dataset: BopDataset, rows: list[InstanceRow], rulers: dict[int, ErrorContext]
 ) -> list[ObjectRow]:
     summed: list[ObjectRow] = []
     numbers = [instance.object_id for instance in dataset.instances]

@@ -36,7 +36,7 @@ class ResUNetConfig:
     """A bias for each inner convolution, as folding batch norm leaves one."""
 
     first_kernel: int = 7
-    """Size of the first convolution's kernel, in voxels: 3, 5 or 7."""
+    """Size of the first convolution's kernel, in voxels: 1, 3, 5 or 7."""
 
     encoder: Widths = (32, 64, 128, 256)
     """Channels of the levels going down, finest first."""

@@ -22,7 +22,7 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import find_shard
+from depthpose.core.run import find_rank
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.datasets import open_bop
@@ -190,7 +190,7 @@ def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     task = DepthImageTask(network, models, config)
     seconds = run.train(task, crops, config.loop)
     path = run.folder / "depth-image.safetensors"
-    if find_shard().rank:
+    if find_rank().rank:
         return path
     weights = packed(network, models, config)
     write_pose_weights(path, weights, with_half=config.with_half)

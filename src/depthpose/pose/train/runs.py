@@ -11,7 +11,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import Run, write_card
-from depthpose.core.run import find_shard
+from depthpose.core.run import find_rank
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
 from depthpose.pose.sparse import Voxels
@@ -121,7 +121,7 @@ def _leave(
     seconds: float,
 ) -> Path:
     """Calibrate the refusal, write the weights, measure the file, and write its card."""
-    if find_shard().rank:
+    if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     weights = _as_written(packed(network, models, config), with_half=config.with_half)
     weights = calibrated(weights, config.objects, config.calibration)

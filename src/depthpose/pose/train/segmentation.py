@@ -8,7 +8,7 @@ from torch import nn
 
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
 from depthpose.core.loop import Run, Update, ValidationResult, held_out_text, make_adam, write_card
-from depthpose.core.run import find_shard
+from depthpose.core.run import find_rank
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.resnet import KIND, normalise_colors, read_encoder_state
 from depthpose.pose.segmentation import (
@@ -88,7 +88,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     samples = TrainingImages(images, config.augment, config.network, config.loop.seed)
     seconds = run.train(task, samples, config.loop)
     path = run.folder / "segmentation.safetensors"
-    if find_shard().rank:
+    if find_rank().rank:
         return path
     licence = "not stated; that of the training data binds"
     facts = {"trained_on": Path(config.images.folder).name, "licence": licence}

@@ -36,7 +36,7 @@ _locks: dict[Path, int] = {}
 """Records of the folders that this process writes to, locked, and their descriptors."""
 
 
-def hold(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
+def lock_folder(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
     """Lock a folder against other commands until :func:`release_folders`, or the process ends.
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.

@@ -13,7 +13,7 @@ import pytest
 from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
-from depthpose.core.hold import hold, release_folders, write_once
+from depthpose.core.lock import lock_folder, release_folders, write_once
 from depthpose.core.loop import LoopConfig, train
 from depthpose.core.run import RECORD, claim_folder
 
@@ -45,7 +45,7 @@ def holder(folder: Path, seconds: int, **environment: str) -> Iterator["subproce
 def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
     refused = pytest.raises(InputError, match="another command is writing there")
     with holder(tmp_path, 600), refused:
-        hold(tmp_path / RECORD, is_shared=False, patience_s=0.3)
+        lock_folder(tmp_path / RECORD, is_shared=False, patience_s=0.3)
     claim_folder(tmp_path, {"a": 1})
     release_folders()
 
@@ -53,7 +53,7 @@ def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> 
 def test_a_second_command_waits_for_one_that_ends(tmp_path: Path) -> None:
     with holder(tmp_path, 1) as process:
         began = time.monotonic()
-        hold(tmp_path / RECORD, is_shared=False, patience_s=60.0)
+        lock_folder(tmp_path / RECORD, is_shared=False, patience_s=60.0)
         assert process.wait() == 0
         assert time.monotonic() - began < 60
 
@@ -67,7 +67,7 @@ def test_processes_of_one_launch_share_a_folder(
         claim_folder(tmp_path, {"a": 1})
         release_folders()
         with pytest.raises(InputError, match="another command is writing there"):
-            hold(tmp_path / RECORD, is_shared=False, patience_s=0.2)
+            lock_folder(tmp_path / RECORD, is_shared=False, patience_s=0.2)
 
 
 def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
@@ -102,9 +102,9 @@ def test_a_record_that_cannot_be_opened_is_refused(
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     (tmp_path / RECORD).write_text("{}")
-    monkeypatch.setattr("depthpose.core.hold.os.open", refuse)
+    monkeypatch.setattr("depthpose.core.lock.os.open", refuse)
     with pytest.raises(InputError, match="cannot be written: Read-only file system"):
-        hold(tmp_path / RECORD, is_shared=False)
+        lock_folder(tmp_path / RECORD, is_shared=False)
 
 
 def test_half_files_go_when_the_folder_is_ours_alone(tmp_path: Path) -> None:
