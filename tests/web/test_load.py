@@ -57,7 +57,7 @@ class Served:
 
     process: "subprocess.Popen[str]"
     port: int
-    lock_folder: Path
+    hold: Path
     """While this file exists, no computation ends."""
 
     @property
@@ -97,12 +97,12 @@ def serve(tmp_path: Path) -> Iterator[Callable[[float], Served]]:
     started: list[subprocess.Popen[str]] = []
 
     def start(seconds: float) -> Served:
-        lock_folder = tmp_path / "hold"
-        words = [sys.executable, "-c", SERVER, str(seconds), str(lock_folder)]
+        hold = tmp_path / "hold"
+        words = [sys.executable, "-c", SERVER, str(seconds), str(hold)]
         own = {**os.environ, "TMPDIR": str(tmp_path)}
         started.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=own))
         assert started[-1].stdout is not None
-        return Served(started[-1], int(started[-1].stdout.readline()), lock_folder)
+        return Served(started[-1], int(started[-1].stdout.readline()), hold)
 
     yield start
     for process in started:
@@ -175,14 +175,14 @@ def test_slow_uploads_block_nobody_and_are_ended(
 
 def test_the_place_in_the_queue_is_true(serve: Callable[[float], Served], samples: Path) -> None:
     served = serve(1.0)
-    served.lock_folder.touch()
+    served.hold.touch()
     with ThreadPoolExecutor(5) as pool:
         waiting = []
         for k in range(5):
             waiting.append(pool.submit(ask, served, samples, f"t{k}"))
             served.await_place(f"t{k}", k)
         assert ask(served, samples).status_code == 503
-        served.lock_folder.unlink()
+        served.hold.unlink()
         seen: list[int] = []
         while (place := served.before("t4")) is not None:
             seen.append(place)
@@ -197,7 +197,7 @@ def test_nothing_is_computed_for_who_has_gone(
     serve: Callable[[float], Served], samples: Path
 ) -> None:
     served = serve(0.0)
-    served.lock_folder.touch()
+    served.hold.touch()
     with ThreadPoolExecutor(4) as pool:
         first = pool.submit(ask, served, samples, "first")
         served.await_place("first", 0)
@@ -207,7 +207,7 @@ def test_nothing_is_computed_for_who_has_gone(
             served.await_place(f"gone{k}", k + 1)
         for one in gone:
             assert isinstance(one.exception(), httpx2.TimeoutException)
-        served.lock_folder.unlink()
+        served.hold.unlink()
         assert first.result().status_code == 200
         assert ask(served, samples).status_code == 200
     assert served.stop() == (1, 2)
