@@ -113,7 +113,9 @@ def depth_training(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
     config = read_config(CONFIGS / f"depth/{name}.yaml", kind)
     monkeypatch.setattr(depth_runs, "TrainingPairs", _NamedPairs)
     run = Run(folder=folder)
-    task, pairs, config, _ = begun(monkeypatch, depth_runs, "_run_stage", lambda: run_stage(config, run))
+    task, pairs, config, _ = begun(
+        monkeypatch, depth_runs, "_run_stage", lambda: run_stage(config, run)
+    )
     return Training(task, pairs, config)
 
 

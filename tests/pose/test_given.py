@@ -55,7 +55,9 @@ def test_a_unit_says_what_whole_numbers_and_floats_are() -> None:
 
 def test_two_units_that_disagree_are_refused() -> None:
     tum = Camera(width=64, height=48, K=K, depth_unit_m=0.0002)
-    with pytest.raises(InputError, match=r"unit mm is 0\.001 m, but its camera says .* 0\.0002; omit"):
+    with pytest.raises(
+        InputError, match=r"unit mm is 0\.001 m, but its camera says .* 0\.0002; omit"
+    ):
         view_input(whole(0.0002), MASK, tum, "part", "view", "mm")
     with pytest.raises(InputError, match=r"nothing says of what; .* 0\.0002 of TUM RGB-D, .* mm"):
         view_input(whole(0.001), MASK, K, "part", "view")
