@@ -56,7 +56,7 @@ class BeginningOptions:
     generator: str | None = None
     """finetune: weights of the generator to begin with."""
     matcher: str | None = None
-    """finetune: for the synthesised view: weights with a matcher, by name or file, which are not
+    """finetune: weights whose matcher matches the synthesised view, by name or file; they are not
     changed."""
     start: str | None = None
     """view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default."""
