@@ -1,4 +1,4 @@
-"""Time of ``--help`` of each command, of an empty Python and of ``import torch``.
+"""Time of ``--help`` of each command, of an empty Python, of ``import torch`` and of ours.
 
 python bench/startup.py
 """
@@ -25,6 +25,7 @@ def main() -> None:
     rows: dict[str, tuple[str, ...]] = {
         "python -c pass": ("-c", "pass"),
         "python -c 'import torch'": ("-c", "import torch"),
+        "python -c 'import depthpose'": ("-c", "import depthpose"),
     }
     for name in ("", *COMMANDS):
         rows[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
