@@ -85,7 +85,7 @@ def _predict_on_ray(
             f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
             "file of both by 'depthpose weights pack G --matcher S --out W'"
         )
-    recipe = engine.NetSpec(
+    spec = engine.NetSpec(
         weights=Weights.read(networks.weights),
         config=config,
         with_right=False,
@@ -93,7 +93,7 @@ def _predict_on_ray(
         with_unlike=networks.with_unlike,
         answer=networks.answer,
     )
-    return engine.predict(images, lens, recipe, output, out, on)
+    return engine.predict(images, lens, spec, output, out, on)
 
 
 def match(
@@ -164,7 +164,7 @@ def _match_on_ray(
 ) -> int:
     from depthpose.cli.depth import engine as engine_depth
 
-    recipe = engine_depth.NetSpec(
+    spec = engine_depth.NetSpec(
         weights=None if weights is None else Weights.read(weights),
         config=config,
         with_right=True,
@@ -172,7 +172,7 @@ def _match_on_ray(
     )
     words = [left] if right is None else [left, right]
     return engine_depth.match(
-        words, camera, recipe, out, on, with_cloud=pairs.cloud, with_check=pairs.check
+        words, camera, spec, out, on, with_cloud=pairs.cloud, with_check=pairs.check
     )
 
 

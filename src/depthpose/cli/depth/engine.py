@@ -83,7 +83,7 @@ class NetSpec:
 class PredictWork:
     """Single images to the files of their depth."""
 
-    recipe: NetSpec
+    spec: NetSpec
     lens: Lens
     look: PredictOutput
     files: Files = IMAGES
@@ -96,7 +96,7 @@ class PredictWork:
 
     def start(self) -> Function:
         """Build the networks."""
-        net = self.recipe.build().net
+        net = self.spec.build().net
         assert isinstance(net, FakestereoNet)
         return partial(_predict, net, self.lens, self.look)
 
@@ -105,7 +105,7 @@ class PredictWork:
 class MatchWork:
     """Stereo pairs to the files of their depth."""
 
-    recipe: NetSpec
+    spec: NetSpec
     rig: StereoRig
     with_cloud: bool
     files: Files = PAIRS
@@ -114,13 +114,13 @@ class MatchWork:
 
     def start(self) -> Function:
         """Build the matcher."""
-        return partial(_match, self.recipe.build(), self.rig, self.with_cloud)
+        return partial(_match, self.spec.build(), self.rig, self.with_cloud)
 
 
 def predict(
     words: Sequence[str],
     given: tuple[Path | None, float | None],
-    recipe: NetSpec,
+    spec: NetSpec,
     look: PredictOutput,
     out: str,
     options: EngineOptions,
@@ -133,16 +133,16 @@ def predict(
     with inputs.first() as (image,):
         lens = read_lens(*given, image)
     settings = {
-        **recipe.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
+        **spec.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
     }  # fmt: skip
-    work = PredictWork(recipe=recipe, lens=lens, look=look)
+    work = PredictWork(spec=spec, lens=lens, look=look)
     return say(run(work, inputs, out, settings, options), out, "depth maps")
 
 
 def match(
     words: Sequence[str],
     camera: Path,
-    recipe: NetSpec,
+    spec: NetSpec,
     out: str,
     options: EngineOptions,
     *,
@@ -156,8 +156,8 @@ def match(
         if with_check:
             refuse_unrectified_pair(_read_pair("the first pair", left, right, rig))
     facts = {"K": rig.K.tolist(), "baseline_m": rig.baseline_m}
-    work = MatchWork(recipe=recipe, rig=rig, with_cloud=with_cloud)
-    settings = {**recipe.settings(), "camera": facts}
+    work = MatchWork(spec=spec, rig=rig, with_cloud=with_cloud)
+    settings = {**spec.settings(), "camera": facts}
     return say(run(work, inputs, out, settings, options), out, "pairs")
 
 

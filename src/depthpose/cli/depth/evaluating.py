@@ -64,15 +64,15 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
         for i, frame in frames
         if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
     ]
-    shard = find_rank()
-    mine = [usable[k] for k in shard.share(len(usable))]
+    process = find_rank()
+    mine = [usable[k] for k in process.share(len(usable))]
     names = [dataset.frames[i].name for i in mine]
     readers = [partial(_read, dataset, i, method.with_right) for i in mine]
     home = folder / method.name
     written = predict(method.net, readers, names, home, method.settings)
     for _ in tqdm(written, method.name, total=len(names), disable=None, unit=" frames"):
         pass
-    if shard.rank == 0:
+    if process.rank == 0:
         wait_for([dataset.frames[i].name for i in usable], partial(is_finished, home))
     return home
 

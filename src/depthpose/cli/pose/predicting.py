@@ -86,19 +86,19 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     Returns:
         All predictions in the order of the jobs; None in a process that is not the first.
     """
-    shard = find_rank()
-    home = out if shard.world == 1 else out / f"part-{shard.rank}"
+    process = find_rank()
+    home = out if process.world == 1 else out / f"part-{process.rank}"
     done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
-    left = [jobs[k] for k in shard.share(len(jobs)) if jobs[k].name not in done]
+    left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
-        with open_viewer(None if shard.rank else view) as viewer:
+        with open_viewer(None if process.rank else view) as viewer:
             shown = method if viewer is None else _watched(method, viewer)
             names = predict(_safely(shown), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
-    if shard.rank:
+    if process.rank:
         return None
-    return _gather(jobs, out, shard)
+    return _gather(jobs, out, process)
 
 
 def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
@@ -204,8 +204,8 @@ def _known(out: Path) -> dict[str, Prediction]:
     return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 
 
-def _gather(jobs: list[Job[Any]], out: Path, shard: ProcessRank) -> list[Prediction]:
-    if shard.world > 1:
+def _gather(jobs: list[Job[Any]], out: Path, process: ProcessRank) -> list[Prediction]:
+    if process.world > 1:
         seen: dict[str, Any] = {"at": -10.0, "names": set()}
 
         def is_there(name: str) -> bool:

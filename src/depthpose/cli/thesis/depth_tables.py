@@ -96,28 +96,28 @@ def own_methods(
     return chosen
 
 
-def reproduce_table(order: TableSpec, methods: Sequence[tuple[str, Method]], out: Path) -> int:
+def reproduce_table(spec: TableSpec, methods: Sequence[tuple[str, Method]], out: Path) -> int:
     """Predict what is missing, measure, join with the published rows, and write everything."""
-    claim_folder(out, _settings(order, [method for _, method in methods]), _RESULTS)
-    rule = find_protocol(order.protocol)
+    claim_folder(out, _settings(spec, [method for _, method in methods]), _RESULTS)
+    rule = find_protocol(spec.protocol)
     home = out / "predictions"
-    folders = [evaluating.predict_all(order.dataset, m, rule, home) for _, m in methods]
+    folders = [evaluating.predict_all(spec.dataset, m, rule, home) for _, m in methods]
     if find_rank().rank > 0:
         return 0
-    measured = evaluating.measure_all(order.dataset, folders, order.protocol, order.caps_m)
-    of_each = len(order.caps_m)
+    measured = evaluating.measure_all(spec.dataset, folders, spec.protocol, spec.caps_m)
+    of_each = len(spec.caps_m)
     owns = [own for own, _ in methods for _ in range(of_each)]
-    joined = join_published(order.table, list(zip(owns, measured.rows, strict=True)))
+    joined = join_published(spec.table, list(zip(owns, measured.rows, strict=True)))
     rows = evaluating.columns(joined)
     write_table(out, rows)
     evaluating.write_details(measured, out)
     sections = [
-        Section(title="Published rows, ours, and difference", text=_say_how(order), rows=rows),
-        *_picture_sections(order, [method for _, method in methods], out),
+        Section(title="Published rows, ours, and difference", text=_say_how(spec), rows=rows),
+        *_picture_sections(spec, [method for _, method in methods], out),
         *evaluating.detail_sections(measured),
         Section(title="Settings", rows=_setting_rows([method for _, method in methods])),
     ]
-    title = f"{order.table.title}, on {order.dataset.name}"
+    title = f"{spec.table.title}, on {spec.dataset.name}"
     write_markdown(out / "report.md", title, sections, environment())
     write_page(out / "report.html", title, sections, environment())
     print(markdown_table(rows))
@@ -194,16 +194,16 @@ def _draw_column(number: str, dataset: Dataset, index: int, method: Method) -> l
     return draw_figure_2_1(pair, lidar_m, estimate, method.net.estimate_pair(pair))
 
 
-def _picture_sections(order: TableSpec, methods: Sequence[Method], out: Path) -> list[Section]:
+def _picture_sections(spec: TableSpec, methods: Sequence[Method], out: Path) -> list[Section]:
     """Draw some frames of each method, from the files that were measured."""
-    if order.pictures < 1:
+    if spec.pictures < 1:
         return []
     sections: list[Section] = []
     for method in methods:
         folder = out / "predictions" / method.name
-        frames = [f for f in order.dataset.frames if has_prediction(folder, f.name)]
-        shown = replace(order.dataset, frames=frames)
-        for place, index in enumerate(choose_frames(shown, (), order.pictures)):
+        frames = [f for f in spec.dataset.frames if has_prediction(folder, f.name)]
+        shown = replace(spec.dataset, frames=frames)
+        for place, index in enumerate(choose_frames(shown, (), spec.pictures)):
             pair, lidar_m = shown.read_input(index), _lidar(shown, index)
             estimate = read_estimate(folder, pair.name, pair.camera)
             figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
@@ -237,14 +237,14 @@ def _lidar(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | None:
     return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
 
 
-def _settings(order: TableSpec, methods: Sequence[Method]) -> dict[str, Any]:
+def _settings(spec: TableSpec, methods: Sequence[Method]) -> dict[str, Any]:
     """What decides the results; the files of a run of other settings are not touched."""
     return {
-        "table": order.table.number,
-        "dataset": order.dataset.name,
-        "frames": len(order.dataset),
-        "protocol": order.protocol,
-        "caps_m": list(order.caps_m),
+        "table": spec.table.number,
+        "dataset": spec.dataset.name,
+        "frames": len(spec.dataset),
+        "protocol": spec.protocol,
+        "caps_m": list(spec.caps_m),
         "methods": {method.name: method.settings for method in methods},
     }
 
@@ -257,8 +257,8 @@ def _setting_rows(methods: Sequence[Method]) -> list[dict[str, Any]]:
     ]
 
 
-def _say_how(order: TableSpec) -> str:
-    how = evaluating.describe_protocol(order.protocol)
+def _say_how(spec: TableSpec) -> str:
+    how = evaluating.describe_protocol(spec.protocol)
     return (
         f"Ours: {how} The printed rows are of the 697 frames of eigen-test. Difference: ours minus "
         "the thesis's own row. A row of another protocol, or of other frames (see the columns), "

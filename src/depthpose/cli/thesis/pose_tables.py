@@ -45,7 +45,7 @@ class TableSpec:
     pictures: int
 
 
-def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> TableSpec:
+def make_spec(number: str, data: PoseDataOptions, how: PoseTableOptions) -> TableSpec:
     """Open the one data set that was named.
 
     Raises:
@@ -58,32 +58,32 @@ def make_order(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Tab
 
 
 def reproduce_by_object(
-    order: TableSpec,
+    spec: TableSpec,
     weights: Sequence[str],
     how: PoseTableOptions,
     out: Path,
     csv: Sequence[Path] = (),
 ) -> int:
     """Predict what is missing, measure, join with the published rows, and write everything."""
-    dataset = order.dataset
+    dataset = spec.dataset
     methods = pose_methods.pose_methods(weights, how.estimate, tuple(dataset.objects.values()))
-    claim_folder(out, _settings(order, methods, how), _RESULTS)
+    claim_folder(out, _settings(spec, methods, how), _RESULTS)
     shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
     numbers = {model.name: number for number, model in dataset.objects.items()}
-    joined = join_by_object(measured.rows, numbers, with_published=order.number == "3.2")
+    joined = join_by_object(measured.rows, numbers, with_published=spec.number == "3.2")
     rows, every = [row.columns() for row in joined], pose_evaluating.table_of(measured.rows)
     write_table(out, rows)
     write_table(out, every, name="all")
     pose_evaluating.write_details(measured, out)
     sections = [
-        Section(title="Percent by object", text=_say_how(order), rows=rows),
+        Section(title="Percent by object", text=_say_how(spec), rows=rows),
         Section(title="All numbers", text=pose_evaluating.HOW, rows=every),
-        *picture_sections(dataset, folders, order.pictures, out),
+        *picture_sections(dataset, folders, spec.pictures, out),
         *pose_evaluating.detail_sections(measured),
     ]
-    return _write(f"{TITLES[order.number]}, on {dataset.folder.resolve().name}", sections, out)
+    return _write(f"{TITLES[spec.number]}, on {dataset.folder.resolve().name}", sections, out)
 
 
 def reproduce_voting(
@@ -120,24 +120,24 @@ def _write(title: str, sections: Sequence[Section], out: Path) -> int:
 
 
 def _settings(
-    order: TableSpec, methods: Sequence[pose_methods.PoseMethod], how: PoseTableOptions
+    spec: TableSpec, methods: Sequence[pose_methods.PoseMethod], how: PoseTableOptions
 ) -> dict[str, Any]:
     """What decides the results; the files of a run of other settings are not touched."""
     return {
-        "table": order.number,
-        "frames_sha256": frames_hash(order.dataset.instances),
+        "table": spec.number,
+        "frames_sha256": frames_hash(spec.dataset.instances),
         "diameters": how.diameters,
         "methods": {method.name: dict(method.settings) for method in methods},
     }
 
 
-def _say_how(order: TableSpec) -> str:
+def _say_how(spec: TableSpec) -> str:
     ours = (
         "Percent of instances whose ADD (ADD-S where there is a star, or a declared symmetry) is "
         "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "
         "columns for masks, diameters and the list of frames."
     )
-    if order.number == "3.1":
+    if spec.number == "3.1":
         return f"{ours} Differences: the first weights less each of the others."
     return (
         f"{ours} Published rows: as printed, of the 13 objects; those with RGB see what ours does "

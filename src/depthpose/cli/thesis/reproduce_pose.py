@@ -26,13 +26,13 @@ def table_3_1(
             (an extra), which needs no weights.
         out: folder to write to.
     """
-    from depthpose.cli.thesis.pose_tables import make_order, reproduce_by_object
+    from depthpose.cli.thesis.pose_tables import make_spec, reproduce_by_object
 
     if len(weights) < 2:
         raise InputError(
             "table 3.1 compares the method with its baselines: give two weights or more"
         )
-    return reproduce_by_object(make_order("3.1", data, estimates), weights, estimates, out)
+    return reproduce_by_object(make_spec("3.1", data, estimates), weights, estimates, out)
 
 
 def table_3_2(
@@ -54,11 +54,11 @@ def table_3_2(
         weights: files or names.
         csv: BOP results of any method, each a row of ours.
     """
-    from depthpose.cli.thesis.pose_tables import make_order, reproduce_by_object
+    from depthpose.cli.thesis.pose_tables import make_spec, reproduce_by_object
 
     if not weights and not csv:
         raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
-    return reproduce_by_object(make_order("3.2", data, estimates), weights, estimates, out, csv)
+    return reproduce_by_object(make_spec("3.2", data, estimates), weights, estimates, out, csv)
 
 
 def table_3_3(

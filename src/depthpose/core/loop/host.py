@@ -116,13 +116,13 @@ _SECOND = (
 @contextmanager
 def graceful_stop() -> Iterator[StopRequest]:
     """Let SIGTERM and Ctrl-C end the training after the step, with its state saved."""
-    wish = StopRequest()
+    request = StopRequest()
     try:
-        before = {s: signal.signal(s, wish.remember) for s in (signal.SIGTERM, signal.SIGINT)}
+        before = {s: signal.signal(s, request.remember) for s in (signal.SIGTERM, signal.SIGINT)}
     except ValueError:  # not the main thread: whoever runs us handles signals
         before = {}
     try:
-        yield wish
+        yield request
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

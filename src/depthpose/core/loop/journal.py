@@ -75,13 +75,13 @@ class Journal:
             for name, value in numbers.items():
                 self._board.add_scalar(name, value, step)
 
-    def show(self, step: int, evidence: ValidationResult) -> None:
+    def show(self, step: int, result: ValidationResult) -> None:
         """Write what validation found."""
         if not self._is_writer:
             return
-        if evidence.numbers:
-            self.log(step, evidence.numbers)
-        for name, picture in evidence.pictures.items():
+        if result.numbers:
+            self.log(step, result.numbers)
+        for name, picture in result.pictures.items():
             write_image(self.folder / _PICTURES / f"{step:07d}_{name}.png", picture)
             with refused_write(self.folder):
                 self._board.add_image(name, picture, step)

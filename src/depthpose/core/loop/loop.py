@@ -91,8 +91,8 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
         raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
     run.steps = run.step if finish else run.steps
     try:
-        with graceful_stop() as wish:
-            run.walk(on_step, wish)
+        with graceful_stop() as request:
+            run.take_steps(on_step, request)
     finally:
         release_folders()
     return run.seconds
@@ -136,15 +136,15 @@ class _Run:
         """What it took until now, with the runs before this one."""
         return time.monotonic() - self._began
 
-    def walk(self, on_step: Callable[[Progress], None] | None, wish: StopRequest) -> None:
+    def take_steps(self, on_step: Callable[[Progress], None] | None, request: StopRequest) -> None:
         """Take the remaining steps; if asked to finish, the current step is the last."""
         batches = self._batches()
         while self.step < self.steps:
             micro_batches = [next(batches) for _ in range(self.config.accumulate)]
             self._take_step(micro_batches)
             self.step += 1
-            stop = self._any_process(wish.to_stop())
-            if stop and self._any_process(wish.to_finish()):
+            stop = self._any_process(request.to_stop())
+            if stop and self._any_process(request.to_finish()):
                 self.steps = self.step
             numbers = self._log()
             if self._is_due(self.config.validate_every_steps):
@@ -180,30 +180,30 @@ class _Run:
     def _take_step(self, micro_batches: list[Any]) -> None:
         """Run the first update of all micro-batches, then the second, and so on."""
         iterators = [iter(self.task.step(batch)) for batch in micro_batches]
-        turn_number = 0
+        number = 0
         while True:
-            turns = list(self._backward_all(iterators, turn_number))
-            if not turns:
+            updates = list(self._backward_all(iterators, number))
+            if not updates:
                 break
-            self._move(turns[0])
-            turn_number += 1
+            self._move(updates[0])
+            number += 1
         if self.config.ema_decay is not None:
             self._update_average(self.config.ema_decay)
 
     def _backward_all(self, iterators: list[Iterator[Update]], number: int) -> Iterator[str]:
-        for place, walk in enumerate(iterators):
+        for place, iterator in enumerate(iterators):
             # Dropout follows the micro-batch, not the process that happens to hold it.
             micro = place * self.world + self.accelerator.process_index
             torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
             with self.arithmetic.autocast():
-                turn = next(walk, None)
-            if turn is None:
+                update = next(iterator, None)
+            if update is None:
                 continue
-            self._refuse_bad_loss(turn.optimizer, float(turn.loss.detach()))
-            parameters = _parameters(self.optimizers[turn.optimizer])
-            self.scaler.scale(turn.loss / len(iterators)).backward(inputs=parameters)
-            self._remember({"loss": turn.loss.detach(), **turn.facts}, turn.optimizer)
-            yield turn.optimizer
+            self._refuse_bad_loss(update.optimizer, float(update.loss.detach()))
+            parameters = _parameters(self.optimizers[update.optimizer])
+            self.scaler.scale(update.loss / len(iterators)).backward(inputs=parameters)
+            self._remember({"loss": update.loss.detach(), **update.facts}, update.optimizer)
+            yield update.optimizer
 
     def _move(self, name: str) -> None:
         """Average the gradients over processes and step the optimiser."""

@@ -47,9 +47,9 @@ class Task(Protocol):
         ...
 
     def step(self, batch: Any) -> Iterator[Update]:  # noqa: ANN401 - the task's own batch
-        """Yield one turn after the other; each optimiser steps before the next turn is computed.
+        """Yield one update after the other; each optimiser steps before the next is computed.
 
-        An adversarial task yields the discriminator's turn, then the generator's, whose loss then
+        An adversarial task yields the discriminator's update, then the generator's, whose loss then
         uses the updated discriminator.
         """
         ...

@@ -136,11 +136,11 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     path = run.folder / "matcher.safetensors"
     if find_rank().rank:
         return path
-    guard = AdaptationCheck(
+    check = AdaptationCheck(
         kept, config.streets, MatcherConfig(device=str(next(matcher.parameters()).device))
     )
     before = read_matcher(find_weights(config.start))
-    found = [guard.measure(network) for network in (before, matcher.eval())]
+    found = [check.measure(network) for network in (before, matcher.eval())]
     write_json(run.folder / "adapt.json", [asdict(metrics) for metrics in found])
     refuse_worse(*found)
     write_depth_weights(path, matcher=matcher, facts=facts)

@@ -155,9 +155,9 @@ class SelectTask:
             return ValidationResult()
         self.generator.eval()
         device = next(self.generator.parameters()).device
-        evidence = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
+        result = held_out_depth(SelectionSynthesiser(self.generator, device), self.held_out)
         self._train()
-        return evidence
+        return result
 
 
 def held_out_depth(synthesiser: SelectionSynthesiser, held_out: TrainingPairs) -> ValidationResult:

@@ -58,7 +58,7 @@ class StereoTask:
             self._fixed.keep_statistics()
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """One turn: match and compare."""
+        """One update: match and compare."""
         heads = self.matcher(normalise(batch.left), normalise(batch.right))
         reach = self.matcher.config.max_disparity_px
         heads = tuple(head.float() for head in heads)
@@ -70,12 +70,12 @@ class StereoTask:
         if self.held_out is None:
             return ValidationResult()
         self.matcher.eval()
-        evidence = held_out_evidence(self.matcher, self.held_out)
+        result = validate_pairs(self.matcher, self.held_out)
         self._train()
-        return evidence
+        return result
 
 
-def held_out_evidence(
+def validate_pairs(
     matcher: StereoNetwork,
     held_out: TrainingPairs,
     draw: Callable[[Tensor], Tensor] | None = None,
@@ -125,7 +125,7 @@ def mean_error_px(
 
 
 class ViewTask:
-    """cGAN + lambda L1 (eq. 2.3): the discriminator's turn, then the generator's."""
+    """cGAN + lambda L1 (eq. 2.3): the discriminator's update, then the generator's."""
 
     def __init__(
         self, generator: UNetGenerator, config: ViewTraining, held_out: TrainingPairs | None
@@ -209,7 +209,7 @@ class FinetuneTask:
         }
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """One turn: draw, match, compare with the truth."""
+        """One update: draw, match, compare with the truth."""
         drawn = draw_right(self.generator, batch.left)
         (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         reach = self.matcher.config.max_disparity_px
@@ -230,6 +230,6 @@ class FinetuneTask:
         def draw(left: Tensor) -> Tensor:
             return draw_right(self.generator, left[None].to(device))[0].cpu()
 
-        evidence = held_out_evidence(self.matcher, self.held_out, draw)
+        result = validate_pairs(self.matcher, self.held_out, draw)
         self.generator.train()
-        return evidence
+        return result

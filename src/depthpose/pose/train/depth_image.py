@@ -133,7 +133,7 @@ class DepthImageTask:
         self._views: dict[float, list[ViewSample]] = {}
 
     def step(self, batch: CropSample) -> Iterator[Update]:
-        """One turn: regress, move the model's points, compare; in diameters."""
+        """One update: regress, move the model's points, compare; in diameters."""
         which, device = batch.class_of, batch.R.device
         outputs = self.network(batch.crop.image, which).float()
         copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])

@@ -41,7 +41,7 @@ class SegmentationTask:
             self._held_out = AnnotatedImages(config.held_out, objects)
 
     def step(self, batch: LabelledImage) -> Iterator[Update]:
-        """One turn: label and compare."""
+        """One update: label and compare."""
         logits = self.network(normalise_colors(batch.image)).float()
         loss = mask_loss(logits, batch.labels, self.config.object_weight)
         overlap = Overlap(self.network.classes)

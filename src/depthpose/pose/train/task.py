@@ -46,7 +46,7 @@ class PoseTask:
         self._copies_m = keypoint_copies(models)
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
-        """One turn of the loop: all clouds at once."""
+        """One update: all clouds at once."""
         instance = batch.instance
         outputs = self.network.directions(batch.seen).float()
         found, copies_m = outputs[..., :3], self._posed(batch)
@@ -62,9 +62,9 @@ class PoseTask:
         if self.held_out is None:
             return ValidationResult()
         self.network.eval()
-        evidence = self.held_out.look(self.network)
+        result = self.held_out.look(self.network)
         self.network.train()
-        return evidence
+        return result
 
     def _posed(self, batch: CloudBatch) -> Float[Tensor, "clouds copies keypoints 3"]:
         copies = self._copies_m.to(batch.R)[batch.class_of]
