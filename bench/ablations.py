@@ -191,7 +191,7 @@ class Bench:
 
 def synthetic_quality(weights: Path) -> dict[str, float]:
     """Errors of the generated view and of depth, in visible and in occluded regions."""
-    net = FakestereoNet.load(weights, with_unlike=True)
+    net = FakestereoNet.load(weights, allow_ood=True)
     config = StreetsConfig(seed=9, scale=0.25)
     rows = [measure(net, draw_street(config, index)) for index in range(HELD_OUT_STREETS)]
     return {key: float(torch.tensor([r[key] for r in rows]).nanmean()) for key in rows[0]}

@@ -26,7 +26,7 @@ from depthpose.depth.evaluate import evaluate
 from depthpose.depth.predictions import predict
 from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import UNetGenerator
-from depthpose.depth.synthesis.synthesiser import Drawn, draw_right, pad_to_multiple
+from depthpose.depth.synthesis.synthesiser import SynthesisedViews, draw_right, pad_to_multiple
 from depthpose.depth.weights import read_depth_weights, read_matcher
 from depthpose.report.tables import markdown_table
 
@@ -90,10 +90,10 @@ class Drawer:
         self.config = generator.config
 
     @torch.no_grad()
-    def draw(self, left: Tensor) -> Drawn:
+    def draw(self, left: Tensor) -> SynthesisedViews:
         """Generate right views one by one."""
         right = [self.way(self.generator, image[None]).clamp(0, 1) for image in left]
-        return Drawn(right=torch.cat(right))
+        return SynthesisedViews(right=torch.cat(right))
 
 
 def first_camera(dataset: Dataset) -> StereoRig:

@@ -35,7 +35,7 @@ HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
 def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
     """Load a set by name, or build the full width."""
     if weights != "full":
-        return FakestereoNet.load(find_weights(weights), config=config, with_unlike=True)
+        return FakestereoNet.load(find_weights(weights), config=config, allow_ood=True)
     torch.manual_seed(0)
     generator = UNetGenerator(GeneratorConfig()).eval()
     return FakestereoNet(

@@ -104,8 +104,8 @@ TABLES = (
         key={"cap": "cap_m"},
         rows={
             **_BASELINES,
-            "one image (default)": {"weights": "default", "sees": "left view"},
-            "one image (kitti-nc)": {"weights": "kitti-nc", "sees": "left view"},
+            "one image (default)": {"weights": "default", "input": "left view"},
+            "one image (kitti-nc)": {"weights": "kitti-nc", "input": "left view"},
             **{
                 f"real stereo, {name}, {speed}": {"weights": name, "speed": speed}
                 for name in ("default", "kitti-nc", "psmnet-compact")
@@ -142,8 +142,8 @@ TABLES = (
         files=("disparity/rows.json",),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
         rows={
-            "one image, default": {"weights": "default", "sees": "left view"},
-            "one image, kitti-nc": {"weights": "kitti-nc", "sees": "left view"},
+            "one image, default": {"weights": "default", "input": "left view"},
+            "one image, kitti-nc": {"weights": "kitti-nc", "input": "left view"},
             **{
                 f"both views, {name}, {speed}": {"weights": name, "speed": speed}
                 for name in ("default", "kitti-nc", "psmnet-compact")

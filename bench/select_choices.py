@@ -36,7 +36,7 @@ from depthpose.depth.config import (
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import make_matcher
-from depthpose.depth.synthesis import Drawn, SelectionGenerator
+from depthpose.depth.synthesis import SelectionGenerator, SynthesisedViews
 from depthpose.depth.synthesis.selection import mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
 from depthpose.depth.train import STAGES
@@ -50,7 +50,7 @@ FOCAL_PX = 186.0
 RIG = SelectionConfig(virtual_focal_px=FOCAL_PX, disparity_px=(0.6, 44.0))
 CROP = AugmentConfig(crop_px=(96, 288), scale=(0.9, 1.15), jitter=0.0)
 HARSH = DegradeConfig(
-    colour=0.5, hue_share=0.25, veil_share=0.4, glare_share=0.4, blur_share=0.6, blur_px=2.0,
+    colour=0.5, hue_share=0.25, haze_share=0.4, glare_share=0.4, blur_share=0.6, blur_px=2.0,
     noise_share=0.8, noise=0.08, jpeg_share=0.5,
 )  # fmt: skip
 
@@ -62,7 +62,7 @@ class Arm:
     Attributes:
         name: in the table.
         change: of the config.
-        sees: which pairs: streets, real ones, or both (three real ones for each street).
+        data: which pairs: streets, real ones, or both (three real ones for each street).
         unlabelled: what pairs without truth are seen as: with labels of a matcher, as they are, or
             not at all.
         seed: of the training.
@@ -70,7 +70,7 @@ class Arm:
 
     name: str
     change: dict[str, Any] = field(default_factory=dict)
-    sees: str = "both"
+    data: str = "both"
     unlabelled: str = "labelled"
     seed: int = 0
 
@@ -78,13 +78,13 @@ class Arm:
 ARMS = (
     Arm(name="as shipped"),
     Arm(name="as shipped", seed=1),
-    Arm(name="streets alone", sees="streets"),
-    Arm(name="streets alone, encoder's rate 0.05", sees="streets", change={"encoder_rate": 0.05}),
-    Arm(name="streets alone, harsher degrade", sees="streets", change={"degrade": HARSH}),
-    Arm(name="real alone", sees="real"),
+    Arm(name="streets alone", data="streets"),
+    Arm(name="streets alone, encoder's rate 0.05", data="streets", change={"encoder_rate": 0.05}),
+    Arm(name="streets alone, harsher degrade", data="streets", change={"degrade": HARSH}),
+    Arm(name="real alone", data="real"),
     Arm(
         name="encoder from scratch",
-        change={"encoder": None, "with_fixed_start": False, "encoder_rate": 1.0},
+        change={"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0},
     ),
     Arm(name="pixel loss", change={"disparity_loss": "pixel"}),
     Arm(name="no cross entropy", change={"plane_weight": 0.0}),
@@ -92,14 +92,14 @@ ARMS = (
     Arm(name="pairs without truth teach by the view alone", unlabelled="unlabelled"),
     Arm(name="pairs without truth left out", unlabelled="none"),
     Arm(name="pairs without truth left out", unlabelled="none", seed=1),
-    Arm(name="streets alone", sees="streets", seed=1),
+    Arm(name="streets alone", data="streets", seed=1),
 )
 
 
 class MixingSynthesiser(SelectionSynthesiser):
     """Renders the right view as a mixture of shifts instead of by one shift per pixel."""
 
-    def draw(self, left: torch.Tensor) -> Drawn:
+    def draw(self, left: torch.Tensor) -> SynthesisedViews:
         """Synthesise right views; images are RGB in [0, 1]."""
         height, width = left.shape[-2:]
         size = (round(height / 32) * 32, round(width / 32) * 32)
@@ -129,13 +129,13 @@ class Bench:
     def sources(self, arm: Arm) -> dict[str, Any]:
         """Give the training data of an arm."""
         streets = replace(self.pairs([self.options.streets]), exclude=(), truth="disparity")
-        if arm.sees == "streets":
+        if arm.data == "streets":
             return {"pairs": streets}
         more = {
             "labelled": self.options.labelled, "unlabelled": self.options.unlabelled, "none": [],
         }[arm.unlabelled]  # fmt: skip
         found: dict[str, Any] = {"pairs": self.pairs([*self.options.real, *more])}
-        return found if arm.sees == "real" else found | {"more": streets, "more_share": 0.3}
+        return found if arm.data == "real" else found | {"more": streets, "more_share": 0.3}
 
     def loop(self, seed: int) -> LoopConfig:
         """Give the length of an arm."""

@@ -56,7 +56,7 @@ def real_frames(samples: Path) -> list[Frame]:
     return frames
 
 
-def synthetic_frame(kind: SensorKind, alike_px: float | None, like: Frame) -> Frame:
+def synthetic_frame(kind: SensorKind, noise_correlation_px: float | None, like: Frame) -> Frame:
     """Measure a disc before a plane at the distance of a real frame's plane."""
     height, width = _SIZE
     rows, columns = torch.arange(height)[:, None] / height, torch.arange(width) / width
@@ -70,11 +70,15 @@ def synthetic_frame(kind: SensorKind, alike_px: float | None, like: Frame) -> Fr
         kinds=(kind,),
         noise=(1.0, 1.0),
         missing=(0.0, 0.0),
-        alike_px=None if alike_px is None else (alike_px, alike_px),
+        noise_correlation_px=None
+        if noise_correlation_px is None
+        else (noise_correlation_px, noise_correlation_px),
     )
     generator = torch.Generator().manual_seed(0)
     read_m = measure(depth_m, (like.focal_px, like.focal_px), config, generator)
-    name = kind if alike_px is None else f"{kind}, alike over {alike_px:g} px"
+    name = (
+        kind if noise_correlation_px is None else f"{kind}, alike over {noise_correlation_px:g} px"
+    )
     return Frame(f"{name}, as {like.name}", read_m.double(), like.focal_px, is_object)
 
 

@@ -21,14 +21,14 @@ SEED = 9
 CAP_M = 80.0
 
 
-def measure(name: str, sees: str, streets: list[StereoSample]) -> dict[str, object]:
+def measure(name: str, input: str, streets: list[StereoSample]) -> dict[str, object]:
     """One row: a network's depth in the sky and elsewhere; no depth counts as far."""
-    net = FakestereoNet.load(name, with_unlike=True)
+    net = FakestereoNet.load(name, allow_ood=True)
     depths: dict[bool, list[Tensor]] = {True: [], False: []}
     sure: dict[bool, list[Tensor]] = {True: [], False: []}
-    for street in tqdm(streets, f"{name}, {sees}"):
+    for street in tqdm(streets, f"{name}, {input}"):
         assert street.truth.is_sky is not None
-        seen = street.input if sees == "both" else replace(street.input, right=None)
+        seen = street.input if input == "both" else replace(street.input, right=None)
         found = net.estimate_pair(seen)
         assert found.depth_m is not None
         assert found.confidence is not None
@@ -39,7 +39,7 @@ def measure(name: str, sees: str, streets: list[StereoSample]) -> dict[str, obje
     sky_m, rest_m = torch.cat(depths[True]), torch.cat(depths[False])
     return {
         "weights": name,
-        "sees": sees,
+        "input": input,
         "sky nearer than 80 m": f"{float((sky_m < CAP_M).float().mean()):.1%}",
         "rest without depth": f"{float(rest_m.isinf().float().mean()):.2%}",
         "sky: median confidence": round(float(torch.cat(sure[True]).median()), 2),
@@ -56,7 +56,7 @@ def main() -> None:
     options = parser.parse_args()
     rendered = Streets(StreetsConfig(seed=SEED, scale=options.scale))
     streets = [rendered[k] for k in tqdm(range(options.number), "streets")]
-    rows = [measure(name, sees, streets) for name in options.weights for sees in ("one", "both")]
+    rows = [measure(name, input, streets) for name in options.weights for input in ("one", "both")]
     print(markdown_table(rows))
 
 

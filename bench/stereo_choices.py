@@ -39,26 +39,26 @@ class Arm:
         name: in the table.
         augment: changes of the augmentation.
         change: changes of the rest of the config.
-        sees: which synthetic scenes.
+        data: which synthetic scenes.
         seed: of the training.
     """
 
     name: str
     augment: dict[str, Any] = field(default_factory=dict)
     change: dict[str, Any] = field(default_factory=dict)
-    sees: tuple[str, ...] = ("streets", "clutter")
+    data: tuple[str, ...] = ("streets", "clutter")
     seed: int = 0
 
 
-SCRATCH = {"encoder": None, "with_fixed_start": False, "encoder_rate": 1.0}
+SCRATCH = {"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0}
 ARMS = (
     Arm(name="the recipe"),
-    Arm(name="both views degraded alike", augment={"apart": None}),
+    Arm(name="both views degraded alike", augment={"per_view": None}),
     Arm(name="rows aligned", augment={"misaligned_px": 0.0}),
     Arm(name="no patch erased", augment={"erased_share": 0.0}),
     Arm(name="one focal length (558 px)", augment={"scale": (1.5, 1.5)}),
-    Arm(name="no clutter", sees=("streets",)),
-    Arm(name="no streets", sees=("clutter",)),
+    Arm(name="no clutter", data=("streets",)),
+    Arm(name="no streets", data=("clutter",)),
     Arm(name="the sky has no truth", change={"with_sky": False}),
     Arm(name="encoder from scratch", change=SCRATCH),
     Arm(name="the recipe", seed=1),
@@ -68,7 +68,7 @@ ARMS = (
 def config_of(arm: Arm, options: argparse.Namespace) -> StereoTraining:
     """Change the recipe."""
     base = read_config(RECIPE, StereoTraining)
-    folders = tuple(str(getattr(options, name)) for name in arm.sees)
+    folders = tuple(str(getattr(options, name)) for name in arm.data)
     augment: AugmentConfig = replace(base.pairs.augment, **arm.augment)
     loop = replace(
         base.loop, steps=options.steps, seed=arm.seed, save_every_steps=50,

@@ -83,7 +83,7 @@ def main() -> None:
     options = parser.parse_args()
     config = StreetsConfig(seed=9, scale=options.scale)
     nets = {
-        name: FakestereoNet.load(find_weights(name), with_unlike=True) for name in options.weights
+        name: FakestereoNet.load(find_weights(name), allow_ood=True) for name in options.weights
     }
     found: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
     for index in range(options.number):

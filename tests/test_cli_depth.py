@@ -147,7 +147,7 @@ def test_an_image_unlike_the_known_is_refused_unless_asked_for(
     assert main(["depth", "predict", *words, str(tmp_path / "a")]) == 2
     assert "0: out of distribution for these weights" in capsys.readouterr().err
     assert not (tmp_path / "a/0.depth_m.npy").exists()
-    assert main(["depth", "predict", *words, str(tmp_path / "b"), "--with-unlike"]) == 0
+    assert main(["depth", "predict", *words, str(tmp_path / "b"), "--allow-ood"]) == 0
     assert "warning: 0: out of distribution" in capsys.readouterr().err
     assert "its depth is a guess" in (tmp_path / "b/0.warning.txt").read_text()
     assert "its depth is a guess" in (tmp_path / "b/report.html").read_text()
@@ -402,7 +402,7 @@ loop: {steps: 4, batch_size: 2, device: cpu}
 SELECT = """
 generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],
   virtual_focal_px: 130.0}
-with_fixed_start: false
+with_frozen_stem: false
 encoder_rate: 1.0
 pairs: {truth: disparity, augment: {crop_px: [32, 64]}}
 loop: {steps: 4, batch_size: 2, device: cpu}

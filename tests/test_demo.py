@@ -62,7 +62,7 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert len(scenes) == 3 + 2 + 1
     assert all(scene["layers"][0]["count"] > 10_000 for scene in scenes)
     rows = json.loads((tmp_path / "depths.json").read_text())
-    assert [(row["scene"], row["sees"]) for row in rows] == [
+    assert [(row["scene"], row["input"]) for row in rows] == [
         ("motorcycle", "both images"),
         ("motorcycle", "both images"),
         ("street", "both images"),
@@ -73,7 +73,7 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert headings[0] == "Parts on a table", "poses lead, one image comes last"
     assert headings[1] == "The motorcycle"
     assert headings[-1].endswith("one image")
-    assert all(0 < row["abs_rel"] < 0.2 for row in rows if row["sees"] == "both images")
+    assert all(0 < row["abs_rel"] < 0.2 for row in rows if row["input"] == "both images")
     assert 0 < rows[-1]["abs_rel"] < 0.6
     assert rows[-1]["coverage"] == 1.0
     camera = read_camera(tmp_path / "street/camera.json")
@@ -99,7 +99,7 @@ def test_without_a_matcher_the_pair_is_left_to_opencv() -> None:
     net = FakestereoNet(None, make_synthesiser(sure_of(3)))
     street = make_street(0.1)
     methods = _nets(net, replace(street, input=replace(street.input, name="street")))
-    assert {name: sees for name, (sees, _) in methods.items()} == {
+    assert {name: given for name, (given, _) in methods.items()} == {
         "selecting generator": "one image",
         "SGBM, holes filled": "both images",
     }

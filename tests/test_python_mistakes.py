@@ -87,7 +87,7 @@ from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.pose.config import EstimateConfig, EvaluationConfig, VotingConfig
 from depthpose.pose.mesh import read_model
 
-pose, depth = GeoPoseNet.load("parts"), FakestereoNet.load("default", with_unlike=True)
+pose, depth = GeoPoseNet.load("parts"), FakestereoNet.load("default", allow_ood=True)
 K = [[50.0, 0.0, 31.5], [0.0, 50.0, 23.5], [0.0, 0.0, 1.0]]
 camera = Camera(width=64, height=48, K=torch.tensor(K, dtype=torch.float64))
 points, depth_m, mask = torch.rand(99, 3), torch.ones(48, 64), torch.ones(48, 64) > 0

@@ -42,7 +42,7 @@ NO_WEIGHT_FOLLOWS = frozenset({
     "calibration.occlusion", "calibration.max_wrong_share", "calibration.negatives",
     "calibration.max_negative_share", "calibration.noises", "calibration.without",
     # Without a meaning beside what is written.
-    "encoder", "encoder_rate", "with_fixed_start",
+    "encoder", "encoder_rate", "with_frozen_stem",
     "confidence_weight", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",
     # These follow from the models.
     "network.classes", "network.keypoints", "network.inputs", "network.descriptor",
@@ -189,7 +189,7 @@ def test_the_generator_is_trained_as_printed(
     assert pairs.focal_px == found.task.generator.config.virtual_focal_px == 493.0
     assert sum(isinstance(m, nn.Dropout) for m in found.task.generator.modules()) == 3
     augment = {"crop_px": (256, 512), "scale": (1.0, 1.0), "jitter": 0.2, "flip_share": 0.5}
-    augment |= {"apart": None, "erased_share": 0.0, "misaligned_px": 0.0}
+    augment |= {"per_view": None, "erased_share": 0.0, "misaligned_px": 0.0}
     assert dataclasses.asdict(pairs.augment) == augment
 
 

@@ -45,7 +45,7 @@ def holder(folder: Path, seconds: int, **environment: str) -> Iterator["subproce
 def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
     refused = pytest.raises(InputError, match="another command is writing there")
     with holder(tmp_path, 600), refused:
-        lock_folder(tmp_path / RECORD, is_shared=False, patience_s=0.3)
+        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.3)
     claim_folder(tmp_path, {"a": 1})
     release_folders()
 
@@ -53,7 +53,7 @@ def test_a_second_command_is_refused_until_the_first_is_gone(tmp_path: Path) -> 
 def test_a_second_command_waits_for_one_that_ends(tmp_path: Path) -> None:
     with holder(tmp_path, 1) as process:
         began = time.monotonic()
-        lock_folder(tmp_path / RECORD, is_shared=False, patience_s=60.0)
+        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=60.0)
         assert process.wait() == 0
         assert time.monotonic() - began < 60
 
@@ -67,7 +67,7 @@ def test_processes_of_one_launch_share_a_folder(
         claim_folder(tmp_path, {"a": 1})
         release_folders()
         with pytest.raises(InputError, match="another command is writing there"):
-            lock_folder(tmp_path / RECORD, is_shared=False, patience_s=0.2)
+            lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.2)
 
 
 def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:

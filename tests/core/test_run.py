@@ -150,7 +150,7 @@ def test_waiting_ends_when_all_is_there() -> None:
 
 def test_waiting_in_vain_names_what_is_missing() -> None:
     with pytest.raises(InputError, match="1 of 2 are missing, first 'b': another process may have"):
-        wait_for(["a", "b"], lambda name: name == "a", patience_s=0.1)
+        wait_for(["a", "b"], lambda name: name == "a", timeout_s=0.1)
 
 
 def test_a_nested_setting_is_named_by_its_path_and_a_new_one_may_be_off(tmp_path: Path) -> None:

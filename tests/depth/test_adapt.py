@@ -125,15 +125,17 @@ def test_batch_norm_keeps_its_statistics() -> None:
     assert any(p.grad is not None and bool(p.grad.any()) for p in matcher.parameters())
 
 
-def test_one_pair_of_five_is_kept_back(tmp_path: Path) -> None:
+def test_the_last_fifth_of_the_pairs_is_held_out(tmp_path: Path) -> None:
     folder = write_pairs(tmp_path / "pairs", (0.15,) * 6)
-    assert split_pairs(str(folder), None, 5)[1] == [0, 5]
-    assert split_pairs(str(folder), None, 100)[1] == [0], "one at least is trained on"
-    first = split_pairs(str(folder), None, 5)[0].frames[0].name
-    assert split_pairs(str(folder), None, 5, [first])[1] == [1], "what is left out is not kept back"
+    assert split_pairs(str(folder), None, 0.2)[1] == [5]
+    assert split_pairs(str(folder), None, 0.34)[1] == [4, 5]
+    assert split_pairs(str(folder), None, 0.01)[1] == [5], "one at least is held out"
+    assert split_pairs(str(folder), None, 0.99)[1] == [1, 2, 3, 4, 5], "one at least is trained on"
+    last = split_pairs(str(folder), None, 0.2)[0].frames[5].name
+    assert split_pairs(str(folder), None, 0.2, [last])[1] == [4], "excluded pairs are not held out"
     lone = write_pairs(tmp_path / "lone", (0.15,))
     with pytest.raises(InputError, match="two at least are needed"):
-        split_pairs(str(lone), None, 5)
+        split_pairs(str(lone), None, 0.2)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +199,7 @@ def config_of(tmp_path: Path, start: Path, rate: float) -> AdaptTraining:
     folder = write_pairs(tmp_path / "pairs", (0.2, 0.2, 0.25))
     return AdaptTraining(
         start=str(start),
-        kept_back=3,
+        validation_share=0.34,
         streets=1,
         adam=AdamConfig(learning_rate=rate),
         pairs=PairsConfig(
@@ -222,7 +224,7 @@ def test_pairs_are_adapted_to_at_the_size_of_a_fine_match(
     """Never enlarged; large ones are reduced to what a fine match takes."""
     network = read_matcher(start)
     config = config_of(tmp_path, start, 1e-3)
-    camera = open_dataset(tmp_path / "pairs").read_input(0).camera
+    camera = open_dataset(tmp_path / "pairs").read_input(2).camera  # held out
     assert camera is not None
     own_px = float(camera.K[0, 0])
     assert fine_focal_px(config, network) == pytest.approx(own_px)
@@ -247,11 +249,11 @@ def test_an_adapted_matcher_carries_its_card(
 
 
 def test_views_that_are_changed_apart_are_refused() -> None:
-    changed = PairsConfig(augment=AugmentConfig(apart=DegradeConfig()))
-    with pytest.raises(InputError, match="changes views apart"):
+    changed = PairsConfig(augment=AugmentConfig(per_view=DegradeConfig()))
+    with pytest.raises(InputError, match="changes each view on its own"):
         AdaptTraining(pairs=changed)
-    with pytest.raises(InputError, match="kept_back must be 2 or more"):
-        AdaptTraining(kept_back=1)
+    with pytest.raises(InputError, match="validation_share must be above 0"):
+        AdaptTraining(validation_share=1.0)
     with pytest.raises(InputError, match="one above 0"):
         AdaptTraining(photometric_weight=0.0, smooth_weight=0.0, label_weight=0.0)
 

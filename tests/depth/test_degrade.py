@@ -10,7 +10,7 @@ from depthpose.depth.config import DegradeConfig
 NOTHING = DegradeConfig(
     colour=0.0,
     hue_share=0.0,
-    veil_share=0.0,
+    haze_share=0.0,
     glare_share=0.0,
     blur_share=0.0,
     noise_share=0.0,
@@ -33,7 +33,7 @@ def test_the_generator_alone_decides() -> None:
     assert not torch.equal(one, other)
 
 
-@pytest.mark.parametrize("share", ["hue", "veil", "glare", "blur", "noise", "jpeg"])
+@pytest.mark.parametrize("share", ["hue", "haze", "glare", "blur", "noise", "jpeg"])
 def test_each_change_alone_changes_the_picture_and_keeps_its_range(share: str) -> None:
     config = dataclasses.replace(NOTHING, **{f"{share}_share": 1.0})
     found = degrade(IMAGE, config, seeded(3))

@@ -33,7 +33,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @with_openvino
 def test_openvino_answers_what_torch_does_at_any_size(weights: Path) -> None:
     nets = [
-        FakestereoNet.load(weights, engine=engine, with_unlike=True)
+        FakestereoNet.load(weights, engine=engine, allow_ood=True)
         for engine in ("torch", "openvino")
     ]
     multiple = CONFIG.side_multiple_px
@@ -53,7 +53,7 @@ def test_openvino_answers_what_torch_does_at_any_size(weights: Path) -> None:
 
 @with_openvino
 def test_an_answer_stays_when_the_next_image_comes(weights: Path) -> None:
-    net = FakestereoNet.load(weights, engine="openvino", with_unlike=True)
+    net = FakestereoNet.load(weights, engine="openvino", allow_ood=True)
     assert net.synthesiser is not None
     first = net.synthesiser.draw(torch.zeros(1, 3, 64, 96))
     kept = first.disparity_px.clone() if first.disparity_px is not None else None

@@ -28,10 +28,10 @@ from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.rig import join_matches
+from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
-from depthpose.depth.unlike import calibrate, measure_familiarity
 from depthpose.depth.weights import read_generator, write_depth_weights
 
 
@@ -475,14 +475,14 @@ def unsure(least: float) -> SelectionGenerator:
 def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     image, lens = torch.rand(3, 40, 60), camera(60, 40, FOCAL_PX)
     known = FakestereoNet(None, make_synthesiser(unsure(0.6))).estimate(image, lens)
-    assert known.familiarity == pytest.approx(0.7)
+    assert known.image_confidence == pytest.approx(0.7)
     assert known.warning == ""
     synthesiser = make_synthesiser(unsure(0.8))
     with pytest.raises(
-        InputError, match=r"cup: out of distribution .* below 0\.80\), .* with_unlike=True"
+        InputError, match=r"cup: out of distribution .* below 0\.80\), .* allow_ood=True"
     ):
         FakestereoNet(None, synthesiser).estimate(image, lens, name="cup")
-    guess = FakestereoNet(None, synthesiser, with_unlike=True).estimate(image, lens, name="cup")
+    guess = FakestereoNet(None, synthesiser, allow_ood=True).estimate(image, lens, name="cup")
     assert guess.warning.startswith("out of distribution for these weights")
     torch.testing.assert_close(guess.depth_m, known.depth_m)
 
@@ -495,7 +495,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
                     camera=camera(60, 40, FOCAL_PX))
         for k in range(5)
     ]  # fmt: skip
-    known = measure_familiarity(FakestereoNet.load(given, with_unlike=True), images)
+    known = measure_image_confidence(FakestereoNet.load(given, allow_ood=True), images)
     least = calibrate(given, [*known, 0.1, 0.9], 0.2, out)
     assert least == pytest.approx(0.7, abs=1e-4)
     found = read_generator(out)
@@ -517,7 +517,7 @@ def test_a_generator_without_confidence_cannot_be_calibrated(
     image = StereoInput(name="a", left=torch.rand(3, 40, 60), right=None,
                         camera=camera(60, 40, FOCAL_PX))  # fmt: skip
     with pytest.raises(InputError, match="no generator with a confidence of its own"):
-        measure_familiarity(net, [image])
+        measure_image_confidence(net, [image])
 
 
 def speed_of(matcher: PSMNet, speed: Speed) -> PSMNetMatcher:

@@ -22,7 +22,7 @@ from depthpose.depth.datasets import Dataset, lidar_truth, open_dataset, pack_fr
 CONFIG = """
 generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],
   virtual_focal_px: 130.0}
-with_fixed_start: false
+with_frozen_stem: false
 encoder_rate: 1.0
 pairs: {truth: disparity, augment: {crop_px: [32, 64]}}
 loop: {steps: 60, batch_size: 2, save_every_steps: 5, device: cpu}

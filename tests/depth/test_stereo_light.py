@@ -313,7 +313,7 @@ def stereo_task(**settings: Any) -> StereoTask:  # noqa: ANN401
 
 
 def test_it_learns_and_every_part_gets_gradients() -> None:
-    task = stereo_task(with_fixed_start=False, encoder_rate=1.0)
+    task = stereo_task(with_frozen_stem=False, encoder_rate=1.0)
     network, batch = task.matcher, training_batch()
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     losses = []

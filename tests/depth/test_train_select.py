@@ -160,7 +160,7 @@ def test_early_layers_and_statistics_of_the_encoder_stay(pairs: PairsConfig) -> 
     assert not any("running_" in name for name in moved if name.startswith("encoder."))
     assert "encoder.blocks.3.project.conv.weight" in moved
     assert "decoder.0.1.running_mean" in moved
-    free = SelectTask(SelectionGenerator(TINY), SelectTraining(with_fixed_start=False), None)
+    free = SelectTask(SelectionGenerator(TINY), SelectTraining(with_frozen_stem=False), None)
     assert all(p.requires_grad for p in free.generator.parameters())
     assert all(m.training for m in free.generator.modules())
 
@@ -176,12 +176,12 @@ def test_the_encoder_learns_at_its_own_rate(pairs: PairsConfig) -> None:
 def test_it_learns_disparity_and_view(folder: Path, tmp_path: Path, pairs: PairsConfig) -> None:
     config = SelectTraining(
         generator=TINY,
-        with_fixed_start=False,
+        with_frozen_stem=False,
         encoder_rate=1.0,
         adam=AdamConfig(learning_rate=4e-3),
         pairs=dataclasses.replace(pairs, with_cache=True),
         held_out=dataclasses.replace(pairs, limit=1),
-        degrade=DegradeConfig(colour=0.0, hue_share=0.0, veil_share=0.0, glare_share=0.0),
+        degrade=DegradeConfig(colour=0.0, hue_share=0.0, haze_share=0.0, glare_share=0.0),
         loop=dataclasses.replace(LOOP, steps=80, log_every_steps=10),
     )
     path = train_select(config, Run(folder=tmp_path))
@@ -200,7 +200,7 @@ def test_held_out_pairs_are_measured_at_the_focal_length_of_the_generator(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:
     config = SelectTraining(
-        generator=TINY, with_fixed_start=False, pairs=pairs, loop=dataclasses.replace(LOOP, steps=1)
+        generator=TINY, with_frozen_stem=False, pairs=pairs, loop=dataclasses.replace(LOOP, steps=1)
     )
     found = []
     for focal_px in (130.0, None):
@@ -286,7 +286,7 @@ def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Pa
     zoom = dataclasses.replace(pairs.augment, scale=(1.0, 1.3))
     config = SelectTraining(
         generator=TINY,
-        with_fixed_start=False,
+        with_frozen_stem=False,
         pairs=dataclasses.replace(pairs, augment=zoom),
         loop=LOOP,
     )

@@ -97,7 +97,7 @@ def test_noise_is_that_of_the_sensor(kind: str, at_1_m: float, at_2_m: float) ->
 
 
 def test_noise_that_neighbours_share_falls_off_with_their_distance() -> None:
-    config = dataclasses.replace(_sensor("time of flight"), alike_px=(4.0, 4.0))
+    config = dataclasses.replace(_sensor("time of flight"), noise_correlation_px=(4.0, 4.0))
     noise_m = measure(torch.full((400, 400), 1.0), (286.0, 572.0), config, _generator(1)) - 1
     assert abs(float(noise_m.std()) / 0.003 - 1) < 0.1
     for lag in (1, 2, 4):  # the window shows half as many pixels: 2 for 4
@@ -208,8 +208,8 @@ def test_bad_settings_of_objects_are_refused(values: dict, text: str) -> None:
         ({"kinds": ()}, "kinds is (); name one or more of structured light, active stereo, ti"),
         ({"noise": (2.0, 1.0)}, "noise is (2.0, 1.0), but it is a range within 0.0 to 20.0"),
         (
-            {"alike_px": (-1.0, 2.0)},
-            "alike_px is (-1.0, 2.0), but it is a range within 0.0 to 30.0",
+            {"noise_correlation_px": (-1.0, 2.0)},
+            "noise_correlation_px is (-1.0, 2.0), but it is a range within 0.0 to 30.0",
         ),
         ({"missing": (0.0, 1.0)}, "missing is (0.0, 1.0), but it is a range within 0.0 to 0.9"),
     ],

@@ -67,10 +67,10 @@ def test_columns_of_a_table_come_in_the_declared_order() -> None:
     rows = [measured("obj_01", 0.9)]
     table = join_by_object(rows, {"obj_01": 1}, with_published=True)
     assert list(table[2].columns()) == [
-        "source", "method", "masks", "sees", "mean", "diameters", "note", "printed in",
+        "source", "method", "masks", "input", "mean", "diameters", "note", "printed in",
     ]  # fmt: skip
     assert list(table[11].columns()) == [
-        "source", "method", "masks", "sees", "ape", "mean", "refused", "wrong", "auc", "instances",
+        "source", "method", "masks", "input", "ape", "mean", "refused", "wrong", "auc", "instances",
         "diameters", "weights", "weights_sha256", "frames", "frames_sha256", "ms_network",
     ]  # fmt: skip
     # Where there is no difference the column is empty, not left out.

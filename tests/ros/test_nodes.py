@@ -104,7 +104,7 @@ def test_recorded_pairs_give_the_depth_of_the_estimator(
 def test_recorded_images_give_the_depth_of_the_estimator(
     street: StereoSample, recorded: dict[str, Any]
 ) -> None:
-    net = FakestereoNet.load("default", with_unlike=True)
+    net = FakestereoNet.load("default", allow_ood=True)
     rig = rig_of_street(street)
     given = (recorded["/left/image_rect"], recorded["/left/camera_info"])
     made = DepthFromImage(net, "16UC1")(*given)

@@ -64,13 +64,13 @@ class DepthImageNode(WorkNode):
     def __init__(self) -> None:
         super().__init__(
             "depth_image", weights="default", encoding="32FC1", engine="torch", device="cpu",
-            with_unlike=False,
+            allow_ood=False,
         )  # fmt: skip
         net = FakestereoNet.load(
             self.value("weights"),
             config=MatcherConfig(device=self.value("device")),
             engine=self.value("engine"),
-            with_unlike=self.value("with_unlike"),
+            allow_ood=self.value("allow_ood"),
         )
         work = DepthFromImage(net, self.value("encoding"))
         depth = self.create_publisher(Image, "~/depth", NEWEST)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 _OF_POSES = ("object", "status", "error_mm", "of_diameter", "rotation_deg", "translation_mm")
-_OF_DEPTHS = ("scene", "method", "sees", "abs_rel", "rmse", "d1", "epe_px")
+_OF_DEPTHS = ("scene", "method", "input", "abs_rel", "rmse", "d1", "epe_px")
 """Columns that are printed; the page and the files hold all."""
 
 
@@ -26,7 +26,7 @@ def demo(
     from depthpose.demo import make_demo
     from depthpose.report.tables import plain_table
 
-    result = make_demo(out, weights, pose_weights, tell=partial(print, flush=True))
+    result = make_demo(out, weights, pose_weights, on_message=partial(print, flush=True))
     print(plain_table(result.poses, _OF_POSES))
     print(plain_table(result.depths, _OF_DEPTHS))
     print(f"The page: {result.page}")

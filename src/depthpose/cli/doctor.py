@@ -122,7 +122,7 @@ def _try_depth() -> str:
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
     left, right = scene[..., :-_SHIFT_PX], scene[..., _SHIFT_PX:]
-    net = FakestereoNet.load("default", with_unlike=True)  # of noise
+    net = FakestereoNet.load("default", allow_ood=True)  # of noise
     if net.matcher is None:
         return _try_one_image(net, left)
     found = net.estimate(left, None, right=right, with_check=False)

@@ -47,7 +47,7 @@ def serve(page: ServeOptions = ServeOptions()) -> int:
     taken = open_socket(page.host, page.port)
     names = known_names(page.host, taken_address(taken))
     limits = Limits(upload_bytes=page.max_upload_mb * 10**6, hosts=names)
-    depth = FakestereoNet.load(page.weights, with_unlike=True)
+    depth = FakestereoNet.load(page.weights, allow_ood=True)
     return _answer(make_app(depth, GeoPoseNet.load(page.pose_weights), limits), taken)
 
 

@@ -36,7 +36,7 @@ _locks: dict[Path, int] = {}
 """Records of the folders that this process writes to, locked, and their descriptors."""
 
 
-def lock_folder(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> bool:
+def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:
     """Lock a folder against other commands until :func:`release_folders`, or the process ends.
 
     A POSIX lock: it ends with the process, however that ends, and workers do not inherit it.
@@ -45,7 +45,7 @@ def lock_folder(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> b
     Args:
         record: a file in the folder that no command replaces.
         is_shared: let other processes of the same launch in.
-        patience_s: how long another command may take to end.
+        timeout_s: how long another command may take to end.
 
     Returns:
         Whether the folder is this process's alone from now on.
@@ -59,7 +59,7 @@ def lock_folder(record: Path, *, is_shared: bool, patience_s: float = 10.0) -> b
     with refused_write(record):
         file = os.open(record, os.O_RDWR)
     kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
-    last = time.monotonic() + patience_s
+    last = time.monotonic() + timeout_s
     while True:
         try:
             fcntl.lockf(file, kind | fcntl.LOCK_NB)

@@ -63,14 +63,14 @@ def own_device(device: str) -> str:
 
 
 def wait_for(
-    names: Sequence[str], is_there: Callable[[str], bool], patience_s: float = 3600.0
+    names: Sequence[str], is_there: Callable[[str], bool], timeout_s: float = 3600.0
 ) -> None:
     """Wait until other processes have finished all of these.
 
     Args:
         names: what is waited for.
         is_there: whether one is finished.
-        patience_s: how long nothing new may appear: a process that died finishes nothing.
+        timeout_s: how long nothing new may appear: a process that died finishes nothing.
 
     Raises:
         InputError: the time is up; what is missing is named.
@@ -78,13 +78,13 @@ def wait_for(
     missing = [name for name in names if not is_there(name)]
     last_news = time.monotonic()
     while missing:
-        if time.monotonic() - last_news > patience_s:
+        if time.monotonic() - last_news > timeout_s:
             raise InputError(
-                f"nothing new for {patience_s:.0f} s and {len(missing)} of {len(names)} are "
+                f"nothing new for {timeout_s:.0f} s and {len(missing)} of {len(names)} are "
                 f"missing, first {missing[0]!r}: another process may have failed. Start again; "
                 "what is finished is kept."
             )
-        time.sleep(min(0.2, patience_s))
+        time.sleep(min(0.2, timeout_s))
         still = [name for name in missing if not is_there(name)]
         last_news = time.monotonic() if len(still) < len(missing) else last_news
         missing = still

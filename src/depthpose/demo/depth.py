@@ -77,11 +77,11 @@ def _try_all(
     name = sample.input.name
     _write_pair(out / name, sample)
     rows, shown = [], []
-    for method, (sees, net) in nets.items():
-        pair = sample.input if sees == _FROM_PAIR else replace(sample.input, right=None)
+    for method, (given, net) in nets.items():
+        pair = sample.input if given == _FROM_PAIR else replace(sample.input, right=None)
         estimate = net.estimate_pair(pair)
-        rows.append({"scene": name, "method": method, "sees": sees, **_measure(sample, estimate)})
-        title = f"{name}: {method}, {sees}"
+        rows.append({"scene": name, "method": method, "input": given, **_measure(sample, estimate)})
+        title = f"{name}: {method}, {given}"
         shown.append(_show(out / _folder(method), title, replace(sample, input=pair), estimate))
     method = next(iter(nets))
     best = Picture(

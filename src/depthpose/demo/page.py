@@ -31,7 +31,7 @@ def make_demo(
     weights: str | Path = "default",
     parts: str | Path = "parts",
     scale: float = 1.0,
-    tell: Callable[[str], None] | None = None,
+    on_message: Callable[[str], None] | None = None,
 ) -> DemoResult:
     """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
 
@@ -40,16 +40,16 @@ def make_demo(
         weights: of the depth networks, by name or file.
         parts: weights of a pose network for the parts, by name or file.
         scale: size of the street's images as a share of KITTI's.
-        tell: called with what is done next.
+        on_message: called with what is done next.
 
     Raises:
         InputError: ``out`` holds files that the demo did not write and would replace.
     """
     claim_folder(out, {"command": "demo"}, [*_FOLDERS, *table_files("depths", "poses"), _PAGE])
-    tell = tell or (lambda _: None)
-    tell("synthetic parts on a table are posed from a depth image ...")
+    on_message = on_message or (lambda _: None)
+    on_message("synthetic parts on a table are posed from a depth image ...")
     poses, of_pose = show_poses(out, parts)
-    tell("depth of a real pair and of a synthetic street ...")
+    on_message("depth of a real pair and of a synthetic street ...")
     depths, of_depth = show_depth(out, weights, scale)
     write_table(out, depths, name="depths")
     write_table(out, poses, name="poses")

@@ -33,8 +33,8 @@ def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -
     if draw.share(config.hue_share):
         image = image[torch.randperm(3, generator=generator)]
     image = _recoloured(image, config.colour, draw)
-    if draw.share(config.veil_share):
-        image = _veiled(image, draw)
+    if draw.share(config.haze_share):
+        image = _hazy(image, draw)
     if draw.share(config.glare_share):
         image = _glaring(image, draw)
     if draw.share(config.blur_share):
@@ -83,7 +83,7 @@ def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
     return image.clamp(0, 1) ** gamma
 
 
-def _veiled(image: Picture, draw: _Draw) -> Picture:
+def _hazy(image: Picture, draw: _Draw) -> Picture:
     """Add haze to the image: a share of one light grey everywhere."""
     return torch.lerp(image, torch.full_like(image, draw.between(0.5, 1.0)), draw.between(0.0, 0.4))
 
@@ -245,8 +245,10 @@ def set_apart(
     pair: TrainingPair, config: AugmentConfig, generator: torch.Generator
 ) -> TrainingPair:
     """Change each view on its own, as two real cameras differ; disparity stays what it is."""
-    if config.apart is not None:
-        left, right = (degrade(view, config.apart, generator) for view in (pair.left, pair.right))
+    if config.per_view is not None:
+        left, right = (
+            degrade(view, config.per_view, generator) for view in (pair.left, pair.right)
+        )
         pair = pair._replace(left=left, right=right)
     if config.misaligned_px:
         ends = config.misaligned_px * (2 * torch.rand(2, generator=generator) - 1)

@@ -83,8 +83,8 @@ class DepthEstimate:
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
         is_sky: where the image shows the sky, or None where the weights do not know it.
-        familiarity: mean confidence of the generator over the image, 0..1: how well its weights
-            know such images. None for pairs, and where the generator has no confidence.
+        image_confidence: mean confidence of the generator over the image, 0..1: low for images out
+            of distribution. None for pairs, and where the generator has no confidence.
         warning: why the whole estimate is doubtful, such as an image unlike those that the
             weights know; else empty.
         seen: what it was estimated from, for its colours and camera; None where files hold the
@@ -96,7 +96,7 @@ class DepthEstimate:
     confidence: Float[Tensor, "h w"] | None = None
     right: Float[Tensor, "3 h w"] | None = None
     is_sky: Bool[Tensor, "h w"] | None = None
-    familiarity: float | None = None
+    image_confidence: float | None = None
     warning: str = ""
     seen: StereoInput | None = None
 

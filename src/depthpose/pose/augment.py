@@ -19,7 +19,7 @@ _KINECT_BASELINE_M = 0.075
 _STEPS_A_PIXEL = 8
 _STEREO_BASELINE_M = 0.05
 _STEREO_STEPS_A_PIXEL = 32
-_STEREO_ALIKE_PX = (3.0, 6.0)
+_STEREO_CORRELATION_PX = (3.0, 6.0)
 _STEREO_WINDOW = 2
 """Pixels by which active stereo displaces an edge at most."""
 _STEEPEST = math.tan(math.radians(80))
@@ -123,9 +123,11 @@ def measure(
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
     is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
-    alike_px = config.alike_px or (_STEREO_ALIKE_PX if kind == "active stereo" else None)
+    noise_correlation_px = config.noise_correlation_px or (
+        _STEREO_CORRELATION_PX if kind == "active stereo" else None
+    )
     of_full = focal_px[0] / focal_px[1]
-    width_px = of_full * uniform(generator, *alike_px) if alike_px else 0.0
+    width_px = of_full * uniform(generator, *noise_correlation_px) if noise_correlation_px else 0.0
     white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])

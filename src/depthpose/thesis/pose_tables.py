@@ -30,7 +30,7 @@ class PublishedRow:
 
     Attributes:
         method: who.
-        sees: what the method uses.
+        input: what the method uses.
         by_object: percent by BOP's number; empty where only the mean is printed.
         mean: percent, as printed.
         diameters: whose table a success is a tenth of.
@@ -39,7 +39,7 @@ class PublishedRow:
     """
 
     method: str
-    sees: str
+    input: str
     by_object: dict[int, float]
     mean: float
     diameters: str
@@ -52,13 +52,15 @@ _FFB6D = "table in the README of ethnhe/FFB6D"
 _EACH = "one network an object, some 20,000 synthetic images of each"
 
 
-def _row(method: str, sees: str, printed: str, mean: float, note: str, source: str) -> PublishedRow:
+def _row(
+    method: str, input: str, printed: str, mean: float, note: str, source: str
+) -> PublishedRow:
     """Read the thirteen numbers in the order of the objects."""
     numbers = dict(zip(LINEMOD, map(float, printed.split()), strict=True)) if printed else {}
     diameters = "pvnet" if method == "PVNet" else "bop"
     return PublishedRow(
         method=method,
-        sees=sees,
+        input=input,
         by_object=numbers,
         mean=mean,
         diameters=diameters,
@@ -105,7 +107,7 @@ class ComparedRow:
         source: ``published``, ``ours`` or ``difference`` (ours minus the other).
         method: who.
         masks: that it was given.
-        sees: what the method uses.
+        input: what the method uses.
         by_object: percent by column.
         mean: over the objects.
         refused: percent of instances.
@@ -123,7 +125,7 @@ class ComparedRow:
     source: Literal["published", "ours", "difference"]
     method: str
     masks: str
-    sees: str | None = None
+    input: str | None = None
     by_object: Mapping[str, float]
     mean: float | None
     refused: float | None = None
@@ -143,7 +145,7 @@ class ComparedRow:
             "source": self.source,
             "method": self.method,
             "masks": self.masks,
-            "sees": self.sees,
+            "input": self.input,
             **self.by_object,
             "mean": self.mean,
             "refused": self.refused,
@@ -214,7 +216,7 @@ def _own(
         source="ours",
         method=mean.origin.method,
         masks=mean.origin.masks,
-        sees="depth",
+        input="depth",
         by_object={
             _column(name, number, with_published): 100 * by_name[name].success
             for name, number in numbers.items()
@@ -236,7 +238,7 @@ def _published(row: PublishedRow) -> ComparedRow:
         source="published",
         method=row.method,
         masks="",
-        sees=row.sees,
+        input=row.input,
         by_object={LINEMOD[number]: percent for number, percent in row.by_object.items()},
         mean=row.mean,
         diameters=row.diameters,

@@ -168,7 +168,7 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
 def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     assert found.depth_m is not None
     known_m = found.depth_m[found.depth_m.isfinite()]
-    sees = "one image" if pair.right is None else "both images"
+    given = "one image" if pair.right is None else "both images"
     is_sky = found.is_sky
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     if len(known_m) == 0:
@@ -177,10 +177,10 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
             if pair.right is not None
             else (f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else ".")
         )
-        return f"No pixel got a depth from {sees}{why}"
+        return f"No pixel got a depth from {given}{why}"
     warning = f"Careful: {found.warning}. " if found.warning else ""
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
     return (
-        f"{warning}Depth from {sees} for {share:.0%} of the pixels; half of these are nearer than "
+        f"{warning}Depth from {given} for {share:.0%} of the pixels; half of these are nearer than "
         f"{middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
     )

@@ -63,7 +63,7 @@ def predict(
         config,
         with_right=False,
         matcher=networks.matcher,
-        with_unlike=networks.with_unlike,
+        allow_ood=networks.allow_ood,
         answer=networks.answer,
     )
     return predicting.predict_all(sources, lens, method, Path(out), output)
@@ -90,7 +90,7 @@ def _predict_on_ray(
         config=config,
         with_right=False,
         with_sgbm=networks.matcher == "sgbm",
-        with_unlike=networks.with_unlike,
+        allow_ood=networks.allow_ood,
         answer=networks.answer,
     )
     return engine.predict(images, lens, spec, output, out, on)

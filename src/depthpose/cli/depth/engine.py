@@ -55,7 +55,7 @@ class NetSpec:
     config: MatcherConfig
     with_right: bool
     with_sgbm: bool
-    with_unlike: bool = True
+    allow_ood: bool = True
     answer: Answer | None = None
 
     def build(self) -> Method:
@@ -68,7 +68,7 @@ class NetSpec:
                 self.config,
                 with_right=self.with_right,
                 matcher="sgbm" if self.with_sgbm else None,
-                with_unlike=self.with_unlike,
+                allow_ood=self.allow_ood,
                 answer=self.answer,
             )
 

@@ -161,7 +161,7 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
         settings: that made them, where they are ours.
     """
     source = describe_source(name, settings)
-    short = {field: getattr(source, field) for field in ("method", "sees", "speed", "weights")}
+    short = {field: getattr(source, field) for field in ("method", "input", "speed", "weights")}
     return Evaluation(
         rows=[replace(row, **asdict(source)) for row in result.rows],
         per_frame=[replace(row, **short) for row in result.per_frame],
@@ -222,8 +222,8 @@ def describe_source(name: str, settings: dict[str, Any] | None) -> Source:
     suffix = holes.get(settings.get("with_filled_holes", ""), "")
     return Source(
         method=settings.get("matcher", "") + suffix,
-        sees=settings.get("sees", "both views"),
-        speed=settings.get("speed", "") if settings.get("sees") != "left view" else "",
+        input=settings.get("input", "both views"),
+        speed=settings.get("speed", "") if settings.get("input") != "left view" else "",
         weights=settings.get("weights", ""),
         weights_sha256=settings.get("weights_sha256", "")[:12],
     )

@@ -38,7 +38,7 @@ def weights_method(
     *,
     with_right: bool | None = None,
     matcher: str | None = None,
-    with_unlike: bool = True,
+    allow_ood: bool = True,
     answer: Answer | None = None,
 ) -> Method:
     """Build the network of a weights file, given by its path or by name.
@@ -49,7 +49,7 @@ def weights_method(
         with_right: give it the real right view; by default only to a matcher, which needs it.
         matcher: for the synthesised view: None (the weights' own), sgbm (OpenCV's), or that of
             other weights, by name or file.
-        with_unlike: answer out-of-distribution images too, as a measurement must.
+        allow_ood: answer out-of-distribution images too, as a measurement must.
         answer: where depth of one image comes from, in place of what the weights say.
 
     Raises:
@@ -68,11 +68,11 @@ def weights_method(
         )
     facts = {"matcher": kind, "weights": path.stem, "weights_sha256": file_sha256(path)}
     if not is_matcher:
-        facts["sees"] = "both views" if is_shown else "left view"
+        facts["input"] = "both views" if is_shown else "left view"
     if matcher is not None:
-        return _matched_by(path, matcher, config, facts, is_shown, with_unlike)
+        return _matched_by(path, matcher, config, facts, is_shown, allow_ood)
     config = replace(config, device=own_device(config.device))
-    net = FakestereoNet.load(path, config=config, answer=answer, with_unlike=with_unlike)
+    net = FakestereoNet.load(path, config=config, answer=answer, allow_ood=allow_ood)
     if is_shown and net.matcher is None:
         raise InputError(
             f"{path}: answers depth of one image, and holds no matcher, which a pair needs. Give "
@@ -91,7 +91,7 @@ def _matched_by(
     config: MatcherConfig,
     facts: dict[str, str],
     is_shown: bool,
-    with_unlike: bool,
+    allow_ood: bool,
 ) -> Method:
     """Build the network of a generator whose view is matched by OpenCV, or by other weights."""
     if matcher == "sgbm":
@@ -102,7 +102,7 @@ def _matched_by(
         facts["matcher_sha256"] = file_sha256(other)
     facts["matcher"] += f" with {name}"
     net = FakestereoNet.load(
-        path, matcher=other, config=used, answer="matched", with_unlike=with_unlike
+        path, matcher=other, config=used, answer="matched", allow_ood=allow_ood
     )
     return Method(f"{path.stem}-{name}", net, {**facts, **config_to_dict(used)}, is_shown)
 
@@ -140,7 +140,7 @@ def baseline_method(name: BaselineName, training: Dataset) -> Method:
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
         "matcher": f"baseline: {name}",
-        "sees": "left view" if name == "nearest" else "no image",
+        "input": "left view" if name == "nearest" else "no image",
         "train": training.name,
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),

@@ -111,7 +111,7 @@ class ImageNetworks:
     answer: Answer | None = None
     """own: the generator's own disparity; matched: the matcher on left and synthesised right view;
     joined: both. Default: what the weights say; with --matcher, matched."""
-    with_unlike: bool = False
+    allow_ood: bool = False
     """also answer out-of-distribution images, with a warning (NAME.warning.txt), in
     place of refusing them."""
 

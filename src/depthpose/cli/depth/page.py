@@ -14,7 +14,7 @@ from depthpose.report.depth import DepthError, DepthShown, depth_section
 from depthpose.report.tables import Section, write_page
 
 PAGE = "report.html"
-_SAID_ABOVE = ("method", "sees", "speed", "weights", "protocol", "dataset")
+_SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
 
 
 def write_depth_page(

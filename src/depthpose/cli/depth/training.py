@@ -40,7 +40,7 @@ class PairsOptions:
         if not hasattr(chosen, "held_out"):
             raise InputError(
                 "--held-out has no meaning for 'adapt', which holds out a share of the pairs "
-                "itself (kept_back in the config); leave it out."
+                "itself (validation_share in the config); leave it out."
             )
         held_out = chosen.held_out or PairsConfig(
             focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
@@ -153,7 +153,7 @@ def calibrate(
 
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
-    from depthpose.depth import unlike
+    from depthpose.depth import out_of_distribution
     from depthpose.depth.datasets import join_datasets, open_dataset
     from depthpose.depth.estimator import FakestereoNet
 
@@ -161,10 +161,10 @@ def calibrate(
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
-    net = FakestereoNet.load(path, config=MatcherConfig(device=device), with_unlike=True)
+    net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
-    known = unlike.measure_familiarity(net, map(dataset.read_input, shown))
-    least = unlike.calibrate(path, known, alarm_share, out)
+    known = out_of_distribution.measure_image_confidence(net, map(dataset.read_input, shown))
+    least = out_of_distribution.calibrate(path, known, alarm_share, out)
     print(f"{len(known)} images: mean confidence {min(known):.3f} to {max(known):.3f}")
     print(f"refused below {least:.3f}; calibrated weights: {out}")
     return 0

@@ -102,9 +102,13 @@ def train(
     chosen = learnt.applied(chosen, config)
     is_first = find_rank().rank == 0
     with progress_bar(training.view) as on_step:
-        tell = partial(print, flush=True) if is_first else None
+        on_message = partial(print, flush=True) if is_first else None
         run = Run(
-            folder=out, resume=training.resume, finish=training.finish, on_step=on_step, tell=tell
+            folder=out,
+            resume=training.resume,
+            finish=training.finish,
+            on_step=on_step,
+            on_message=on_message,
         )
         path = run_stage(chosen, run)
     if is_first:

@@ -26,14 +26,14 @@ class Run:
         resume: go on from its last state.
         finish: make weights of its last state, without another step.
         on_step: called after each optimiser step.
-        tell: called with each message for the user.
+        on_message: called with each message for the user.
     """
 
     folder: Path
     resume: bool = False
     finish: bool = False
     on_step: Callable[[Progress], None] | None = None
-    tell: Callable[[str], None] | None = None
+    on_message: Callable[[str], None] | None = None
 
     def claim(
         self,

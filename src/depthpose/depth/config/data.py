@@ -20,7 +20,7 @@ class DegradeConfig:
     hue_share: float = 0.1
     """Share of images whose channels are exchanged."""
 
-    veil_share: float = 0.2
+    haze_share: float = 0.2
     """Share of images with haze."""
 
     glare_share: float = 0.2
@@ -43,7 +43,7 @@ class DegradeConfig:
 
     def __post_init__(self) -> None:
         """Refuse shares that are none."""
-        for name in ("hue", "veil", "glare", "blur", "noise", "jpeg"):
+        for name in ("hue", "haze", "glare", "blur", "noise", "jpeg"):
             share = getattr(self, f"{name}_share")
             if not 0 <= share <= 1:
                 raise InputError(f"{name}_share must be from 0 to 1, got {share}")
@@ -73,7 +73,7 @@ class AugmentConfig:
     flip_share: float = 0.5
     """Share of pairs that are mirrored and swapped."""
 
-    apart: DegradeConfig | None = None
+    per_view: DegradeConfig | None = None
     """Changes of each view on its own, as two cameras differ; None: none."""
 
     erased_share: float = 0.0

@@ -38,7 +38,12 @@ from depthpose.depth.estimator.rig import (
     square_camera,
 )
 from depthpose.depth.stereo import CameraMatcher, Matcher
-from depthpose.depth.synthesis import Drawn, Synthesiser, make_synthesiser, openvino_generator
+from depthpose.depth.synthesis import (
+    SynthesisedViews,
+    Synthesiser,
+    make_synthesiser,
+    openvino_generator,
+)
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
 
@@ -64,7 +69,7 @@ class FakestereoNet:
         synthesiser: left view to right view; None matches real pairs only.
         terms: of the weights, where they bind whoever uses them.
         weights: what they are called.
-        with_unlike: answer images that are unlike what the weights know too, with a
+        allow_ood: answer images that are unlike what the weights know too, with a
             ``warning`` in the estimate, in place of refusing them.
     """
 
@@ -75,7 +80,7 @@ class FakestereoNet:
         *,
         terms: str = "",
         weights: str = "",
-        with_unlike: bool = False,
+        allow_ood: bool = False,
     ) -> None:
         if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
             raise InputError(
@@ -85,7 +90,7 @@ class FakestereoNet:
         self.matcher = matcher
         self.synthesiser = synthesiser
         self.terms = terms
-        self.with_unlike = with_unlike
+        self.allow_ood = allow_ood
         self.weights = weights
 
     def __repr__(self) -> str:
@@ -105,7 +110,7 @@ class FakestereoNet:
         matcher: str | Path | Matcher | None = None,
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
-        with_unlike: bool = False,
+        allow_ood: bool = False,
         engine: str = "torch",
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
@@ -121,7 +126,7 @@ class FakestereoNet:
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
-            with_unlike: answer images that are unlike what the weights know too, with a
+            allow_ood: answer images that are unlike what the weights know too, with a
                 ``warning`` in the estimate, in place of refusing them.
             engine: what computes a generator that selects on the processor: torch, or openvino
                 (extra ``openvino``), half the network's time after some seconds, in ``config``'s
@@ -155,7 +160,7 @@ class FakestereoNet:
         if engine == "openvino":
             generator = openvino_generator(generator, run.device, run.precision)
         synthesiser = make_synthesiser(generator, run.device)
-        return cls(chosen, synthesiser, terms=terms, weights=said, with_unlike=with_unlike)
+        return cls(chosen, synthesiser, terms=terms, weights=said, allow_ood=allow_ood)
 
     from_pretrained = load
     """The same as :meth:`load`."""
@@ -272,31 +277,31 @@ class FakestereoNet:
             return found
         known = [float(confidence.mean()) for confidence in drawn.confidence]
         return [
-            self._checked_familiarity(image.name, replace(one, familiarity=familiarity))
-            for image, one, familiarity in zip(images, found, known, strict=True)
+            self._check_distribution(image.name, replace(one, image_confidence=image_confidence))
+            for image, one, image_confidence in zip(images, found, known, strict=True)
         ]
 
-    def _checked_familiarity(self, name: str, found: DepthEstimate) -> DepthEstimate:
+    def _check_distribution(self, name: str, found: DepthEstimate) -> DepthEstimate:
         """Refuse an image that is unlike what the weights know, or warn of it."""
         assert self.synthesiser is not None, "checked before"
-        assert found.familiarity is not None
+        assert found.image_confidence is not None
         rig = self.synthesiser.config
         least = rig.least_confidence if isinstance(rig, SelectionConfig) else 0.0
-        if found.familiarity >= least:
+        if found.image_confidence >= least:
             return found
         said = (
-            f"out of distribution for these weights (mean confidence {found.familiarity:.2f}, "
+            f"out of distribution for these weights (mean confidence {found.image_confidence:.2f}, "
             f"below {least:.2f}), so its depth is a guess"
         )
-        if not self.with_unlike:
+        if not self.allow_ood:
             raise InputError(
                 f"{name}: {said}. Check that it is upright and that the focal length is its own; "
-                "--with-unlike (in Python, with_unlike=True) answers it all the same."
+                "--allow-ood (in Python, allow_ood=True) answers it all the same."
             )
         return replace(found, warning=said)
 
     def _disparities(
-        self, left: Float[Tensor, "b 3 h w"], drawn: Drawn, camera: Camera
+        self, left: Float[Tensor, "b 3 h w"], drawn: SynthesisedViews, camera: Camera
     ) -> list[Match]:
         """Take the generator's own disparity, the matcher's, or both, as its weights say."""
         assert self.synthesiser is not None, "checked before"

@@ -32,14 +32,14 @@ class Source(Row):
 
     Attributes:
         method: its name.
-        sees: which images it was given.
+        input: which images it was given.
         speed: of a matcher of real pairs.
         weights: name of the file.
         weights_sha256: the first 12 digits.
     """
 
     method: str
-    sees: str = ""
+    input: str = ""
     speed: str = ""
     weights: str = ""
     weights_sha256: str = ""
@@ -51,7 +51,7 @@ class MeanRow(Row):
 
     Attributes:
         method: as in :class:`Source`, like the next four; None: not known.
-        sees: which images it was given.
+        input: which images it was given.
         speed: of a matcher of real pairs.
         weights: name of the file.
         weights_sha256: the first 12 digits.
@@ -66,7 +66,7 @@ class MeanRow(Row):
     """
 
     method: str | None = None
-    sees: str | None = None
+    input: str | None = None
     speed: str | None = None
     weights: str | None = None
     weights_sha256: str | None = None
@@ -84,7 +84,7 @@ class FrameRow(Row):
     """Numbers of one frame; the fields are those of :class:`MeanRow`, ``frame`` is its name."""
 
     method: str | None = None
-    sees: str | None = None
+    input: str | None = None
     speed: str | None = None
     weights: str | None = None
     protocol: str
@@ -108,7 +108,7 @@ class DecileRow(Row):
     """
 
     method: str | None = None
-    sees: str | None = None
+    input: str | None = None
     speed: str | None = None
     weights: str | None = None
     protocol: str

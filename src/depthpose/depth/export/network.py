@@ -136,7 +136,7 @@ def gathered_volume(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DrawnValues:
-    """What a generator answers: :class:`~depthpose.depth.synthesis.Drawn`, as values of a graph."""
+    """:class:`~depthpose.depth.synthesis.SynthesisedViews` as values of a graph."""
 
     right: Value
     disparity_px: Value | None = None

@@ -124,7 +124,7 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None
     matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
     # The scenes of the proof need not be like the images that the weights were trained on.
-    net = FakestereoNet(matcher, make_synthesiser(weights.generator), with_unlike=True)
+    net = FakestereoNet(matcher, make_synthesiser(weights.generator), allow_ood=True)
     sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
     for size in _SIZES:
         scenes, _ = _scenes(*size)
@@ -180,8 +180,8 @@ def _under_sky(images: Tensor) -> Tensor:
     """Lay a bright, smooth sky over the upper two fifths, for weights that know the sky."""
     rows = images.shape[2] * 2 // 5
     sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, rows)[:, None]
-    veiled = torch.lerp(images[:, :, :rows], sky, 0.97)
-    return torch.cat([veiled, images[:, :, rows:]], 2)
+    hazy = torch.lerp(images[:, :, :rows], sky, 0.97)
+    return torch.cat([hazy, images[:, :, rows:]], 2)
 
 
 def _scenes(rows: int, columns: int, share: float, count: int) -> tuple[Tensor, Tensor]:

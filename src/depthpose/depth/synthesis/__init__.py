@@ -9,21 +9,21 @@ from depthpose.depth.synthesis.generator import (
 from depthpose.depth.synthesis.openvino import openvino_generator
 from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
-    Drawn,
     Generator,
     SelectionSynthesiser,
+    SynthesisedViews,
     Synthesiser,
     UNetSynthesiser,
     make_synthesiser,
 )
 
 __all__ = [
-    "Drawn",
     "Generator",
     "PatchDiscriminator",
     "PixelDiscriminator",
     "SelectionGenerator",
     "SelectionSynthesiser",
+    "SynthesisedViews",
     "Synthesiser",
     "UNetGenerator",
     "UNetSynthesiser",

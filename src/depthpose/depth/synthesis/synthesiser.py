@@ -30,7 +30,7 @@ COLUMNS_SHARE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Drawn:
+class SynthesisedViews:
     """What a generator answers for left images.
 
     Attributes:
@@ -56,7 +56,7 @@ class Synthesiser(Protocol):
         """The network's settings, and its rig."""
         ...
 
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1]."""
         ...
 
@@ -77,7 +77,7 @@ class SelectionSynthesiser:
         self.config = generator.config
 
     @torch.no_grad()
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1].
 
         Raises:
@@ -91,7 +91,7 @@ class SelectionSynthesiser:
             "confidence": seen.confidence,
             "is_sky": seen.is_sky,
         }
-        return Drawn(**{name: part.to(left.device) for name, part in parts.items()})
+        return SynthesisedViews(**{name: part.to(left.device) for name, part in parts.items()})
 
 
 class UNetSynthesiser:
@@ -110,7 +110,7 @@ class UNetSynthesiser:
             _keep_training(self.generator)
 
     @torch.no_grad()
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> Drawn:
+    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1].
 
         Raises:
@@ -120,7 +120,7 @@ class UNetSynthesiser:
         # The statistics of test mode 'batch' are those of one image: a batch would change them.
         groups = given.split(1) if self.config.test_mode == "batch" else [given]
         drawn = [draw_right(self.generator, part) for part in groups]
-        return Drawn(right=torch.cat(drawn).to(left.device))
+        return SynthesisedViews(right=torch.cat(drawn).to(left.device))
 
 
 def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tensor, "b 3 h w"]:

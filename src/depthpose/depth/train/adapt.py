@@ -72,7 +72,7 @@ class AdaptTask:
         yield Update("matcher", loss, facts)
 
     def validate(self) -> ValidationResult:
-        """Nothing: what was kept back is looked at once, at the end."""
+        """Nothing: the held-out pairs are looked at once, at the end."""
         return ValidationResult()
 
 
@@ -102,7 +102,7 @@ def _photometric_loss(
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptMetrics:
-    """What a matcher does on pairs that were kept back, and on synthetic streets.
+    """What a matcher does on held-out pairs, and on synthetic streets.
 
     Attributes:
         photometric: difference of left views and right ones looked up, where the start's two
@@ -177,7 +177,7 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
     """Refuse a matcher that lost more than it gained.
 
     Raises:
-        InputError: the pairs that were kept back fit no better, by one of both measures worse, or
+        InputError: the held-out pairs fit no better, by one of both measures worse, or
             the streets are matched much worse.
     """
     said = f"before {asdict(before)}, after {asdict(after)}"
@@ -191,7 +191,7 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
     ]
     # NaN, where no pixel could be compared, is no gain either.
     if not (all(c <= _NOTHING for c in changes) and any(c <= -_NOTHING for c in changes)):
-        raise InputError(f"the pairs that were kept back fit no better: {said}; {advice}.")
+        raise InputError(f"the held-out pairs fit no better: {said}; {advice}.")
     if after.street_d1 > before.street_d1 + _FORGOTTEN:
         raise InputError(
             f"synthetic streets are matched worse by more than {_FORGOTTEN:.1%} bad disparities: "
@@ -200,11 +200,11 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
 
 
 def split_pairs(
-    folder: str, split: str | None, kept_back: int, exclude: Sequence[str] = ()
+    folder: str, split: str | None, share: float, exclude: Sequence[str] = ()
 ) -> tuple[Dataset, list[int]]:
-    """Open a folder of pairs; give the numbers of those that are kept back, evenly spread.
+    """Open a folder of pairs; give the numbers of the last ones, which are held out.
 
-    Frames that ``exclude`` names are neither trained on nor kept back.
+    Frames that ``exclude`` names are neither trained on nor held out.
 
     Raises:
         InputError: fewer than two pairs with calibration.
@@ -220,17 +220,18 @@ def split_pairs(
             f"{dataset.name}: {len(usable)} of {len(dataset.frames)} frames have a right view and "
             "a calibration; two at least are needed, one to train on and one to measure by"
         )
-    return dataset, usable[:: max(min(kept_back, len(usable)), 2)]
+    number = min(max(1, round(share * len(usable))), len(usable) - 1)
+    return dataset, usable[-number:]
 
 
 def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
-    """Give the focal length of a fine match of the first pair, not enlarged beyond the pair [px].
+    """Give the focal length of a fine match of the first held-out pair, not enlarged [px].
 
     Raises:
         InputError: the first folder has fewer than two pairs with calibration.
     """
     folder, split = config.pairs.folders[0], config.pairs.split
-    dataset, back = split_pairs(folder, split, config.kept_back, config.pairs.exclude)
+    dataset, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
     camera = dataset.read_input(back[0]).camera
     assert camera is not None, "pairs with a calibration"
     matcher = make_matcher(network, MatcherConfig())
@@ -244,7 +245,7 @@ def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
     rows = [
         f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |" for name, old in vars(before).items()
     ]
-    head = ["Pairs that were kept back, and synthetic streets:", "", "| | before | after |"]
+    head = ["Held-out pairs, and synthetic streets:", "", "| | before | after |"]
     return "\n".join([*head, "| --- | --- | --- |", *rows])
 
 
@@ -257,7 +258,7 @@ def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[
     net = FakestereoNet.load(path, matcher=path)
     for number, folder in enumerate(config.pairs.folders):
         split = config.pairs.split if number == 0 else None
-        dataset, back = split_pairs(folder, split, config.kept_back, config.pairs.exclude)
+        dataset, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
         kept += [dataset.read_input(n) for n in back]
         excluded += [dataset.frames[n].name for n in back]
         settings = {"dataset": dataset.name, "weights_sha256": file_sha256(path), **asdict(_LIMITS)}

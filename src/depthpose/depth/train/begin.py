@@ -23,11 +23,11 @@ _CAN_BE_ADDED = ("with_agreement", "with_refinement")
 
 def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
     """Refuse to keep the first layers of an encoder that begins at random."""
-    if config.with_fixed_start and config.encoder is None and config.start is None:
+    if config.with_frozen_stem and config.encoder is None and config.start is None:
         raise InputError(
-            "with_fixed_start keeps the encoder's first layers as they are, and nothing says what "
+            "with_frozen_stem keeps the encoder's first layers as they are, and nothing says what "
             "they begin with: give --encoder ('depthpose weights import efficientnet-lite0'), "
-            "--start, or with_fixed_start: false with encoder_rate: 1.0."
+            "--start, or with_frozen_stem: false with encoder_rate: 1.0."
         )
 
 

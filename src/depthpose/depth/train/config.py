@@ -77,7 +77,7 @@ class SelectTraining:
     start: str | None = None
     """Weights of the whole generator to begin with (or a whole set)."""
 
-    with_fixed_start: bool = True
+    with_frozen_stem: bool = True
     """Keep the encoder's first layers and its batch norm statistics: right for ImageNet's weights,
     wrong for an encoder that begins at random."""
 
@@ -158,7 +158,7 @@ class StereoTraining:
     """light: weights of the encoder to begin with ('depthpose weights import
     efficientnet-lite0')."""
 
-    with_fixed_start: bool = True
+    with_frozen_stem: bool = True
     """light: keep the encoder's first layers and its batch norm statistics: right for ImageNet's
     weights, wrong for an encoder that begins at random."""
 
@@ -207,8 +207,9 @@ class AdaptTraining:
     label_weight: float = 0.1
     """Weight of the error to what the start itself found, where both views agreed."""
 
-    kept_back: int = 5
-    """One pair of so many is not trained on: by these the result is accepted or refused."""
+    validation_share: float = 0.2
+    """Share of the pairs, the last of each folder by name, that are not trained on: by these the
+    result is accepted or refused. The last ones, because neighbours in a recording look alike."""
 
     streets: int = 8
     """Synthetic streets by which forgetting is measured; 0: it is not."""
@@ -224,7 +225,7 @@ class AdaptTraining:
         )
     )
     """Pairs of the rig, with calibration; their truth is not used. Views must not be changed
-    apart."""
+    each on its own."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(steps=200, batch_size=1, save_every_steps=50)
@@ -232,23 +233,23 @@ class AdaptTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and counts that are none, and views that are changed apart."""
+        """Refuse weights and counts that are none, and views changed each on its own."""
         weights = (self.photometric_weight, self.smooth_weight, self.label_weight)
         if min(weights) < 0 or max(weights) == 0:
             raise InputError(
                 "photometric_weight, smooth_weight and label_weight must be 0 or more, and one "
                 f"above 0; got {weights}"
             )
-        if self.kept_back < 2 or self.streets < 0:
+        if not 0 < self.validation_share < 1 or self.streets < 0:
             raise InputError(
-                f"kept_back must be 2 or more and streets 0 or more, got {self.kept_back} and "
-                f"{self.streets}"
+                "validation_share must be above 0 and below 1 and streets 0 or more, got "
+                f"{self.validation_share:g} and {self.streets}"
             )
         augment = self.pairs.augment
-        if augment.apart is not None or augment.erased_share or augment.misaligned_px:
+        if augment.per_view is not None or augment.erased_share or augment.misaligned_px:
             raise InputError(
-                "pairs.augment changes views apart (apart, erased_share or misaligned_px), and "
-                "this training compares them with each other; leave these out"
+                "pairs.augment changes each view on its own (per_view, erased_share or "
+                "misaligned_px), and this training compares them; omit these"
             )
 
 

@@ -99,7 +99,7 @@ class SelectTask:
     ) -> None:
         self.config, self.held_out = config, held_out
         self.generator = generator
-        if config.with_fixed_start:
+        if config.with_frozen_stem:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
@@ -114,7 +114,7 @@ class SelectTask:
 
     def _train(self) -> None:
         self.generator.train()
-        if self.config.with_fixed_start:
+        if self.config.with_frozen_stem:
             self.generator.encoder.keep_statistics()
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:

@@ -36,7 +36,7 @@ class StereoTask:
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
-        self._fixed = matcher.encoder if config.with_fixed_start else None
+        self._fixed = matcher.encoder if config.with_frozen_stem else None
         if self._fixed is not None:
             self._fixed.freeze_early()
         self._train()

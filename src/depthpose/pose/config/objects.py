@@ -25,7 +25,7 @@ class SensorConfig:
     noise: tuple[float, float] = (0.5, 1.5)
     """Times the noise of the kind."""
 
-    alike_px: tuple[float, float] | None = None
+    noise_correlation_px: tuple[float, float] | None = None
     """Correlation length of the noise (deviation of the Gaussian that smooths it), in pixels of the
     full image; None: 3 to 6 for ``active stereo``, else every pixel has its own. Measured on planes
     by ``bench/sensors.py``: a Kinect 3, a RealSense 5."""
@@ -39,8 +39,8 @@ class SensorConfig:
         if not self.kinds or any(kind not in known for kind in self.kinds):
             raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
         _refuse_range("noise", self.noise, (0.0, MOST_NOISE), "(0.5, 1.5)")
-        if self.alike_px is not None:
-            _refuse_range("alike_px", self.alike_px, (0.0, 30.0), "(3, 6)")
+        if self.noise_correlation_px is not None:
+            _refuse_range("noise_correlation_px", self.noise_correlation_px, (0.0, 30.0), "(3, 6)")
         _refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
 
 

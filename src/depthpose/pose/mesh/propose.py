@@ -164,7 +164,7 @@ def symmetries_from_proposals(
 
 def with_found_symmetries(
     model: ObjectModel,
-    tell: Callable[[str], None] | None,
+    on_message: Callable[[str], None] | None,
     *,
     is_taken: bool,
     tolerance: float = 0.02,
@@ -173,11 +173,12 @@ def with_found_symmetries(
 
     Args:
         model: a mesh, or points with normals.
-        tell: called with what was found, taken or not; None: nothing is searched that is not taken.
+        on_message: called with what was found, taken or not; None: symmetries that are not taken
+            are not searched.
         is_taken: give the model these symmetries.
         tolerance: as for :func:`propose_symmetries`.
     """
-    if not (is_taken or tell) or not model.symmetries.is_none:
+    if not (is_taken or on_message) or not model.symmetries.is_none:
         return model
     proposals = propose_symmetries(model, tolerance)
     found = replace(symmetries_from_proposals(proposals), is_found=True)
@@ -185,8 +186,8 @@ def with_found_symmetries(
         return model
     turns = 0 if found.discrete is None else len(found.discrete.R)
     certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
-    if tell is not None:
-        tell(
+    if on_message is not None:
+        on_message(
             f"{model.name}: looks the same after {turns} turns, about {len(found.continuous)} axes "
             f"(certainty {certainty:.2f} and more); "
             + (

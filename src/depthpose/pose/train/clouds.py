@@ -213,13 +213,13 @@ def _rolled(sample: CloudSample, angle_rad: float) -> CloudSample:
 
 
 def read_models(
-    config: ModelsConfig, tell: Callable[[str], None] | None = None
+    config: ModelsConfig, on_message: Callable[[str], None] | None = None
 ) -> tuple[ObjectModel, ...]:
     """Read the models that a training names.
 
     Args:
         config: which.
-        tell: called with symmetries that were found and are not declared, taken or not.
+        on_message: called with symmetries that were found and are not declared, taken or not.
 
     Raises:
         InputError: none is named, or of two kinds, two have one name, or a file is damaged.
@@ -235,7 +235,7 @@ def read_models(
     return tuple(
         with_found_symmetries(
             model,
-            tell,
+            on_message,
             is_taken=config.with_found_symmetries,
             tolerance=config.symmetry_tolerance,
         )

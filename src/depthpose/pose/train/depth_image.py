@@ -174,7 +174,7 @@ class DepthImageTask:
 def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     """Train the regression of depth images; give its weights file."""
     torch.manual_seed(config.loop.seed)
-    models = read_models(config.models, run.tell)
+    models = read_models(config.models, run.on_message)
     config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
     network = DepthImageNet(config.network)
     if config.start is not None:

@@ -48,7 +48,7 @@ _STATISTICS_CLOUDS = 64
 def train_pose(config: PoseTraining, run: Run) -> Path:
     """Train a network of directions, ours or the PointNet; give its weights file."""
     torch.manual_seed(config.loop.seed)
-    models = read_models(config.models, run.tell)
+    models = read_models(config.models, run.on_message)
     config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
     clouds = TrainingClouds(
         models,
@@ -65,8 +65,10 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     claim_run(config, run, config.models.cad)
     task = PoseTask(network, models, config, held_out)
     seconds = run.train(task, clouds, config.loop)
-    if run.tell is not None:
-        run.tell("trained; now the refusal is calibrated and measured on synthetic views: minutes")
+    if run.on_message is not None:
+        run.on_message(
+            "trained; now the refusal is calibrated and measured on synthetic views: minutes"
+        )
     if isinstance(network, PointNet):
         return _leave(run.folder / "pointnet.safetensors", network, models, config, seconds)
     return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)

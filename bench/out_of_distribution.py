@@ -1,6 +1,6 @@
 """Images that weights refuse as unlike those of their training: real streets, and other images.
 
-    python bench/unlike.py --samples $DEPTHPOSE_DATA [--weights default kitti-nc]
+    python bench/out_of_distribution.py --samples $DEPTHPOSE_DATA [--weights default kitti-nc]
 
 Streets: KITTI's, KITTI-360's and those of six cameras of another car (DGP), with their own focal
 lengths. Unlike: scikit-image's pictures, indoor pictures, noise, one colour; streets turned,
@@ -25,8 +25,8 @@ from depthpose.core.files import read_image
 from depthpose.demo.depth import read_motorcycle
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.out_of_distribution import measure_image_confidence
 from depthpose.depth.types import StereoInput
-from depthpose.depth.unlike import measure_familiarity
 from depthpose.report.tables import markdown_table, write_table
 
 PAIRS = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
@@ -107,13 +107,13 @@ def unlike(samples: Path) -> Iterator[tuple[str, StereoInput]]:
 
 def measure(weights: str, samples: Path) -> list[dict[str, Any]]:
     """Give, for each kind of image, how many are refused."""
-    net = FakestereoNet.load(weights, with_unlike=True)
+    net = FakestereoNet.load(weights, allow_ood=True)
     assert net.synthesiser is not None
     least = getattr(net.synthesiser.config, "least_confidence", 0.0)
     found: dict[tuple[str, bool], list[float]] = defaultdict(list)
     for is_known, images in ((True, streets(samples)), (False, unlike(samples))):
         for kind, image in images:
-            found[kind, is_known] += measure_familiarity(net, [image])
+            found[kind, is_known] += measure_image_confidence(net, [image])
     return [
         {
             "weights": weights, "images": kind, "known": is_known, "number": len(values),
@@ -129,7 +129,7 @@ def indoors(weights: str) -> dict[str, Any]:
     sample = read_motorcycle()
     assert sample is not None
     truth_m = sample.truth.depth_m
-    net = FakestereoNet.load(weights, with_unlike=True)
+    net = FakestereoNet.load(weights, allow_ood=True)
     found = net.estimate_pair(dataclasses.replace(sample.input, right=None))
     assert truth_m is not None
     assert found.depth_m is not None
@@ -143,7 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--samples", type=Path, required=True)
     parser.add_argument("--weights", nargs="+", default=["default", "kitti-nc"])
-    parser.add_argument("--out", type=Path, default=Path("out/bench/unlike"))
+    parser.add_argument("--out", type=Path, default=Path("out/bench/out_of_distribution"))
     options = parser.parse_args()
     rows = [row for weights in options.weights for row in measure(weights, options.samples)]
     write_table(options.out, rows, name="unlike")

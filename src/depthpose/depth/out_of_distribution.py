@@ -1,4 +1,4 @@
-"""When an image is unlike what the weights know: the generator's own confidence says so."""
+"""Images out of distribution for a generator, by its own mean confidence."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -15,11 +15,11 @@ from depthpose.depth.weights import BOTH
 _KIND = "selection"
 
 
-def measure_familiarity(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
+def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
     """Give the mean confidence of each image that the generator is given, 0..1.
 
     Args:
-        net: with a generator that selects, and ``with_unlike``.
+        net: with a generator that selects, and ``allow_ood``.
         images: right views are ignored.
 
     Raises:
@@ -27,22 +27,22 @@ def measure_familiarity(net: FakestereoNet, images: Iterable[StereoInput]) -> li
     """
     found: list[float] = []
     for image in images:
-        familiarity = net.estimate_pair(replace(image, right=None)).familiarity
-        if familiarity is None:
+        image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence
+        if image_confidence is None:
             raise InputError(
                 "these weights have no generator with a confidence of its own; take those of "
                 "'depthpose depth train select'"
             )
-        found.append(familiarity)
+        found.append(image_confidence)
     return found
 
 
-def calibrate(weights: Path, familiarity: list[float], alarm_share: float, out: Path) -> float:
+def calibrate(weights: Path, image_confidence: list[float], alarm_share: float, out: Path) -> float:
     """Write weights that refuse all but ``1 - alarm_share`` of images like some that are known.
 
     Args:
         weights: with a generator that selects; its tensors stay as they are.
-        familiarity: of images that the weights shall know (:func:`measure_familiarity`).
+        image_confidence: of images that the weights shall know (:func:`measure_image_confidence`).
         alarm_share: share of these that may be refused, 0..1.
         out: the file of the weights.
 
@@ -52,12 +52,12 @@ def calibrate(weights: Path, familiarity: list[float], alarm_share: float, out: 
     Raises:
         InputError: too few images for that share, or weights of another kind.
     """
-    if not 0 < alarm_share < 1 or len(familiarity) * alarm_share < 1:
+    if not 0 < alarm_share < 1 or len(image_confidence) * alarm_share < 1:
         raise InputError(
-            f"{len(familiarity)} images cannot tell what refuses a share of {alarm_share:g} of "
-            f"them; give {1 / max(alarm_share, 1e-6):.0f} images or more, or a larger share"
+            f"{len(image_confidence)} images cannot say what refuses {alarm_share:g} of them; "
+            f"give {1 / max(alarm_share, 1e-6):.0f} images or more, or a larger share"
         )
-    least = min(round(float(np.quantile(familiarity, alarm_share)), 4), 0.9999)
+    least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
     found = read_checkpoint(weights)
     config = dict(found.config)
     own = config.get(_KIND) if found.kind == BOTH else config if found.kind == _KIND else None
