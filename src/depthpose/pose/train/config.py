@@ -60,7 +60,8 @@ class FramesConfig:
     """Of the samples; the others are synthetic."""
 
     with_roll: bool = True
-    """Turn the camera of a frame about its optical axis at random: as true as the frame."""
+    """Turn the camera of a frame about its optical axis at random: as true as the frame. Of clouds
+    alone; the depth images of the regressing baseline are not turned."""
 
     def __post_init__(self) -> None:
         """Refuse no folder, and shares that are none."""
