@@ -105,10 +105,13 @@ def first_camera(dataset: Dataset) -> StereoRig:
 
 def measure(dataset: Dataset, net: FakestereoNet) -> dict[str, float]:
     """Numbers of one way, over all frames."""
-    names = [frame.name for frame in dataset.frames]
-    readers = [lambda k=k: replace(dataset.read_input(k), right=None) for k in range(len(dataset))]
+    sources = {frame.name: frame.left for frame in dataset.frames}
+    readers = {
+        name: lambda k=k: replace(dataset.read_input(k), right=None)
+        for k, name in enumerate(sources)
+    }
     with tempfile.TemporaryDirectory() as home:
-        for _ in tqdm(predict(net, readers, names, Path(home) / "p", {}), total=len(names)):
+        for _ in tqdm(predict(net, readers, Path(home) / "p", {}, sources), total=len(sources)):
             pass
         (row,) = evaluate(dataset, Path(home) / "p", "eigen-raw-camera", (80.0,)).rows
     return {name: round(row.metrics[name], 4) for name in ("abs_rel", "rmse", "d1", "right_l1")}

@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/bench/out_of_distribution"))
     options = parser.parse_args()
     rows = [row for weights in options.weights for row in measure(weights, options.samples)]
-    write_table(options.out, rows, name="unlike")
+    write_table(options.out, rows, name="out_of_distribution")
     print(markdown_table(rows))
     print(markdown_table([indoors(weights) for weights in options.weights]))
 

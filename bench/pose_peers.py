@@ -66,7 +66,8 @@ def measure(case: RealCase, estimate: PoseEstimate) -> Row:
 def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
     """ADD in diameters to the nearest copy of the truth that the data set declares."""
     truth = case.sample.truth.camera_from_model
-    truth = nearest_copy(pose, truth, symmetry_transforms(case.model.symmetries))
+    declared = case.model.symmetries
+    truth = nearest_copy(pose, truth, symmetry_transforms(declared), declared)
     return float(add_m(pose, truth, points_m)) / case.model.diameter_m
 
 

@@ -184,7 +184,7 @@ def test_a_threshold_is_chosen_on_a_folder(
     (tmp_path / "pairs/calib.txt").write_text("".join(lines))
     words = [str(given), "--data", str(tmp_path / "pairs"), "--out", str(out)]
     assert main(["depth", "calibrate", *words]) == 2
-    assert "3 images cannot tell what refuses a share of 0.01" in capsys.readouterr().err
+    assert "3 images cannot say what refuses 0.01 of them" in capsys.readouterr().err
     assert main(["depth", "calibrate", *words, "--alarm-share", "0.5"]) == 0
     assert "3 images: mean confidence 1.000 to 1.000" in capsys.readouterr().out
     assert read_checkpoint(out).config["least_confidence"] == pytest.approx(1.0, abs=1e-3)
@@ -200,6 +200,9 @@ def test_a_pair_is_matched_by_the_default_weights_where_none_are_named(
         assert main([*pair, str(tmp_path / name), *words]) == 0
         settings = json.loads((tmp_path / name / "run.json").read_text())["settings"]
         assert settings["weights"] == "default"
+    rig.write_text(json.dumps({**CAMERA, "baseline_m": 0.5, "cx_right_minus_left_px": 8.0}))
+    assert main([*pair, str(tmp_path / "none")]) == 2, "the same pairs by another rig"
+    assert "cx_right_minus_left_px" in capsys.readouterr().err
     assert main([*pair, str(tmp_path / "x"), "--matcher", "sgmb"]) == 2
     assert "'sgmb': neither a file nor the name of weights" in capsys.readouterr().err
 

@@ -13,8 +13,8 @@ import pytest
 from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
-from depthpose.core.lock import lock_folder, release_folders, write_once
-from depthpose.core.loop import LoopConfig, train
+from depthpose.core.lock import held_folders, lock_folder, release_folders, write_once
+from depthpose.core.loop import LoopConfig, Run, holds_folder
 from depthpose.core.run import RECORD, claim_folder
 
 HOLDER = """
@@ -79,11 +79,29 @@ def test_a_folder_that_is_let_go_is_free(tmp_path: Path) -> None:
 
 
 def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
-    claim_folder(tmp_path, {"a": 1})
+    """Not after its last step, but when its weights are measured and written."""
     config = LoopConfig(steps=1, batch_size=2, device="cpu")
-    train(ToyTask(), ToySamples(), config, tmp_path)
+
+    @holds_folder
+    def stage(config: LoopConfig, run: Run) -> Path:
+        claim_folder(run.folder, {"a": 1})
+        run.train(ToyTask(), ToySamples(), config)
+        assert held_folders() == {run.folder / RECORD}
+        return run.folder
+
+    stage(config, Run(folder=tmp_path.resolve()))
+    assert not held_folders()
     with holder(tmp_path, 0) as process:
         assert process.wait() == 0
+
+
+def test_a_command_within_another_releases_its_own_folders_alone(tmp_path: Path) -> None:
+    claim_folder(tmp_path / "one", {"a": 1})
+    before = held_folders()
+    claim_folder(tmp_path / "two", {"a": 1})
+    release_folders(but=before)
+    assert held_folders() == before
+    assert len(before) == 1
 
 
 def test_the_first_record_stays(tmp_path: Path) -> None:

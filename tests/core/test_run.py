@@ -11,6 +11,7 @@ from depthpose.core.run import (
     find_rank,
     own_device,
     read_settings,
+    read_sources,
     refuse_among_inputs,
     refuse_to_replace,
     wait_for,
@@ -25,13 +26,35 @@ def test_a_folder_remembers_its_settings(tmp_path: Path) -> None:
 
 def test_other_settings_are_refused_and_nothing_is_lost(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"a": 1})
+    (tmp_path / "result.npy").touch()
     with pytest.raises(InputError, match="made with a = 1, but now it is 2"):
         claim_folder(tmp_path, {"a": 2})
     assert read_settings(tmp_path) == {"a": 1}
 
 
+def test_a_run_that_left_no_result_binds_no_other_to_its_settings(tmp_path: Path) -> None:
+    claim_folder(tmp_path, {"focal_px": 700})
+    claim_names(tmp_path, {"x": tmp_path / "x.png"})
+    claim_folder(tmp_path, {"focal_px": 721})
+    assert read_settings(tmp_path) == {"focal_px": 721}
+    claim_names(tmp_path, {"x": tmp_path / "other/x.png"})
+
+
+def test_an_input_that_has_changed_is_refused(tmp_path: Path) -> None:
+    out, image = tmp_path / "out", tmp_path / "x.png"
+    image.write_bytes(b"one")
+    claim_folder(out, {"a": 1})
+    claim_names(out, {"x": image})
+    claim_names(out, {"x": image})
+    image.write_bytes(b"another")
+    with pytest.raises(InputError, match=r"x\.png: has changed since its result 'x'"):
+        claim_names(out, {"x": image})
+    assert read_sources(out) == {"x": image.resolve()}
+
+
 def test_a_new_setting_counts_as_another(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"a": 1})
+    (tmp_path / "result.npy").touch()
     with pytest.raises(InputError, match="made with b = None, but now it is 2"):
         claim_folder(tmp_path, {"a": 1, "b": 2})
 
@@ -155,6 +178,7 @@ def test_waiting_in_vain_names_what_is_missing() -> None:
 
 def test_a_nested_setting_is_named_by_its_path_and_a_new_one_may_be_off(tmp_path: Path) -> None:
     claim_folder(tmp_path, {"pairs": {"limit": 3}})
+    (tmp_path / "result.npy").touch()
     claim_folder(tmp_path, {"pairs": {"limit": 3, "later": None, "share": 0.0}})
     with pytest.raises(InputError, match=r"pairs\.share = None, but now it is 0\.5"):
         claim_folder(tmp_path, {"pairs": {"limit": 3, "share": 0.5}})

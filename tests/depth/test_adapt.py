@@ -27,6 +27,7 @@ from depthpose.depth.train.adapt import (
     AdaptMetrics,
     AdaptTask,
     fine_focal_px,
+    label_folders,
     refuse_worse,
     split_pairs,
 )
@@ -127,12 +128,12 @@ def test_batch_norm_keeps_its_statistics() -> None:
 
 def test_the_last_fifth_of_the_pairs_is_held_out(tmp_path: Path) -> None:
     folder = write_pairs(tmp_path / "pairs", (0.15,) * 6)
-    assert split_pairs(str(folder), None, 0.2)[1] == [5]
-    assert split_pairs(str(folder), None, 0.34)[1] == [4, 5]
-    assert split_pairs(str(folder), None, 0.01)[1] == [5], "one at least is held out"
-    assert split_pairs(str(folder), None, 0.99)[1] == [1, 2, 3, 4, 5], "one at least is trained on"
+    assert split_pairs(str(folder), None, 0.2)[1:] == ([0, 1, 2, 3, 4], [5])
+    assert split_pairs(str(folder), None, 0.34)[1:] == ([0, 1, 2, 3], [4, 5])
+    assert split_pairs(str(folder), None, 0.01)[2] == [5], "one at least is held out"
+    assert split_pairs(str(folder), None, 0.99)[1] == [0], "one at least is trained on"
     last = split_pairs(str(folder), None, 0.2)[0].frames[5].name
-    assert split_pairs(str(folder), None, 0.2, [last])[1] == [4], "excluded pairs are not held out"
+    assert split_pairs(str(folder), None, 0.2, [last])[1:] == ([0, 1, 2, 3], [4]), "neither"
     lone = write_pairs(tmp_path / "lone", (0.15,))
     with pytest.raises(InputError, match="two at least are needed"):
         split_pairs(str(lone), None, 0.2)
@@ -245,7 +246,7 @@ def test_an_adapted_matcher_carries_its_card(
     assert f"| photometric | {seen[0].photometric:.4g} | {seen[1].photometric:.4g} |" in card
     assert "depth train adapt" in card
     labelled = tmp_path / "out/labels/0-pairs/disp_occ"
-    assert len(list(labelled.iterdir())) == 3
+    assert [path.stem for path in sorted(labelled.iterdir())] == ["00", "01"], "02 is held out"
 
 
 def test_views_that_are_changed_apart_are_refused() -> None:
@@ -271,3 +272,15 @@ def test_what_adapt_cannot_use_is_refused(
 ) -> None:
     assert main(["depth", "train", "adapt", "--out", str(tmp_path / "out"), *words]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_frames_that_are_excluded_are_neither_labelled_nor_missed(
+    tmp_path: Path, start: Path
+) -> None:
+    config = config_of(tmp_path, start, 1e-3)
+    (tmp_path / "pairs/right/00.png").unlink()
+    for names, labelled in (((), ["01"]), (("00",), ["01"])):
+        given = dataclasses.replace(config, pairs=dataclasses.replace(config.pairs, exclude=names))
+        pairs, kept = label_folders(given, tmp_path / "labels")
+        assert [frame.name for frame in open_dataset(pairs.folders[0]).frames] == labelled
+        assert [pair.name for pair in kept] == ["02"]

@@ -353,7 +353,7 @@ def test_code_for_the_pipeline_of_transformers_runs(generator: UNetGenerator) ->
     torch.testing.assert_close(one["predicted_depth"], net.estimate(RGB, focal_px=45.0).depth_m)
     with pytest.raises(InputError, match="task is 'image-segmentation'; Known: 'depth-estimation'"):
         depthpose.pipeline("image-segmentation")
-    assert depthpose.pipeline("depth-estimation").net.weights == "default"
+    assert depthpose.pipeline("depth-estimation", device=-1).net.weights == "default"
 
 
 def constant_matcher(disparity_px: float) -> CallableMatcher:
@@ -502,7 +502,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
     assert isinstance(found, SelectionGenerator)
     assert found.config.least_confidence == least
     assert read_checkpoint(out).facts == read_checkpoint(given).facts
-    with pytest.raises(InputError, match=r"7 images cannot tell what refuses a share of 0\.01"):
+    with pytest.raises(InputError, match=r"7 images cannot say what refuses 0\.01 of them"):
         calibrate(given, [*known, 0.1, 0.9], 0.01, out)
 
 
@@ -566,3 +566,21 @@ def test_at_the_focal_length_of_training_there_is_one_speed() -> None:
     quick, fine = (speed_of(network, s).match_many(pairs, seen) for s in ("quick", "fine"))
     for one, other in zip(quick, fine, strict=True):
         assert torch.equal(one.disparity_px, other.disparity_px)
+
+
+def test_a_focal_length_in_millimetres_is_refused() -> None:
+    net = FakestereoNet(None, make_synthesiser(sure_of(3)))
+    with pytest.raises(InputError, match=r"4\.2 px would enlarge .* is it in millimetres\?"):
+        net.estimate(torch.rand(3, 750, 1000), focal_px=4.2)
+
+
+def test_results_can_be_changed_in_place_and_pictures_be_of_any_byte_order() -> None:
+    net = FakestereoNet(None, make_synthesiser(sure_of(3)))
+    picture = torch.rand(40, 60, 3).numpy()
+    plain = net.estimate(picture, focal_px=45.0).depth_m
+    other = net.estimate(picture.astype(">f4"), focal_px=45.0).depth_m
+    assert plain is not None
+    assert other is not None
+    torch.testing.assert_close(plain, other)
+    plain[plain > 1.0] = 0.0
+    assert float(plain.nan_to_num(0.0).max()) <= 1.0

@@ -147,7 +147,7 @@ def test_a_perfect_prediction_has_no_error_at_any_cap(
 
 def test_a_frame_without_any_usable_pixel_is_said(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: torch.full_like(d, torch.nan))
-    with pytest.raises(InputError, match="no pixel to compare"):
+    with pytest.raises(InputError, match="no prediction has a pixel where there is truth"):
         evaluate(pairs, folder, "kitti-2015")
 
 
@@ -228,14 +228,18 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
         return torch.full(tuple(left.shape[-2:]), 3.0)
 
     net = FakestereoNet(CallableMatcher(answer))
-    names = [frame.name for frame in pairs.frames]
-    readers = [lambda i=i: pairs.read_input(i) for i in range(3)]
-    first = iter(predict(net, readers, names, tmp_path / "p", {"method": "constant"}))
+    sources = {frame.name: frame.left for frame in pairs.frames}
+    readers = {name: lambda i=i: pairs.read_input(i) for i, name in enumerate(sources)}
+    constant = {"method": "constant"}
+    first = iter(predict(net, readers, tmp_path / "p", constant, sources))
     assert next(first) == "a"
-    assert len(list(predict(net, readers, names, tmp_path / "p", {"method": "constant"}))) == 3
+    assert len(list(predict(net, readers, tmp_path / "p", constant, sources))) == 3
     assert len(calls) == 3
     with pytest.raises(InputError, match="Two settings never share a folder"):
-        list(predict(net, readers, names, tmp_path / "p", {"method": "another"}))
+        list(predict(net, readers, tmp_path / "p", {"method": "another"}, sources))
+    others = {name: tmp_path / f"other/{name}.png" for name in sources}
+    with pytest.raises(InputError, match="'a' is the result of"):
+        list(predict(net, readers, tmp_path / "p", constant, others))
 
 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
@@ -296,3 +300,40 @@ def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:
         again = Measured.from_values(json.loads(json.dumps(found[0].to_values())))
         assert again.to_values() == found[0].to_values()
         assert (again.frame, again.cap_m) == ("a", None if protocol == "kitti-2015" else 80.0)
+
+
+def test_a_frame_beyond_the_cap_is_left_out_and_one_without_an_answer_counts_as_uncovered(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    """Truth of 'b' lies at 8 m and more; of the predictions of 'a' and 'b' one is NaN alone."""
+    home = tmp_path / "p"
+    write_predictions(home, lambda px: px)
+    a_m = depth_from_disparity(truth_px(0), rig())
+    b_m = depth_from_disparity(truth_px(1), rig())
+    nearest_a, nearest_b = float(a_m.min()), float(b_m.min())
+    assert nearest_b < nearest_a
+    cap_m = (nearest_a + nearest_b) / 2
+    found = evaluate(pairs, home, "eigen-improved", (80.0, cap_m))
+    assert [(row.cap_m, row.frames) for row in found.rows] == [(80.0, 2), (cap_m, 1)]
+    alone = evaluate(pairs, home, "eigen-improved", (cap_m,))
+    assert alone.skipped["a"] == "no truth within the caps and the crop"
+    write_map(home / "a.disparity_px.npy", torch.full((H, W), torch.nan))
+    (row,) = evaluate(pairs, home, "eigen-improved", (80.0,)).rows
+    assert (row.frames, row.coverage) == (2, 0.5)
+    assert row.metrics["abs_rel"] == pytest.approx(0, abs=1e-3)
+    write_map(home / "b.disparity_px.npy", torch.full((H, W), torch.nan))
+    with pytest.raises(InputError, match="no prediction has a pixel where there is truth"):
+        evaluate(pairs, home, "eigen-improved", (80.0,))
+
+
+def test_far_points_of_a_rig_with_principal_points_apart_are_no_mistake(tmp_path: Path) -> None:
+    """At 30 m their disparity is 80 x 0.5 / 30 - 8, which is negative."""
+    apart = replace(rig(), cx_right_minus_left_px=8.0)
+    home, depth_m = tmp_path / "data", torch.full((H, W), 30.0)
+    for side in ("left", "right"):
+        write_image(home / side / "a.png", torch.rand(3, H, W))
+    write_depth_png(home / "lidar_depth/a.png", depth_m)
+    write_camera(home / "camera.json", apart)
+    write_map(tmp_path / "p/a.depth_m.npy", depth_m)
+    (row,) = evaluate(open_dataset(home), tmp_path / "p", "eigen-improved", (80.0,)).rows
+    assert row.metrics["abs_rel"] == pytest.approx(0, abs=1e-4)

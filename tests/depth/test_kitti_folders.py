@@ -146,6 +146,27 @@ def test_the_baseline_is_that_of_the_calibration_and_so_is_doffs(tmp_path: Path)
     assert rig.cx_right_minus_left_px == 5.0
 
 
+@pytest.mark.parametrize(
+    ("make", "inside", "name"),
+    [
+        (make_middlebury, "Chair", "Chair"),
+        (make_raw, "2011_09_26/2011_09_26_drive_0002_sync", None),
+    ],
+)
+def test_the_working_folder_has_a_name(
+    make: Callable[[Path], None],
+    inside: str,
+    name: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    make(tmp_path)
+    named = [frame.name for frame in open_dataset(tmp_path / inside).frames]
+    assert name is None or named == [name]
+    monkeypatch.chdir(tmp_path / inside)
+    assert [frame.name for frame in open_dataset(".").frames] == named
+
+
 def test_raw_and_object_calibration_draw_the_same_scan(tmp_path: Path) -> None:
     make_raw(tmp_path / "raw")
     make_object(tmp_path / "object")

@@ -91,3 +91,37 @@ def test_the_command_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_limits_that_keep_nothing_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(InputError, match="must be"):
         LabelConfig(**changes)
+
+
+def test_labels_keep_the_whole_rig_and_names_with_blanks(tmp_path: Path) -> None:
+    folder = write_pairs(tmp_path / "pairs", (0.2, 0.25))
+    for side in ("left", "right"):
+        (folder / side / "01.png").rename(folder / side / "image 1.png")
+    (folder / "calib.txt").write_text(
+        "focal_px: 100\nfocal_y_px: 101\ncx: 30\ncy: 20\nbaseline_m: 0.2\n"
+        "cx_right_minus_left_px: 3.5\n"
+    )
+    dataset = open_dataset(folder)
+    list(label_pairs(brightness_matcher(), dataset, LabelConfig(), tmp_path / "out", {}))
+    found = open_dataset(tmp_path / "out")
+    assert [frame.name for frame in found.frames] == ["00", "image 1"]
+    for index in range(2):
+        rig = found.read_rig(index)
+        assert rig is not None
+        assert rig.cx_right_minus_left_px == pytest.approx(3.5)
+        assert torch.equal(rig.K, torch.tensor([[100.0, 0, 30], [0, 101, 20], [0, 0, 1]]).to(rig.K))
+
+
+def test_labels_of_two_folders_go_into_one_if_their_names_differ(tmp_path: Path) -> None:
+    one, other = (write_pairs(tmp_path / name, (0.2,)) for name in ("one", "other"))
+    out = tmp_path / "out"
+    list(label_pairs(brightness_matcher(), open_dataset(one), LabelConfig(), out, {}))
+    with pytest.raises(InputError, match="'00' is the result of"):
+        list(label_pairs(brightness_matcher(), open_dataset(other), LabelConfig(), out, {}))
+    for side in ("left", "right"):
+        (other / side / "00.png").rename(other / side / "02.png")
+    lines = (other / "calib.txt").read_text().replace("00 ", "02 ")
+    (other / "calib.txt").write_text(lines)
+    list(label_pairs(brightness_matcher(), open_dataset(other), LabelConfig(), out, {}))
+    found = open_dataset(out)
+    assert [found.read_input(index).name for index in range(2)] == ["00", "02"]

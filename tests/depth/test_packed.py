@@ -17,7 +17,13 @@ from tests.synthetic_street import write_pairs
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.depth.datasets import Dataset, lidar_truth, open_dataset, pack_frames
+from depthpose.depth.datasets import (
+    Dataset,
+    check_dataset,
+    lidar_truth,
+    open_dataset,
+    pack_frames,
+)
 
 CONFIG = """
 generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [1, 32],
@@ -104,6 +110,11 @@ def test_shards_of_a_store_come_when_they_are_read(
     assert_same(open_dataset(pairs), found)
     with pytest.raises(InputError, match=r"memory://bucket/streets: holds no index\.json"):
         open_dataset(Path("memory://bucket/streets"))
+
+
+def test_packed_pairs_are_checked(pairs: Path, tmp_path: Path) -> None:
+    home = packed(pairs, tmp_path / "shards")
+    assert check_dataset(home).is_ok
 
 
 def test_damaged_shards_are_refused(pairs: Path, tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 import torch.nn.functional as F
 from tests.depth.random_norms import with_random_norms
 
+from depthpose.core.camera import StereoRig
 from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
@@ -248,8 +250,23 @@ def test_tile_change_is_zero_for_one_tile_and_needs_tiles() -> None:
     assert tile_change_px(matcher, left, right) < 1e-5
     matcher = PSMNetMatcher(network, MatcherConfig(tile_px=(32, 48), tile_overlap_px=8))
     assert 0 < tile_change_px(matcher, left, right) < 32
+    assert matcher.config.tile_px == (32, 48), "its config stays"
     with pytest.raises(InputError, match="set tile_px in its config"):
         tile_change_px(PSMNetMatcher(network), left, right)
+
+
+def test_tile_change_is_measured_at_the_size_of_the_match() -> None:
+    """At twice the focal length the network's own, the pair is matched at half its size."""
+    network = random_network(replace(SMALL, work_focal_px=50.0))
+    left, right = torch.rand(2, 3, 64, 96)
+    K = torch.tensor([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]], dtype=torch.float64)
+    rig = StereoRig(width=96, height=64, K=K, baseline_m=0.1)
+    matcher = PSMNetMatcher(
+        network, MatcherConfig(tile_px=(32, 48), tile_overlap_px=8, speed="quick")
+    )
+    assert matcher.work_size(rig) == (32, 48)
+    assert tile_change_px(matcher, left, right, rig) < 1e-5, "one tile"
+    assert tile_change_px(matcher, left, right) > 1e-3
 
 
 def test_left_right_check_lowers_confidence_where_views_disagree() -> None:

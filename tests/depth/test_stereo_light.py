@@ -37,7 +37,7 @@ from depthpose.depth.stereo.light import (
     mean_of_all,
     mean_of_best,
 )
-from depthpose.depth.stereo.matcher import CameraMatcher, TiledMatcher
+from depthpose.depth.stereo.matcher import CameraMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.train import StereoTask
@@ -220,7 +220,6 @@ def test_it_is_a_matcher_of_cameras_and_tiles() -> None:
     fine = make_matcher(network, MatcherConfig(tile_px=(32, 64), tile_overlap_px=8))
     assert isinstance(quick, LightMatcher)
     assert isinstance(fine, CameraMatcher)
-    assert isinstance(fine, TiledMatcher)
     assert quick.work_size(camera) == (32, 64)
     assert fine.work_size(camera) == (96, 192), "small images are enlarged 1.5 times"
     K = torch.tensor([[721.5, 0, 610], [0, 721.5, 173], [0, 0, 1]], dtype=torch.float64)

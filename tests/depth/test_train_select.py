@@ -309,3 +309,15 @@ def test_fixed_layers_need_something_to_begin_with(pairs: PairsConfig, tmp_path:
     config = SelectTraining(generator=TINY, pairs=pairs, loop=LOOP)
     with pytest.raises(InputError, match="nothing says what they begin with: give --encoder"):
         train_select(config, Run(folder=tmp_path))
+
+
+@pytest.mark.parametrize(
+    "change", [{"per_view": DegradeConfig()}, {"erased_share": 0.1}, {"misaligned_px": 1.0}]
+)
+def test_views_changed_each_on_its_own_are_refused(change: dict[str, Any]) -> None:
+    """A lone image, which stands for both views, would become a pair."""
+    pairs = PairsConfig(augment=AugmentConfig(**change))
+    with pytest.raises(InputError, match="changes each view on its own"):
+        SelectTraining(generator=TINY, pairs=pairs)
+    with pytest.raises(InputError, match="changes each view on its own"):
+        SelectTraining(generator=TINY, more=pairs)

@@ -21,13 +21,14 @@ from tests.pose.synthetic_objects import (
 )
 
 import depthpose
-from depthpose.core.camera import Camera, write_camera
+from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
 from depthpose.pose.mesh import make_model, propose_symmetries, symmetries_from_proposals
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -181,6 +182,35 @@ def test_a_ball_whose_symmetries_were_found_is_posed() -> None:
     assert answer.free_motions is not None
     assert answer.free_motions.shape == (3, 6)
     assert float((answer.camera_from_model.t_m - truth.t_m).norm()) < 0.002
+    assert answer.alternatives == (), "every turn of a ball is one pose"
+    assert answer.certainty is None or answer.certainty > 0.9
+
+
+def test_a_part_may_be_longer_than_its_distance() -> None:
+    """A rail of 1.2 m, 0.5 m away: seen, so not centred."""
+    box = trimesh.creation.box((1.2, 0.06, 0.03))
+    vertices_m, faces = torch.from_numpy(np.array(box.vertices)), torch.from_numpy(box.faces)
+    model = make_model(vertices_m, faces, name="rail")
+    turn = rotation_by(torch.tensor([0.7, 0.1, 0.0]))
+    truth = Rigid(turn, torch.tensor([0.02, 0.0, 0.5]))
+    depth_m, mask = view_of(model, truth)
+    view = ViewInput(name="rail", depth_m=depth_m, mask=mask, K=K, object=model.name)
+    cloud = CloudInput(name="rail", points_m=back_project(depth_m, K)[mask], object=model.name)
+    for given in (view, cloud):
+        prepared = prepare_cloud(given, model, CloudConfig(), EstimateConfig())
+        assert isinstance(prepared, Prepared), prepared
+
+
+def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> None:
+    """An organised cloud is mostly NaN."""
+    points_m = cloud_of(part, pose_at()).float()
+    grid = torch.full((150_000, 3), torch.nan)
+    grid[1::7] = torch.finfo(torch.float32).max  # what some sensors write
+    grid[:: 150_000 // len(points_m)][: len(points_m)] = points_m
+    given = CloudInput(name="x", points_m=grid, object=part.name)
+    prepared = prepare_cloud(given, part, CloudConfig(), EstimateConfig())
+    assert isinstance(prepared, Prepared)
+    assert len(prepared.cloud_m) > 0.95 * len(points_m)
 
 
 def test_an_axis_that_nobody_declared_is_not_observable() -> None:

@@ -34,10 +34,10 @@ from depthpose.pose.evaluate import (
     of_targets,
     read_any,
 )
-from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.mesh import symmetry_transforms, turn_about
 from depthpose.pose.metrics import add_m, adds_m, mspd_px, rotation_error_rad
 from depthpose.pose.predictions import Place, write_bop_results, write_predictions
-from depthpose.pose.types import Symmetries
+from depthpose.pose.types import Axis, Symmetries
 
 
 def columns(rows: Sequence[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
@@ -262,3 +262,27 @@ def test_columns_come_in_the_declared_order(synthetic: BopDataset) -> None:
     assert list(found.rows[2].columns()) == list(found.rows[3].columns()) == [*every, *stamp]
     risk = [*who, "coverage", "answers", "least_score", "risk", *stamp]
     assert list(found.risk[0].columns()) == risk
+
+
+def test_turns_about_an_axis_of_revolution_are_no_error() -> None:
+    """Also by angles between the steps of the symmetry, about an axis beside the origin."""
+    true = pose_in_frame(0.0, 3)
+    true = Rigid(true.R.double(), true.t_m.double())
+    upright = Axis(
+        direction=torch.tensor([0.0, 0, 1]).double(), point_m=torch.tensor([0.2, 0, 0]).double()
+    )
+    across = Axis(
+        direction=torch.tensor([1.0, 0, 0]).double(), point_m=torch.tensor([0.2, 0, 0]).double()
+    )
+    bottle, ball = Symmetries(continuous=(upright,)), Symmetries(continuous=(upright, across))
+    turn = turn_about(upright.direction, upright.point_m, torch.tensor(0.123).double())
+    tilt = turn_about(
+        torch.tensor([1.0, 2, 3]).double(), upright.point_m, torch.tensor(1.1).double()
+    )
+    for declared, motion in ((bottle, turn), (ball, tilt)):
+        found = true @ motion
+        copy = nearest_copy(found, true, symmetry_transforms(declared), declared)
+        assert float(rotation_error_rad(found, copy)) < 1e-6
+        assert torch.allclose(found.t_m, copy.t_m, atol=1e-9)
+    tilted = nearest_copy(true @ tilt, true, symmetry_transforms(bottle), bottle)
+    assert float(rotation_error_rad(true @ tilt, tilted)) > 0.5, "a bottle may not be tilted"

@@ -42,6 +42,7 @@ def test_planes_go_and_regions_stay() -> None:
     assert not bool(is_plane[mask].any())
     assert abs(sum(map(len, regions[:2])) - int(mask.sum())) < 0.02 * int(mask.sum())
     assert extent_m(regions[2]) < 0.1
+    assert extent_m(torch.rand(2**20 + 5, 3)) == pytest.approx(1.4, abs=0.1), "of a fine scanner"
     # A wall no wider than an object may be an object's side: it stays.
     assert max(map(len, find_regions(depth_m, K.float(), 5.0)[0])) > 0.5 * 320 * 240
 

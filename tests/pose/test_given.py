@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,3 +71,16 @@ def test_a_crop_may_leave_the_centre_and_a_bare_matrix_may_not() -> None:
     assert torch.equal(view_input(DEPTH_M, MASK, crop, "part", "view").K, off)
     with pytest.raises(InputError, match="K is of another image or size: the principal point"):
         view_input(DEPTH_M, MASK, off, "part", "view")
+
+
+@pytest.mark.parametrize(
+    "kind", ["uint8", "uint16", "uint32", ">u2", "<u4", ">f4", ">f8", "int16", "torch.uint16"]
+)
+def test_depth_of_any_type_of_number(kind: str) -> None:
+    metres = np.full((4, 6), 2.0)
+    depth: np.ndarray | torch.Tensor = metres.astype(kind.removeprefix("torch."))
+    if kind.startswith("torch."):
+        depth = torch.from_numpy(depth)
+    camera = Camera(width=6, height=4, K=torch.tensor([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]).double())
+    view = view_input(depth, None, camera, "cup", "x", "m")
+    assert torch.equal(view.depth_m, torch.full((4, 6), 2.0))

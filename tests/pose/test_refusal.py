@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
+from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.checkpoint import SHIPPED, read_checkpoint
 from depthpose.core.config import config_from_dict
@@ -254,3 +254,19 @@ def test_slopes_of_candidates_are_those_that_made_the_cases() -> None:
     assert all(abs(found[name] - true[name]) < 0.35 for name in names)
     with pytest.raises(InputError, match="no view has several poses that fit"):
         fit_candidate_slopes([])
+
+
+def test_the_reason_gives_the_risk_that_the_estimate_has() -> None:
+    """What takes long is not measured where the rest refuses already; its usual value stands in."""
+    part = bracket()
+    config = RefusalConfig(
+        max_risk=0.01,
+        bias=9.0,
+        slopes={"disagree": 1.0, "size": 1.0},
+        means={"disagree": -3.0, "size": -2.0},
+    )
+    net = Oracle(tiny_weights(part, refusal=config), [pose_at()], noise=0.3)
+    found = net.estimate(cloud=cloud_of(part, pose_at()))
+    assert found.status == "doubtful"
+    assert found.risk is not None
+    assert f"the risk of a wrong pose is {found.risk:.2g}" in found.reason

@@ -110,3 +110,8 @@ def test_models_that_cannot_be_looked_for_are_named() -> None:
         Registration([corners])
     with pytest.raises(InputError, match=r"'mug': the models do not know it"):
         registration().estimate(cloud=torch.ones(30, 3), object="mug")
+
+
+def test_registration_without_icp_is_an_error() -> None:
+    with pytest.raises(InputError, match="registration refines by ICP"):
+        Registration([part()], EstimateConfig(with_icp=False))

@@ -120,6 +120,24 @@ def test_a_cloud_of_the_scene_is_followed_too() -> None:
     assert error_of(found[2], poses[2]) < 0.003
 
 
+def test_in_clouds_of_the_scene_it_is_followed_again_where_it_was() -> None:
+    """A network would refuse such a cloud for its size."""
+    poses = moving(5, step_m=0.003)
+    clouds = [back_project(frame(p, k).double(), K).reshape(-1, 3) for k, p in enumerate(poses)]
+    clouds[2] = back_project(frame(None).double(), K).reshape(-1, 3)
+    found = list(oracle(poses).track(clouds, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked", "tracked", "lost", "tracked", "tracked"]
+    assert error_of(found[4], poses[4]) < 0.003
+
+
+def test_a_pose_about_the_camera_is_compared_in_few_cells() -> None:
+    surface = prepare_surface(bracket())
+    scene_m = back_project(frame(None).double(), K).reshape(-1, 3)
+    for z_m in (0.0, 0.03, 0.08):
+        pose = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, z_m]).double())
+        assert all(0 <= share <= 1 for share in compare_depths(scene_m, pose, surface))
+
+
 def test_what_else_it_may_be_moves_along() -> None:
     poses = moving(2)
     half = Rigid(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))

@@ -133,6 +133,8 @@ _EXIT_CODES = """exit codes:
 
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """Errors of a disk where a library or a temporary file writes; our own writers catch them."""
+_OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
+"""Errors of a path that is looked at before it is read."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -150,20 +152,22 @@ def main(words: Sequence[str] | None = None) -> int:
     name, rest = _split_command(given)
     if name is None:
         return _explain(given)
+    lock = sys.modules.get("depthpose.core.lock")  # not imported for --help
+    before = lock.held_folders() if lock is not None else ()
     try:
         with _notices_in_a_line():
             return _run(name, rest)
     except (InputError, MissingExtraError) as error:
         return _fail(f"error: {error}")
     except OSError as error:
-        if error.errno not in _OF_THE_DISK:
+        if error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
             raise
         return _fail(f"error: {_message_of(error)}")
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
-        if "depthpose.core.lock" in sys.modules:
-            sys.modules["depthpose.core.lock"].release_folders()
+        if (lock := sys.modules.get("depthpose.core.lock")) is not None:
+            lock.release_folders(but=before)
 
 
 def _fail(reason: str, code: int = 2) -> int:

@@ -29,7 +29,7 @@ from depthpose.core.hub import find_weights, is_on_hub
 PATHS = frozenset({
     *("images", "left", "right", "camera", "cloud", "depth", "mask", "bop", "data", "held_out"),
     *("train", "evaluation", "path", "config", "cad", "csv", "predictions", "targets", "file"),
-    *("models", "kitti", "linemod", "results"),
+    *("models", "kitti", "linemod", "results", "folder"),
 })  # fmt: skip
 """Arguments of commands that name files or folders that are read."""
 WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})

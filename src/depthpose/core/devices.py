@@ -15,12 +15,12 @@ def usable_device(name: str | torch.device) -> torch.device:
     """Give the device of a name, such as ``cpu`` or ``cuda:1``.
 
     Raises:
-        InputError: this machine has none of that name.
+        InputError: this machine has none of that name, or it computes no float64.
     """
     try:
         device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
+        torch.ones(1, dtype=torch.float64, device=device).cpu()
+    except (RuntimeError, AssertionError, TypeError) as error:
         raise InputError(
             f"device {str(name)!r} cannot be used here ({str(error).splitlines()[0]}); take 'cpu'"
         ) from error

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,16 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
             return not is_shared
 
 
-def release_folders() -> None:
-    """Let other commands into the folders that this process has claimed."""
-    while _locks:
-        os.close(_locks.popitem()[1])
+def held_folders() -> frozenset[Path]:
+    """Give the records of the folders that this process holds."""
+    return frozenset(_locks)
+
+
+def release_folders(but: Collection[Path] = ()) -> None:
+    """Let other commands into the folders that this process has claimed.
+
+    Args:
+        but: records of folders that it goes on holding.
+    """
+    for record in [record for record in _locks if record not in but]:
+        os.close(_locks.pop(record))

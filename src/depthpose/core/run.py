@@ -1,5 +1,6 @@
 """One folder per run, with what made it: settings, versions, machine, commit."""
 
+import json
 import os
 import platform
 import re
@@ -129,9 +130,26 @@ def claim_folder(
             raise _not_ours(folder / there[0])
     if not record.exists():
         write_once(record, run_record(settings))
+    is_alone = find_rank().world == 1
+    if is_alone and _is_empty(folder) and _has_other_settings(record, settings):
+        lock_folder(record, is_shared=False)
+        if _is_empty(folder):  # a run that failed before its first result
+            (folder / _SOURCES).unlink(missing_ok=True)
+            record.write_text(f"{json.dumps(run_record(settings), indent=2)}\n")
     refuse_other_settings(folder, read_json(record), settings)
-    if lock_folder(record, is_shared=find_rank().world > 1):
+    if lock_folder(record, is_shared=not is_alone):
         remove_parts(folder)
+
+
+def _has_other_settings(record: Path, settings: Mapping[str, Any]) -> bool:
+    earlier = read_json(record)
+    there = earlier.get("settings") if isinstance(earlier, dict) else None
+    return isinstance(there, dict) and _flat(there) != _flat(settings)
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether a folder holds the record of a run and nothing else."""
+    return all(path.name in (RECORD, _SOURCES) for path in folder.iterdir())
 
 
 def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,12 +180,18 @@ def claim_names(
     results = _results_there(folder, endings)
     there = read_json(record) if record.exists() else {}
     known = there if isinstance(there, dict) else {}
-    wanted = {name: str(path.resolve()) for name, path in sources.items()}
-    for name, path in wanted.items():
-        if known.get(name, path) != path:
+    wanted = {name: [str(path.resolve()), _stamp(path)] for name, path in sources.items()}
+    for name, (path, stamp) in wanted.items():
+        earlier, before = _source(known.get(name, [path, stamp]))
+        if earlier != path:
             raise InputError(
-                f"{folder}: {name!r} is the result of {known[name]}, not of {path}; two files of "
+                f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
                 "one name need two folders: choose another"
+            )
+        if before and stamp and before != stamp:
+            raise InputError(
+                f"{path}: has changed since its result {name!r} in {folder} was made; choose "
+                "another folder, or delete this one"
             )
     new = wanted.keys() - known.keys()
     for stem, file in results.items():
@@ -183,7 +207,24 @@ def read_sources(folder: Path) -> dict[str, Path]:
     record = folder / _SOURCES
     known = read_json(record) if record.exists() else {}
     files = known.items() if isinstance(known, dict) else ()
-    return {name: Path(path) for name, path in files if isinstance(path, str)}
+    found = {name: _source(entry)[0] for name, entry in files}
+    return {name: Path(path) for name, path in found.items() if path}
+
+
+def _source(entry: object) -> tuple[str, str]:
+    """Give path and stamp of an entry of the record; empty where it is none."""
+    entry = entry if isinstance(entry, list) else [entry, ""]
+    path, stamp = [*entry, "", ""][:2]
+    return path if isinstance(path, str) else "", stamp if isinstance(stamp, str) else ""
+
+
+def _stamp(path: Path) -> str:
+    """Size and time of a file, by which a change is noticed; empty for what is none."""
+    try:
+        facts = path.stat()
+    except OSError:
+        return ""
+    return f"{facts.st_size} bytes of {facts.st_mtime_ns}" if path.is_file() else ""
 
 
 def refuse_to_replace(path: Path) -> None:

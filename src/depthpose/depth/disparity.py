@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.errors import InputError
 from depthpose.depth.types import Match
 
 _MISTAKES = {
@@ -18,6 +19,8 @@ _MISTAKES = {
 _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
 _NEARLY_ALL = 0.9
+MOST_ENLARGED_PIXELS = 8_000_000
+"""An image is not enlarged beyond this to reach the focal length of a network."""
 
 
 def disparity_advice(
@@ -124,10 +127,20 @@ def left_right_difference_px(
 
 
 def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
-    """Rows and columns at which the camera's image has ``focal_px``, with square pixels."""
-    rows = round(camera.height * focal_px / float(camera.K[1, 1]))
-    columns = round(camera.width * focal_px / float(camera.K[0, 0]))
-    return max(rows, 1), max(columns, 1)
+    """Rows and columns at which the camera's image has ``focal_px``, with square pixels.
+
+    Raises:
+        InputError: the image would be enlarged beyond :data:`MOST_ENLARGED_PIXELS`.
+    """
+    rows = max(round(camera.height * focal_px / float(camera.K[1, 1])), 1)
+    columns = max(round(camera.width * focal_px / float(camera.K[0, 0])), 1)
+    if rows * columns > max(MOST_ENLARGED_PIXELS, camera.height * camera.width):
+        raise InputError(
+            f"a focal length of {float(camera.K[0, 0]):g} px would enlarge the image of "
+            f"{camera.width}x{camera.height} to {columns}x{rows}; is it in millimetres? Give it in "
+            "pixels: millimetres / width of the sensor in millimetres x columns of the image"
+        )
+    return rows, columns
 
 
 def resize_image(

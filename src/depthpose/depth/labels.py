@@ -1,6 +1,6 @@
 """Truth for pairs that have none: what a matcher finds in both views, kept where they agree."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
-from depthpose.core.run import claim_folder
+from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
 from depthpose.depth.estimator import FakestereoNet
@@ -51,11 +51,13 @@ def label_pairs(
     config: LabelConfig,
     folder: Path,
     settings: dict[str, object],
+    numbers: Sequence[int] | None = None,
 ) -> Iterator[tuple[str, float]]:
     """Write a plain folder of pairs with pseudo-truth, and yield each name and what share is known.
 
     ``left/`` and ``right/`` repeat the images, ``disp_occ/`` holds the disparity, ``calib.txt``
-    the rigs. A rerun goes on where it was.
+    the rigs. A rerun goes on where it was. Pairs of another folder may be added, if their names
+    are others.
 
     Args:
         net: the matcher; a network that has seen evaluation frames must not be used.
@@ -63,14 +65,19 @@ def label_pairs(
         config: what counts as known.
         folder: where to write; refused if other settings made what it holds.
         settings: what decides the result.
+        numbers: of the frames that are labelled; None: all.
 
     Raises:
-        InputError: no frame has both, or a frame that cannot be matched.
+        InputError: no frame has both, the folder holds a label of another image of that name, or
+            a frame that cannot be matched.
     """
-    usable = [n for n, frame in enumerate(dataset.frames) if frame.right and frame.calibration]
+    chosen = range(len(dataset)) if numbers is None else numbers
+    frames = {n: dataset.frames[n] for n in chosen}
+    usable = [n for n, frame in frames.items() if frame.right and frame.calibration]
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
+    claim_names(folder, {frames[n].name: frames[n].left for n in usable})
     _write_calibration(folder / "calib.txt", dataset, usable)
     for number in usable:
         name = dataset.frames[number].name
@@ -115,12 +122,15 @@ def is_consistent(
 
 
 def _write_calibration(path: Path, dataset: Dataset, usable: list[int]) -> None:
-    lines = []
+    """Write a line for each pair, beside those of other pairs that are there."""
+    there = path.read_text().splitlines() if path.is_file() else []
+    lines = {line.rsplit(maxsplit=8)[0]: line for line in there}
     for number in usable:
-        rig = dataset.read_rig(number)
+        rig, name = dataset.read_rig(number), dataset.frames[number].name
         assert isinstance(rig, StereoRig)
-        values = (rig.K[0, 0], rig.K[0, 2], rig.K[1, 2], rig.baseline_m)
+        K, shift_px = rig.K, rig.cx_right_minus_left_px
+        values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)
-        lines.append(f"{dataset.frames[number].name} {rig.width} {rig.height} {numbers}")
+        lines[name] = f"{name} {rig.width} {rig.height} {numbers}"
     with atomic_write(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+        part.write_text("\n".join(lines.values()) + "\n")

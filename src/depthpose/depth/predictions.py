@@ -1,6 +1,6 @@
 """Estimates as files: what they are called, writing them all or nothing, reading them back."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -22,7 +22,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.text import read_text
-from depthpose.core.run import claim_folder
+from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -186,22 +186,23 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
 
 def predict(
     net: Estimator,
-    inputs: Iterable[Callable[[], StereoInput]],
-    names: list[str],
+    inputs: Mapping[str, Callable[[], StereoInput]],
     folder: Path,
     settings: dict[str, Any],
+    sources: Mapping[str, Path],
 ) -> Iterable[str]:
     """Estimate what is not finished yet, one frame at a time, and yield each name.
 
     Args:
         net: the estimator.
-        inputs: readers of the inputs, called only for unfinished frames.
-        names: their names, in the same order.
-        folder: where the files go; refused if other settings made what it holds.
+        inputs: readers of the inputs by name, called only for unfinished frames.
+        folder: where the files go; refused if other settings or images made what it holds.
         settings: what decides the results.
+        sources: the image behind each name, of all processes that write to the folder.
     """
-    claim_folder(folder, settings, (f"{name}.{end}" for name in names for end in ENDINGS))
-    for read_input, name in zip(inputs, names, strict=True):
+    claim_folder(folder, settings, (f"{name}.{end}" for name in inputs for end in ENDINGS))
+    claim_names(folder, sources)
+    for name, read_input in inputs.items():
         if not is_finished(folder, name):
             pair = read_input()
             write_estimate(folder, pair, net.estimate_pair(pair))

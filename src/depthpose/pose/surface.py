@@ -159,7 +159,9 @@ def compare_depths(
         saw something before it. They add up to less than one where cells have no reading.
     """
     posed_m = pose.apply(surface.points_m)
-    posed_m, scene_m = posed_m[posed_m[:, 2] > 0], scene_m[scene_m[:, 2] > 0]
+    # As the depth goes to 0 the rays of a surface span any number of cells.
+    least_m = _FRONT * max(float(posed_m[:, 2].median()), 0.0)
+    posed_m, scene_m = posed_m[posed_m[:, 2] > least_m], scene_m[scene_m[:, 2] > 0]
     if len(posed_m) == 0 or len(scene_m) == 0:
         return 0.0, 0.0, 0.0
     scale = float(posed_m[:, 2].median()) / (_CELL * surface.diameter_m)

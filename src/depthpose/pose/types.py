@@ -131,6 +131,10 @@ class Axis:
     point_m: Float[Tensor, "3"]
 
 
+_OTHER_AXIS = 0.1
+"""Sine of the angle from which two axes of revolution are two."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Symmetries:
     """Motions of the model frame that leave the object as it is, as BOP's models_info says them.
@@ -149,6 +153,20 @@ class Symmetries:
     def is_none(self) -> bool:
         """Whether the object looks alike from no two sides."""
         return self.discrete is None and not self.continuous
+
+    @property
+    def ball_centre_m(self) -> Float[Tensor, "3"] | None:
+        """Where two axes of revolution meet: every turn about it changes nothing; else None."""
+        for other in self.continuous[1:]:
+            first = self.continuous[0]
+            across = torch.linalg.cross(first.direction, other.direction)
+            if float(across.norm()) > _OTHER_AXIS:
+                eye = torch.eye(3).to(across)
+                planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
+                points_m = torch.stack([first.point_m, other.point_m])
+                pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
+                return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
+        return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -28,6 +28,8 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
     Raises:
         InputError: there are fewer points than three neighbourhoods.
     """
+    if not 1 <= perplexity < math.inf:
+        raise InputError(f"t-SNE with a perplexity of {perplexity:g}: take 5 to 50, at least 1")
     if len(features) < 3 * perplexity:
         raise InputError(
             f"t-SNE of {len(features)} points with a perplexity of {perplexity:g}: give three "

@@ -1,5 +1,6 @@
 """``depthpose data make ...``."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -141,6 +142,8 @@ def make_objects(
 
     if frames.number < 1:
         raise InputError(f"--number {frames.number}: at least 1 frame")
+    if not re.fullmatch(r"[\w-]+", frames.split) or frames.split == "models":
+        raise InputError(f"--split {frames.split}: a name of letters and digits, not 'models'")
     models = _read_models(cad, frames)
     claim_folder(out, _object_settings(cad, frames), ["models", frames.split])
     write_bop_models(out, models)

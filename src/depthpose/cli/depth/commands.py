@@ -51,6 +51,8 @@ def predict(
     """
     from depthpose.cli.depth import methods, predicting
 
+    if not images:
+        raise InputError("name images, folders of them, patterns or videos to predict from")
     config = matching.config
     output.refuse_unusable()
     networks.refuse_contradiction(matching)
@@ -210,12 +212,15 @@ def evaluate(
 
     predictions = methods.predictions
     methods.refuse_none()
+    comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = evaluating.open_frames(data, split)
     chosen = evaluating.choose_methods(methods, matching.config)
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
-    claim_folder(out, {"command": "depth evaluate"}, files)
+    about = {"data": str(data.resolve()), "split": None if split is None else str(split)}
+    about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
+    claim_folder(out, {"command": "depth evaluate", **about}, files)
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
     name, caps_m = comparison.protocol, comparison.cap
     if predictions is not None and is_job(predictions):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.depth.evaluating import signed
-from depthpose.cli.depth.matching import refuse_unrectified_pair, write_match
+from depthpose.cli.depth.matching import refuse_unrectified_pair, rig_facts, write_match
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
 from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
@@ -155,9 +155,8 @@ def match(
         rig = read_rig(camera, image_size(left))
         if with_check:
             refuse_unrectified_pair(_read_pair("the first pair", left, right, rig))
-    facts = {"K": rig.K.tolist(), "baseline_m": rig.baseline_m}
     work = MatchWork(spec=spec, rig=rig, with_cloud=with_cloud)
-    settings = {**spec.settings(), "camera": facts}
+    settings = {**spec.settings(), "camera": rig_facts(rig)}
     return say(run(work, inputs, out, settings, options), out, "pairs")
 
 

@@ -66,14 +66,14 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
     ]
     process = find_rank()
     mine = [usable[k] for k in process.share(len(usable))]
-    names = [dataset.frames[i].name for i in mine]
-    readers = [partial(_read, dataset, i, method.with_right) for i in mine]
+    readers = {dataset.frames[i].name: partial(_read, dataset, i, method.with_right) for i in mine}
+    sources = {dataset.frames[i].name: dataset.frames[i].left for i in usable}
     home = folder / method.name
-    written = predict(method.net, readers, names, home, method.settings)
-    for _ in tqdm(written, method.name, total=len(names), disable=None, unit=" frames"):
+    written = predict(method.net, readers, home, method.settings, sources)
+    for _ in tqdm(written, method.name, total=len(readers), disable=None, unit=" frames"):
         pass
     if process.rank == 0:
-        wait_for([dataset.frames[i].name for i in usable], partial(is_finished, home))
+        wait_for(list(sources), partial(is_finished, home))
     return home
 
 

@@ -22,7 +22,7 @@ from depthpose.depth.predictions import (
     write_estimate,
     write_estimate_cloud,
 )
-from depthpose.depth.stereo import TiledMatcher, tile_change_px
+from depthpose.depth.stereo import NetworkMatcher, tile_change_px
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 
@@ -87,16 +87,21 @@ def say_tile_change(pairs: Pairs, method: Method) -> None:
     pair = pairs.read(0)
     assert pair.right is not None
     assert isinstance(method.net, FakestereoNet)
-    if not isinstance(method.net.matcher, TiledMatcher):
+    if not isinstance(method.net.matcher, NetworkMatcher):
         raise InputError(f"--tile: {method.name} matches no tiles; omit --tile")
-    change_px = tile_change_px(method.net.matcher, pair.left, pair.right)
+    change_px = tile_change_px(method.net.matcher, pair.left, pair.right, pair.camera)
     print(f"tiles change the disparity of {pair.name} by {change_px:.4f} px on average")
+
+
+def rig_facts(rig: StereoRig) -> dict[str, object]:
+    """Give what of a rig decides depth, for the record of a run."""
+    facts: dict[str, object] = {"K": rig.K.tolist(), "baseline_m": rig.baseline_m}
+    return facts | {"cx_right_minus_left_px": rig.cx_right_minus_left_px}
 
 
 def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
-    rig = {"K": pairs.rig.K.tolist(), "baseline_m": pairs.rig.baseline_m}
-    claim_folder(out, {**method.settings, "camera": rig}, [PAGE])
+    claim_folder(out, {**method.settings, "camera": rig_facts(pairs.rig)}, [PAGE])
     claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
     failures: list[str] = []
     mine = find_rank().share(len(pairs.left))

@@ -1,5 +1,6 @@
 """Options that several depth commands take: each is declared, and described, once."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -209,6 +210,16 @@ class ProtocolOptions:
     """name of the protocol; eigen-raw is the thesis's."""
     cap: tuple[float, ...] = (80.0, 50.0)
     """metres beyond which truth does not count; a row each."""
+
+    def refuse_unusable(self) -> None:
+        """Refuse a cap that is no distance.
+
+        Raises:
+            InputError: it is none.
+        """
+        for cap_m in self.cap:
+            if not 0 < cap_m < math.inf:
+                raise InputError(f"--cap {cap_m:g}: a distance in metres, above 0")
 
 
 def parse_bytes(text: str | None) -> int | None:

@@ -71,6 +71,8 @@ def predict(
         known = tuple(model.name for model in method.models)
         wanted = known if inputs.object is None else (object_named(inputs.object, method),)
         place = Path(inputs.depth)
+        if view is not None:
+            raise InputError("--view shows inputs that have a mask; omit it, or give --mask")
         return find_all(method, place, inputs.camera, wanted, inputs.unit, Path(out))
     return _predict_here(method, inputs, Path(out), estimates.batch, view)
 
@@ -114,7 +116,7 @@ def _jobs_of(
         raise InputError("--depth needs --camera beside it, and --mask unless it is to be found")
     files = (Path(given.depth), Path(given.mask), given.camera)
     jobs = inputs.view_jobs(files, name, given.unit, out)
-    settings |= {"camera": str(given.camera.resolve()), "mask": str(files[1].resolve())}
+    settings |= inputs.camera_facts(given.camera) | {"mask": str(files[1].resolve())}
     return jobs, settings | ({} if given.unit is None else {"unit": given.unit})
 
 
@@ -152,6 +154,7 @@ def evaluate(
     from depthpose.cli.pose import evaluating
     from depthpose.cli.pose.masks import find_masks
     from depthpose.cli.pose.methods import pose_methods, predict_all
+    from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.report.tables import table_files
 
@@ -159,11 +162,14 @@ def evaluate(
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = evaluating.open_instances(bop, split, objects, estimates.targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
-    claim_folder(out, {"command": "pose evaluate"}, files)
+    rule = replace(estimates.evaluation, adds=adds)
+    about = {"bop": str(bop.resolve()), "split": split, "objects": sorted(objects)}
+    targets = None if estimates.targets is None else str(estimates.targets.resolve())
+    how = {"targets": targets, "rule": config_to_dict(rule)}
+    claim_folder(out, {"command": "pose evaluate", **about, **how}, files)
     methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
     paths = [predict_all(dataset, method, one, out) for method in methods for one in shown]
-    rule = replace(estimates.evaluation, adds=adds)
     return evaluating.measure(dataset, [*paths, *csv, *predictions], rule, out)
 
 

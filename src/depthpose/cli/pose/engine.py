@@ -107,7 +107,8 @@ def predict(
 
 def _settings(work: PoseWork, method: PoseMethod) -> dict[str, Any]:
     """What a folder of results remembers of the run."""
-    facts = {} if work.camera is None else {"K": work.camera.K.tolist()}
+    camera = work.camera
+    facts = {} if camera is None else {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
     return {
         **method.settings,
         "estimate": config_to_dict(work.source.config),

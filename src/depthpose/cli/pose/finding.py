@@ -1,24 +1,30 @@
 """``depthpose pose predict`` of depth images without masks."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.pose.inputs import Unreadable
+from depthpose.cli.pose.inputs import Unreadable, camera_facts, frame_jobs
 from depthpose.cli.pose.methods import PoseMethod
 from depthpose.cli.pose.page import write_pose_page
-from depthpose.cli.pose.predicting import claim, say_result, write_files
+from depthpose.cli.pose.predicting import claim, say_result, unread, write_files
 from depthpose.core.errors import InputError
-from depthpose.core.files import list_images
-from depthpose.core.run import find_rank, refuse_among_inputs
+from depthpose.core.run import find_rank
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator.find import explained_mask, nothing_found
-from depthpose.pose.estimator.given import view_input
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.predictions import Job, Prediction, write_predictions
+from depthpose.pose.predictions import (
+    Job,
+    Prediction,
+    is_finished,
+    is_started,
+    read_predictions,
+    write_predictions,
+)
 from depthpose.pose.types import PoseEstimate, ViewInput
 
 
@@ -33,22 +39,42 @@ def find_all(
     """Find objects in every depth image, write the files of each, and give the exit code.
 
     What is found in NAME is called NAME_0, NAME_1, ...; an image where nothing is found has one
-    entry, NAME, that says so.
+    entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
 
     Raises:
         InputError: weights that take no clouds, several processes, or two images of one name.
     """
     _refuse_unable(method)
-    depths = list_images(depth)
-    refuse_among_inputs(out, [depth], depths)
-    facts = {"camera": str(camera.resolve())} | ({} if unit is None else {"unit": unit})
+    jobs = frame_jobs(depth, camera, objects[0], unit, out)
+    _refuse_numbered(jobs)
+    facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, [], depth)
+    earlier = read_predictions(out) if is_started(out) else []
     found: list[tuple[Prediction, Job[Any]]] = []
-    for path in tqdm(depths, disable=None, unit=" images"):
-        found += _find(method, view_input(path, None, camera, objects[0], path.stem, unit), objects)
+    for job in tqdm(jobs, disable=None, unit=" images"):
+        own = [p for p in earlier if _image_of(p.estimate.name, job.name) and is_finished(p)]
+        found += [(p, explained_job(job, p.estimate, method)) for p in own] or list(
+            _find(method, job, objects)
+        )
+        write_predictions(out, [prediction for prediction, _ in found])
     claim(out, settings, [job for _, job in found], depth)
     return _write(found, method, out)
+
+
+def _image_of(name: str, image: str) -> bool:
+    """Whether a result is of an image: its name, or that and a number."""
+    return re.fullmatch(rf"{re.escape(image)}(_\d+)?", name) is not None
+
+
+def _refuse_numbered(jobs: Sequence[Job[Any]]) -> None:
+    names = {job.name for job in jobs}
+    for name in sorted(names):
+        if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
+            raise InputError(
+                f"two depth images are called {plain!r} and {name!r}, and so would be what is "
+                "found in the first; rename one"
+            )
 
 
 def _refuse_unable(method: PoseMethod) -> None:
@@ -61,7 +87,6 @@ def _refuse_unable(method: PoseMethod) -> None:
 def _write(found: list[tuple[Prediction, Job[Any]]], method: PoseMethod, out: Path) -> int:
     """Write what was found, files and a page of what was answered; give the exit code."""
     predictions = [prediction for prediction, _ in found]
-    write_predictions(out, predictions)
     answered = [pair for pair in found if pair[0].estimate.is_ok]
     answers, own = [prediction for prediction, _ in answered], [job for _, job in answered]
     write_files(answers, own, out, method)
@@ -70,12 +95,15 @@ def _write(found: list[tuple[Prediction, Job[Any]]], method: PoseMethod, out: Pa
 
 
 def _find(
-    method: PoseMethod, view: ViewInput, objects: tuple[str, ...]
+    method: PoseMethod, job: Job[Any], objects: tuple[str, ...]
 ) -> Iterator[tuple[Prediction, Job[Any]]]:
     assert method.find is not None
-    whole = Job[Any](name=view.name, read=lambda: view)
+    view = job.read()
+    if isinstance(view, Unreadable):
+        yield Prediction(estimate=unread(view)), job
+        return
     for one in method.find(view, objects) or [nothing_found(view.name, ", ".join(objects))]:
-        yield Prediction(estimate=one), explained_job(whole, one, method)
+        yield Prediction(estimate=one), explained_job(job, one, method)
 
 
 def explained_job(job: Job[Any], estimate: PoseEstimate, method: PoseMethod) -> Job[Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod, match_names
+from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import cloud_suffixes, list_images
 from depthpose.core.run import refuse_among_inputs
@@ -57,6 +58,11 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
     return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+
+
+def camera_facts(camera: Path) -> dict[str, str]:
+    """Give what of a camera file decides the poses, for the record of a run."""
+    return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
 def _is_cloud(path: Path) -> bool:

@@ -49,9 +49,9 @@ class EstimateOptions:
     """How poses are estimated."""
 
     voting: Voting = "ransac"
-    """how directions become keypoints."""
+    """how a network's directions become keypoints."""
     hypotheses: int = 128
-    """of RANSAC, for each keypoint."""
+    """of RANSAC, for each keypoint of a network."""
     icp: bool = True
     """refine the voted pose by ICP."""
     up_to_symmetry: bool = False
@@ -62,9 +62,15 @@ class EstimateOptions:
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimator, on the device of this process."""
+        """Settings of the estimator, on the device of this process.
+
+        Raises:
+            InputError: a value is out of its range.
+        """
         from depthpose.core.run import own_device  # --help must not load torch
 
+        if self.batch < 1:
+            raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
         return EstimateConfig(
             voting=voting_config(self.voting, self.hypotheses),
             with_icp=self.icp,

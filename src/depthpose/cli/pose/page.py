@@ -166,7 +166,7 @@ def _shown(dataset: BopDataset, instance: Instance, estimate: PoseEstimate) -> P
     """Show an estimate beside the truth: of copies that look alike the one nearest to it."""
     model, truth = dataset.objects[instance.object_id], instance.camera_from_model
     if (found := estimate.camera_from_model) is not None:
-        truth = nearest_copy(found, truth, symmetry_transforms(model.symmetries))
+        truth = nearest_copy(found, truth, symmetry_transforms(model.symmetries), model.symmetries)
     return PoseShown(
         given=dataset.view(instance).input,
         estimate=estimate,

@@ -38,7 +38,7 @@ def track_folder(
         assert depth is not None
         assert camera is not None
         jobs = inputs.frame_jobs(depth, camera, name, unit, out)
-        settings |= {"camera": str(camera.resolve())}
+        settings |= inputs.camera_facts(camera)
     predicting.claim(out, settings, jobs, cloud or depth or out)
     predictions = list(_followed(method, jobs, name))
     write_predictions(out, predictions)

@@ -134,6 +134,8 @@ def figure(
     from depthpose.cli.thesis import depth_tables as reproducing
 
     dataset = evaluating.open_frames(kitti, split)
+    if number is not None and number < 1:
+        raise InputError(f"--number {number}: at least 1 frame")
     count = number or (1 if figure == "2-1" else 4)
     chosen = reproducing.choose_frames(dataset, frames, count)
     method = methods.weights_method(

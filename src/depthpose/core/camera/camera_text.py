@@ -67,7 +67,9 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
-    """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each, and a size if given.
+    """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each.
+
+    Also ``width`` and ``height``, ``focal_y_px`` and ``cx_right_minus_left_px`` if given.
 
     Raises:
         InputError: a value is missing.
@@ -76,13 +78,16 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
         _number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")
     )
     has_size = {"width", "height"} <= keys.keys()
+    focal_y_px = _number(path, keys, "focal_y_px") if "focal_y_px" in keys else focal_px
+    shift = "cx_right_minus_left_px"
     return CameraFacts(
         kind="a calibration",
-        K=_intrinsics(focal_px, focal_px, cx, cy),
+        K=_intrinsics(focal_px, focal_y_px, cx, cy),
         size=(int(_number(path, keys, "width")), int(_number(path, keys, "height")))
         if has_size
         else None,
         baseline_m=baseline_m,
+        cx_right_minus_left_px=_number(path, keys, shift) if shift in keys else 0.0,
     )
 
 

@@ -98,6 +98,12 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
             raise InputError(f"{record}: no JSON ({error}); choose another folder") from error
         refuse_other_settings(out, earlier, settings)
         return
+    for name in (MANIFEST, PLAN, SHARDS):
+        if exists(join(out, name)):
+            raise InputError(
+                f"{join(out, name)}: is there already, and no run of this command wrote it; choose "
+                "another --out, or move it away"
+            )
     publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
 
 

@@ -146,6 +146,8 @@ def _refuse_to_replace(target: Path) -> None:
 
 
 def _sync(path: Path) -> None:
+    if os.name == "nt":  # which syncs no folder, and no file that is open for reading
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
-from depthpose.core.lock import release_folders
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.host import (
     Arithmetic,
@@ -90,11 +89,8 @@ def train(  # noqa: PLR0913  what is trained, and how it is run
     if finish and not run.step:
         raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
     run.steps = run.step if finish else run.steps
-    try:
-        with graceful_stop() as request:
-            run.take_steps(on_step, request)
-    finally:
-        release_folders()
+    with graceful_stop() as request:
+        run.take_steps(on_step, request)
     return run.seconds
 
 

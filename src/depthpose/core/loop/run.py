@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from depthpose.core.config import config_to_dict, write_config
+from depthpose.core.lock import held_folders, release_folders
 from depthpose.core.loop.config import LoopConfig
 from depthpose.core.loop.journal import run_files
 from depthpose.core.loop.loop import Progress, train
@@ -14,6 +16,8 @@ from depthpose.core.run import claim_folder, find_rank
 
 _FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
 """Settings of the loop that change no weight: a resumed run may have others."""
+
+_Config = TypeVar("_Config")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,3 +79,17 @@ class Run:
             finish=self.finish,
             on_step=self.on_step,
         )
+
+
+def holds_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
+    """Let other commands into the folder of a training when its weights are written."""
+
+    @wraps(stage)
+    def run_stage(config: _Config, run: Run) -> Path:
+        before = held_folders()
+        try:
+            return stage(config, run)
+        finally:
+            release_folders(but=before)
+
+    return run_stage

@@ -101,7 +101,8 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     """Read a plain folder's ``calib.txt``.
 
     Either ``focal_px``, ``cx``, ``cy`` and ``baseline_m`` for all pairs, a line each, or one line
-    a pair: ``name width height focal_px cx cy baseline_m``.
+    a pair: ``name width height focal_px cx cy baseline_m``, which may go on with ``focal_y_px
+    cx_right_minus_left_px``.
 
     Raises:
         InputError: a value missing, or no line for this pair.
@@ -110,22 +111,34 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
         keys = read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
-    own = [words for line in text.splitlines() if (words := line.split()) and words[0] == name]
+    lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
+    own = [numbers for line in lines if (numbers := _numbers_of(line)) is not None]
     if len(own) > 1:
         raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
-    if not own or len(own[0]) < 7:
+    if not own:
         raise InputError(
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
     try:
-        numbers = [float(word) for word in own[0][1:7]]
+        numbers = own[0]
         size = int(numbers[0]), int(numbers[1])
-        names = ("focal_px", "cx", "cy", "baseline_m")
-        values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=True)}
+        names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
+        values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
         return _rig(path, plain_facts(path, values), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
+
+
+def _numbers_of(line: str) -> list[float] | None:
+    """Six or eight numbers that begin a line, words after them left out; None: it has others."""
+    numbers = list[float]()
+    for word in line.split():
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            break
+    return numbers if len(numbers) in (6, 8) else None
 
 
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:

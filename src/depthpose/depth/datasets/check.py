@@ -88,10 +88,12 @@ def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
     # The folders are listed, not the frames: a split leaves many pairs out on purpose.
     folders = {(f.left.parent, f.right.parent) for f in frames if f.right is not None}
     for left, right in sorted(folders):
+        if left == right or not left.is_dir():  # packed
+            continue
         stems = {path.stem for path in left.iterdir()}
         for path in sorted(right.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
-            if is_view and left != right and path.stem not in stems:
+            if is_view and path.stem not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
 
 

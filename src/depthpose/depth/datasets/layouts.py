@@ -1,5 +1,6 @@
 """Folders to frames: which layout this is, and where each frame's parts lie."""
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Give the folder of a dataset.")
+    folder = Path(os.path.abspath(folder))  # noqa: PTH100  '.' has no name, and a link keeps its own
     known = _recognise(folder)
     if known is not None:
         return known

@@ -48,7 +48,8 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
         case np.ndarray() if image.dtype != np.uint8 and image.dtype.kind != "f":
             raise InputError(f"{name} is an array of {image.dtype}; {_VALUES}")
         case np.ndarray():
-            values = torch.from_numpy(np.require(image, requirements=["C", "W"]))
+            kind = np.uint8 if image.dtype == np.uint8 else np.float32
+            values = torch.from_numpy(np.require(image, kind, requirements=["C", "W"]))
             return _rgb(values, (-1, 0), f"{name} is an array")
         case Tensor() if image.dtype != torch.uint8 and not image.is_floating_point():
             raise InputError(f"{name} is a tensor of {image.dtype}; {_VALUES}")

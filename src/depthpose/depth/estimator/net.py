@@ -201,7 +201,7 @@ class FakestereoNet:
             pair = replace(pair, right=as_tensor(right, "the right image"))
         return self.estimate_pair(pair, with_check=with_check)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = False) -> DepthEstimate:
         """Estimate depth of one input whose images are read already."""
         if pair.right is None:
@@ -226,7 +226,7 @@ class FakestereoNet:
             seen=pair,
         )
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_many(
         self,
         images: Sequence[StereoInput] | Sequence[Picture] | Picture,

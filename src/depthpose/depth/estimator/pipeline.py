@@ -77,19 +77,21 @@ class DepthPipeline:
 
 
 def pipeline(
-    task: str = "depth-estimation", model: str | Path | None = None, device: str = "cpu"
+    task: str = "depth-estimation", model: str | Path | None = None, device: str | int = "cpu"
 ) -> DepthPipeline:
     """Build what transformers' function of this name builds, for the one task that is known.
 
     Args:
         task: depth-estimation.
         model: weights with a generator, by name or file; None: ``default``.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU.
 
     Raises:
         InputError: another task, or no such weights.
     """
     refuse_unknown("task", task, ["depth-estimation"])
+    if isinstance(device, int):
+        device = f"cuda:{device}" if device >= 0 else "cpu"
     net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=device))
     return DepthPipeline(net)
 

@@ -120,7 +120,9 @@ def measure_frame(
     """
     rule = find_protocol(protocol)
     prepared = prepare(dataset, index, predictions, rule)
-    return prepared if isinstance(prepared, str) else _measure(prepared, rule, caps_m)
+    if isinstance(prepared, str):
+        return prepared
+    return _measure(prepared, rule, caps_m) or "no truth within the caps and the crop"
 
 
 def summarise(
@@ -154,28 +156,37 @@ def summarise(
 
 
 def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[Measured]:
+    """Measure by each cap within which there is truth."""
     if rule.truth == "disparity":
-        return [_measure_disparity(prepared)]
-    return [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
+        found = [_measure_disparity(prepared)]
+    else:
+        found = [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
+    return [one for one in found if one is not None]
 
 
-def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured:
+def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured | None:
     compared = compare_depth(prepared, rule, cap_m)
     mask, counted = _count(prepared, compared, cap_m)
+    if counted is None or counted.pixels == 0:
+        return counted
     predicted_m, true_m = compared.predicted[mask], compared.truth[mask]
     metrics = measure("depth", predicted_m, true_m) | prepared.view
     relative = (predicted_m - true_m).abs() / true_m
     return _score(replace(counted, metrics=metrics), relative, prepared.confidence, mask)
 
 
-def _measure_disparity(prepared: Prepared) -> Measured:
+def _measure_disparity(prepared: Prepared) -> Measured | None:
     compared = compare_disparity(prepared)
     mask, counted = _count(prepared, compared, None)
+    if counted is None or counted.pixels == 0:
+        return counted
     predicted_px, true_px = compared.predicted[mask], compared.truth[mask]
     metrics = measure("disparity", predicted_px, true_px)
     if prepared.frame.disparity_noc is not None:
         seen_px = read_truth_disparity(prepared.frame.disparity_noc)
         seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
+        if not bool(seen.any()):
+            raise InputError(f"{prepared.frame.disparity_noc}: no pixel of it can be compared")
         metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
     counted = replace(counted, metrics=metrics | prepared.view)
     return _score(counted, (predicted_px - true_px).abs(), prepared.confidence, mask)
@@ -183,10 +194,15 @@ def _measure_disparity(prepared: Prepared) -> Measured:
 
 def _count(
     prepared: Prepared, compared: Compared, cap_m: float | None
-) -> tuple[Bool[Tensor, "h w"], Measured]:
-    """Find the pixels that are measured, how many they are, and their share of the truth."""
+) -> tuple[Bool[Tensor, "h w"], Measured | None]:
+    """Find the pixels that are measured, how many they are, and their share of the truth.
+
+    None where there is no truth.
+    """
     counts = torch.isfinite(compared.truth)
     mask = counts & torch.isfinite(compared.predicted)
+    if not bool(counts.any()):
+        return mask, None
     share = float(mask.sum() / counts.sum())
     counted = Measured(
         frame=prepared.frame.name,
@@ -225,10 +241,19 @@ def _frame_row(dataset: str, protocol: str, one: Measured) -> FrameRow:
 
 
 def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[MeanRow]:
-    """One row for each cap; each frame counts the same."""
+    """One row for each cap; each frame counts the same.
+
+    A frame without a predicted pixel has no metrics, and lowers the coverage.
+
+    Raises:
+        InputError: no frame has a predicted pixel.
+    """
     rows: list[MeanRow] = []
     for cap_m, of_cap in _by_cap(measured).items():
-        names = [n for n in of_cap[0].metrics if all(n in one.metrics for one in of_cap)]
+        answered = [one for one in of_cap if one.pixels]
+        if not answered:
+            raise InputError(f"{dataset}: no prediction has a pixel where there is truth")
+        names = [n for n in answered[0].metrics if all(n in one.metrics for one in answered)]
         rows.append(
             MeanRow(
                 protocol=protocol,
@@ -237,7 +262,7 @@ def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> lis
                 frames=len(of_cap),
                 pixels=sum(one.pixels for one in of_cap),
                 coverage=sum(one.coverage for one in of_cap) / len(of_cap),
-                metrics={n: sum(one.metrics[n] for one in of_cap) / len(of_cap) for n in names},
+                metrics={n: sum(one.metrics[n] for one in answered) / len(answered) for n in names},
             )
         )
     return rows

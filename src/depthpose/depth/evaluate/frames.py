@@ -228,7 +228,9 @@ def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> 
     true_px = truth
     if rule.truth != "disparity" and isinstance(camera, StereoRig):
         true_px = disparity_from_depth(truth, camera)
-    if (advice := disparity_advice(predicted_px, true_px)) is not None:
+    # With principal points apart, the disparity of far points is negative.
+    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
+    if (advice := disparity_advice(predicted_px + apart_px, true_px + apart_px)) is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
     confidence = read_confidence(predictions, frame.name)
     if confidence is not None and confidence.shape != truth.shape:

@@ -7,7 +7,6 @@ from depthpose.depth.stereo.matcher import (
     CallableMatcher,
     CameraMatcher,
     Matcher,
-    TiledMatcher,
     check_pair,
 )
 from depthpose.depth.stereo.network_matcher import (
@@ -40,7 +39,6 @@ __all__ = [
     "SGBMMatcher",
     "Steps",
     "StereoNetwork",
-    "TiledMatcher",
     "check_pair",
     "fill_holes",
     "import_psmnet",

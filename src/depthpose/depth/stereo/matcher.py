@@ -10,7 +10,6 @@ from torch import Tensor
 from depthpose.core.arrays import check_image
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
-from depthpose.depth.config import MatcherConfig
 from depthpose.depth.types import Match
 
 
@@ -55,21 +54,6 @@ class CameraMatcher(Matcher, Protocol):
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
         """Rows and columns at which the images of a camera are matched [px]."""
-        ...
-
-
-@runtime_checkable
-class TiledMatcher(Matcher, Protocol):
-    """A matcher that can match in tiles, and the whole image all the same."""
-
-    config: MatcherConfig
-
-    def match_whole(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair without tiles, whatever the config says.
-
-        Raises:
-            InputError: as for ``match``.
-        """
         ...
 
 

@@ -7,6 +7,7 @@ left-right check.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -28,7 +29,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.matcher import TiledMatcher, check_pair
+from depthpose.depth.stereo.matcher import check_pair
 from depthpose.depth.stereo.plan import Tiling, match_tiles
 from depthpose.depth.types import Match
 
@@ -169,16 +170,6 @@ class NetworkMatcher(ABC):
         found = [self._match(group, network, with_tiles=with_tiles) for group in groups]
         return list(chain(*found))
 
-    @torch.no_grad()
-    def match_whole(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair without tiles, whatever the config says: what tiles are compared with.
-
-        Raises:
-            InputError: as :meth:`match`.
-        """
-        check_pair(left, right)
-        return self._match([(left, right)], self.network_config, with_tiles=False)[0]
-
     def _match(
         self, pairs: list[tuple[Tensor, Tensor]], network: NetworkConfig, *, with_tiles: bool
     ) -> list[Match]:
@@ -267,14 +258,23 @@ def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Mat
     return Match(disparity_px=found.disparity_px, confidence=confidence)
 
 
-def tile_change_px(matcher: TiledMatcher, left: Tensor, right: Tensor) -> float:
+def tile_change_px(
+    matcher: NetworkMatcher, left: Tensor, right: Tensor, camera: Camera | None = None
+) -> float:
     """Mean difference that tiles make to the disparity of a pair [px].
+
+    Args:
+        matcher: with tiles.
+        left: left image, ``(3, H, W)`` RGB in [0, 1].
+        right: right image, the same size.
+        camera: of the left image, which decides the size at which the pair is matched.
 
     Raises:
         InputError: the matcher uses no tiles, or the pair is unusable.
     """
     if matcher.config.tile_px is None:
         raise InputError("tile_change_px needs a matcher with tiles; set tile_px in its config")
-    tiled = matcher.match(left, right).disparity_px
-    whole = matcher.match_whole(left, right).disparity_px
-    return float((tiled - whole).abs().mean())
+    whole = copy(matcher)
+    whole.config = replace(matcher.config, tile_px=None)
+    tiled, untiled = (one.match_many([(left, right)], camera)[0] for one in (matcher, whole))
+    return float((tiled.disparity_px - untiled.disparity_px).abs().mean())

@@ -201,10 +201,10 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
 
 def split_pairs(
     folder: str, split: str | None, share: float, exclude: Sequence[str] = ()
-) -> tuple[Dataset, list[int]]:
-    """Open a folder of pairs; give the numbers of the last ones, which are held out.
+) -> tuple[Dataset, list[int], list[int]]:
+    """Open a folder of pairs; give the numbers of those to train on, and of the last, held out.
 
-    Frames that ``exclude`` names are neither trained on nor held out.
+    Frames that ``exclude`` names are neither.
 
     Raises:
         InputError: fewer than two pairs with calibration.
@@ -221,7 +221,7 @@ def split_pairs(
             "a calibration; two at least are needed, one to train on and one to measure by"
         )
     number = min(max(1, round(share * len(usable))), len(usable) - 1)
-    return dataset, usable[-number:]
+    return dataset, usable[:-number], usable[-number:]
 
 
 def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
@@ -231,7 +231,7 @@ def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
         InputError: the first folder has fewer than two pairs with calibration.
     """
     folder, split = config.pairs.folders[0], config.pairs.split
-    dataset, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
+    dataset, _, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
     camera = dataset.read_input(back[0]).camera
     assert camera is not None, "pairs with a calibration"
     matcher = make_matcher(network, MatcherConfig())
@@ -250,23 +250,24 @@ def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
 
 
 def label_folders(config: AdaptTraining, home: Path) -> tuple[PairsConfig, list[StereoInput]]:
-    """Label all pairs by the start, once, below ``home``; give what to train on, and the rest."""
+    """Label pairs by the start, once, below ``home``; give what to train on, and the rest."""
     folders: list[str] = []
-    excluded: list[str] = list(config.pairs.exclude)
     kept: list[StereoInput] = []
     path = find_weights(config.start)
-    net = FakestereoNet.load(path, matcher=path)
+    device = "cuda" if config.loop.device == "auto" and torch.cuda.is_available() else "cpu"
+    net = FakestereoNet.load(path, matcher=path, config=MatcherConfig(device=device))
     for number, folder in enumerate(config.pairs.folders):
         split = config.pairs.split if number == 0 else None
-        dataset, back = split_pairs(folder, split, config.validation_share, config.pairs.exclude)
+        dataset, shown, back = split_pairs(
+            folder, split, config.validation_share, config.pairs.exclude
+        )
         kept += [dataset.read_input(n) for n in back]
-        excluded += [dataset.frames[n].name for n in back]
-        settings = {"dataset": dataset.name, "weights_sha256": file_sha256(path), **asdict(_LIMITS)}
+        held_out = [dataset.frames[n].name for n in back]
+        settings = {"dataset": dataset.name, "held_out": held_out} | asdict(_LIMITS)
+        settings["weights_sha256"] = file_sha256(path)
         place = home / f"{number}-{Path(folder).name}"
-        for _ in label_pairs(net, dataset, _LIMITS, place, settings):
+        for _ in label_pairs(net, dataset, _LIMITS, place, settings, shown):
             pass
         folders.append(str(place))
-    pairs = replace(
-        config.pairs, folders=tuple(folders), exclude=tuple(excluded), truth="disparity", split=None
-    )
+    pairs = replace(config.pairs, folders=tuple(folders), exclude=(), truth="disparity", split=None)
     return pairs, kept

@@ -139,6 +139,9 @@ class SelectTraining:
         for name, value in weights.items():
             if value < 0:
                 raise InputError(f"{name} must be 0 or more, got {value}")
+        _refuse_views_changed_apart(self.pairs)
+        if self.more is not None:
+            _refuse_views_changed_apart(self.more)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,12 +248,7 @@ class AdaptTraining:
                 "validation_share must be above 0 and below 1 and streets 0 or more, got "
                 f"{self.validation_share:g} and {self.streets}"
             )
-        augment = self.pairs.augment
-        if augment.per_view is not None or augment.erased_share or augment.misaligned_px:
-            raise InputError(
-                "pairs.augment changes each view on its own (per_view, erased_share or "
-                "misaligned_px), and this training compares them; omit these"
-            )
+        _refuse_views_changed_apart(self.pairs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,3 +275,12 @@ class FinetuneTraining:
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""
+
+
+def _refuse_views_changed_apart(pairs: PairsConfig) -> None:
+    augment = pairs.augment
+    if augment.per_view is not None or augment.erased_share or augment.misaligned_px:
+        raise InputError(
+            "pairs.augment changes each view on its own (per_view, erased_share or "
+            "misaligned_px), and this training compares them; omit these"
+        )

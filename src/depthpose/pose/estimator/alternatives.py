@@ -85,6 +85,11 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
         same = _joined([same, Rigid(every.R.double(), every.t_m.double()), turns])
         turns = Rigid(turns.R[:0], turns.t_m[:0])
     trained = symmetry_transforms(model.symmetries, 2 * _STEP)
+    compared_m = take_evenly(points_m, _POINTS)
+    centre_m = find_true(model).ball_centre_m
+    if centre_m is not None:  # every turn of a ball is the same pose: its centre alone says where
+        compared_m = centre_m.to(points_m)[None]
+        turns = Rigid(turns.R[:0], turns.t_m[:0])
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
@@ -92,7 +97,7 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
         same=same,
         near=turns,
         trained=Rigid(trained.R.double(), trained.t_m.double()),
-        points_m=take_evenly(points_m, _POINTS),
+        points_m=compared_m,
         middle_m=(points_m.amin(0) + points_m.amax(0)) / 2,
         axes=axes,
         lengths_m=along_m.amax(0) - along_m.amin(0),

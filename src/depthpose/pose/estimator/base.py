@@ -133,9 +133,10 @@ class PoseEstimator(ABC):
         Raises:
             InputError: as for :meth:`estimate`.
         """
-        view = view_input(
-            depth, mask, choose_lens(camera, focal_px), self._object(object), _NAME, unit
-        )
+        lens = choose_lens(camera, focal_px)
+        if lens is None:
+            raise InputError("estimate_instances: give camera= or focal_px=")
+        view = view_input(depth, mask, lens, self._object(object), _NAME, unit)
         pieces = split_instances(view.mask) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
@@ -165,6 +166,8 @@ class PoseEstimator(ABC):
             InputError: as for :meth:`estimate`.
         """
         names = self.objects if objects is None else [self._object(name) for name in objects]
+        if not names:
+            raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
         return self.find_in(view, names)
 
@@ -194,7 +197,8 @@ class PoseEstimator(ABC):
 
         Args:
             frames: depth images as for :meth:`estimate`, in their order; without a camera clouds in
-                the camera frame, of the object alone or of what is about it too. They are taken one
+                the camera frame, of the object alone, or of what is about it too: in these it is
+                looked for only where it was, so they need ``first``. They are taken one
                 by one, as their estimates are taken.
             camera: of the depth images.
             object: which one; None where one alone is known.

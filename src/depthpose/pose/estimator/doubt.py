@@ -69,10 +69,11 @@ def find_refusal(
 def _too_risky(
     signals: dict[str, float], named: dict[str, float], config: RefusalConfig
 ) -> Refusal | None:
-    risk = risk_of(signals, config)
-    if risk is None or risk <= config.max_risk:
+    """Refuse a risk above the limit; ``named`` are the signals that the reason is made of."""
+    risk, said = risk_of(signals, config), risk_of(named, config)
+    if risk is None or said is None or risk <= config.max_risk:
         return None
-    return Refusal(status="doubtful", reason=reason_of(named, risk, config))
+    return Refusal(status="doubtful", reason=reason_of(named, said, config))
 
 
 def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:

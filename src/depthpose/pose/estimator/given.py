@@ -162,13 +162,16 @@ def _refuse_no_picture(values: Tensor, name: str) -> Shaped[Tensor, "h w"]:
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
     if isinstance(values, Tensor):
-        return values.detach().cpu()
+        # Of unsigned numbers torch computes little but with bytes.
+        is_odd = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
+        return (values.long() if is_odd else values).detach().cpu()
     array = np.asarray(values)
     if array.dtype.kind not in "biufc":
         raise InputError(
             f"a {type(values).__name__} where numbers belong; give a tensor or array of numbers, "
             "or a file's path (of a camera: a Camera, its file or its matrix K)"
         )
-    if array.dtype == np.uint16:
-        array = array.astype(np.int32)  # torch computes little with uint16
+    if array.dtype.kind == "u" and array.dtype.itemsize > 1:
+        array = array.astype(np.int64)
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     return torch.from_numpy(np.require(array, requirements=["C", "W"]))  # Pillow lends read-only

@@ -24,6 +24,9 @@ from depthpose.pose.types import CloudInput, ObjectModel, Status, ViewInput
 AnyInput = CloudInput | ViewInput
 _MOST = 0.5
 """Where most points lie farther from their median than the object is long, they are not its."""
+_FARTHEST_M = 1e6
+_BEFORE = 0.05
+"""Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
 _THIN = 0.002
 """Below this root mean square, in diameters, a cloud has no extent."""
 
@@ -95,8 +98,8 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
             return Refusal(status="too few points", reason=_nothing_seen(given))
     else:
         points_m = given.points_m.float()
-    points_m = take_evenly(points_m, most)
-    finite_m = points_m[points_m.isfinite().all(-1)]
+    # Some sensors write the largest float where they have no reading; NaN is not below either.
+    finite_m = take_evenly(points_m[(points_m.abs() < _FARTHEST_M).all(-1)], most)
     if len(finite_m) == 0:
         what = "is empty" if len(points_m) == 0 else "has no point with finite coordinates"
         return Refusal(status="too few points", reason=f"the cloud {what}")
@@ -121,7 +124,7 @@ def _size_refusal(
     """Refuse what is not of this object's size; some background in the mask is none of that."""
     some_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
     advice = unit_advice(model.diameter_m, some_m)
-    if advice is None and float(points_m.median(0).values.norm()) < model.diameter_m / 2:
+    if advice is None and isinstance(given, CloudInput) and _is_centred(points_m, model):
         return Refusal(
             status="unusable input",
             reason="the cloud lies about the origin, where the camera is: it was centred, or is in "
@@ -132,6 +135,13 @@ def _size_refusal(
     hint = _view_hint(given) if isinstance(given, ViewInput) else ""
     reason = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
     return Refusal(status="unusable input", reason=reason)
+
+
+def _is_centred(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> bool:
+    """Whether a cloud lies about the origin; one that was seen is wholly before the camera."""
+    is_near = float(points_m.median(0).values.norm()) < model.diameter_m / 2
+    least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
+    return is_near and least_m < _BEFORE * model.diameter_m
 
 
 def _view_hint(view: ViewInput) -> str:
@@ -152,7 +162,7 @@ def _shape_refusal(
 ) -> Refusal | None:
     if (reason := refusal_of(points_m, cloud)) is not None:
         return Refusal(status="too few points", reason=reason)
-    centred = (points_m - points_m.mean(0)).double()
+    centred = points_m.double() - points_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat = int((extent_m < _THIN * model.diameter_m).sum())
     if flat == 0:

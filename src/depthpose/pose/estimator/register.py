@@ -84,6 +84,8 @@ class Registration(PoseEstimator):
         refusal: RefusalConfig | None = None,
     ) -> None:
         _refuse_no_surface(models)
+        if config is not None and not config.with_icp:
+            raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
         super().__init__(models, config)
         self._models, self._refusal = tuple(models), refusal or _REFUSAL
         self._tables: dict[int, PairTable] = {}

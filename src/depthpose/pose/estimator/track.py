@@ -18,7 +18,7 @@ from depthpose.pose.estimator.prepare import AnyInput, Refusal
 from depthpose.pose.estimator.scene import MARGIN, scene_about
 from depthpose.pose.refine import Refined, refine_best
 from depthpose.pose.surface import NEAR, Surface, compare_depths
-from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate
+from depthpose.pose.types import Alternative, CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting import free_motions
 
 _LEAST_POINTS = 60
@@ -75,7 +75,9 @@ def track(
     for given in frames:
         estimate = _next(given, last, known)
         if estimate.camera_from_model is None:
-            last = None
+            # In a cloud of a whole scene it can be looked for only where it was.
+            is_scene = isinstance(given, CloudInput) and given.view is None
+            last = replace(last, moved=None) if is_scene and last is not None else None
         else:
             pose = _doubled(estimate.camera_from_model)
             if estimate.tracking == "found" or last is None:

@@ -18,7 +18,7 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import Instance
-from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.mesh import symmetry_transforms, turn_about
 from depthpose.pose.metrics import (
     BOP_PIXELS,
     BOP_SHARES,
@@ -35,7 +35,7 @@ from depthpose.pose.metrics import (
 )
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
 from depthpose.pose.synthetic import drawn_triangles
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
 
 BOP_WIDTH_PX = 640
 _MARGIN_PX = 2
@@ -141,28 +141,58 @@ def _mspd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
 
 
 def _rotation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> float:
-    copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
+    copy = _nearest(estimated, instance, ruler)
     return math.degrees(float(rotation_error_rad(estimated, copy)))
 
 
 def _translation(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Tensor:
-    copy = nearest_copy(estimated, instance.camera_from_model, ruler.symmetries)
-    return translation_error_m(estimated, copy)
+    return translation_error_m(estimated, _nearest(estimated, instance, ruler))
 
 
-def nearest_copy(estimated: Rigid, true: Rigid, symmetries: Rigid) -> Rigid:
+def _nearest(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Rigid:
+    true, declared = instance.camera_from_model, ruler.model.symmetries
+    return nearest_copy(estimated, true, ruler.symmetries, declared)
+
+
+def nearest_copy(
+    estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
+) -> Rigid:
     """Give the true pose that is turned least against an estimate, of those that look alike.
 
     Args:
         estimated: ``camera_from_model``.
         true: the same.
         symmetries: motions of the model that leave it as it is, the identity first.
+        declared: the symmetries that these are of: turns about their axes are then exact, not one
+            of the steps in ``symmetries``.
     """
     R, t_m = symmetries.R.double(), symmetries.t_m.double()
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
     one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
     nearest = int(rotation_error_rad(one, copies).argmin())
-    return Rigid(copies.R[nearest], copies.t_m[nearest])
+    copy = Rigid(copies.R[nearest], copies.t_m[nearest])
+    return copy if declared is None else _turned_to(copy, estimated.R.double(), declared)
+
+
+def _turned_to(pose: Rigid, R: Float[Tensor, "3 3"], symmetries: Symmetries) -> Rigid:
+    """Turn a pose about the axes of revolution of its object until it is nearest to ``R``."""
+    if not symmetries.continuous:
+        return pose
+    relative = pose.R.mT @ R
+    centre_m = symmetries.ball_centre_m
+    if centre_m is not None:
+        turn = Rigid(relative, centre_m.to(R) - relative @ centre_m.to(R))
+        return pose @ turn
+    turns = []
+    for axis in symmetries.continuous:
+        a = axis.direction.to(R) / axis.direction.norm()
+        # The trace of relative^T turn(angle) is largest there.
+        skew = relative - relative.mT
+        across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+        angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
+        turns.append(pose @ turn_about(a, axis.point_m.to(R), angle))
+    errors = [float(rotation_error_rad(Rigid(R, pose.t_m), one)) for one in turns]
+    return turns[errors.index(min(errors))]
 
 
 def _vsd(estimated: Rigid, instance: Instance, ruler: ErrorContext) -> Float[Tensor, "10"]:

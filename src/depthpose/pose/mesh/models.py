@@ -4,6 +4,7 @@ What a file declares, or may grow to, is checked before it is read in full.
 """
 
 import json
+import math
 import struct
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
@@ -166,16 +167,41 @@ def make_model(
     return _with_keypoints(model, config.keypoints)
 
 
+_HULL = 8000
+"""Corners of a hull of which all pairs are compared; more take seconds."""
+_DIRECTIONS = 4096
+"""No direction is farther than 0.03 rad from one of these, whose cosine is 0.9995."""
+
+
 def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
-    """Largest distance of two points [m]: both are corners of the convex hull."""
-    points = points_m.double().cpu().numpy()
+    """Largest distance of two points [m]: both are corners of the convex hull.
+
+    Of a hull of more than :data:`_HULL` corners, those farthest in many directions are compared:
+    less than 0.05 % too short.
+    """
+    points = np.unique(points_m.double().cpu().numpy(), axis=0)
     # All on one plane, or fewer than four: there is no hull, and every pair is looked at.
     with suppress(QhullError, ValueError):
         points = points[ConvexHull(points).vertices]
     everything = torch.from_numpy(points)
+    if len(everything) > _HULL:
+        everything = everything[_farthest_each_way(everything)]
     exactly = "donot_use_mm_for_euclid_dist"
     rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
     return max(float(row.max()) for row in rows)
+
+
+def _farthest_each_way(points: Float64[Tensor, "n 3"]) -> Int64[Tensor, " m"]:
+    """Number the points that lie farthest forwards or backwards in evenly spread directions."""
+    k = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
+    z, turn = 1 - k / _DIRECTIONS, k * math.pi * (3 - math.sqrt(5))  # a spiral over half a sphere
+    across = (1 - z.square()).sqrt()
+    directions = torch.stack([across * turn.cos(), across * turn.sin(), z])
+    found = []
+    for some in directions.split(256, dim=1):
+        along = points @ some
+        found += [along.argmax(0), along.argmin(0)]
+    return torch.cat(found).unique()
 
 
 def _with_keypoints(model: ObjectModel, count: int) -> ObjectModel:

@@ -50,7 +50,7 @@ def sample_surface(
 
     Faces are entered in proportion to their area at equal steps, and each point placed by a
     sequence of low discrepancy (Roberts 2018), which is more even than chance. A model of points
-    gives its farthest-apart ones, at most all.
+    gives its own in even steps of their order, at most all.
 
     Args:
         model: the object.

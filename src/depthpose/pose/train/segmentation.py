@@ -7,7 +7,15 @@ import torch
 from torch import nn
 
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights
-from depthpose.core.loop import Run, Update, ValidationResult, held_out_text, make_adam, write_card
+from depthpose.core.loop import (
+    Run,
+    Update,
+    ValidationResult,
+    held_out_text,
+    holds_folder,
+    make_adam,
+    write_card,
+)
 from depthpose.core.run import find_rank
 from depthpose.pose.losses import mask_loss
 from depthpose.pose.resnet import KIND, normalise_colors, read_encoder_state
@@ -74,6 +82,7 @@ class SegmentationTask:
         return ValidationResult(numbers=numbers, pictures=pictures)
 
 
+@holds_folder
 def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     """Train FCN; give its weights file."""
     torch.manual_seed(config.loop.seed)

@@ -8,12 +8,10 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
-from depthpose.pose.types import Axis, PoseFit
+from depthpose.pose.types import Axis, PoseFit, Symmetries
 
 _STEPS = 4
 """Gauss-Newton from Kabsch converges quadratically; the fourth step is below float64's noise."""
-_OTHER_AXIS = 0.1
-"""Sine of the angle between two axes from which they are two."""
 
 
 def fit_pose(
@@ -80,21 +78,11 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
 
 
 def _with_third(axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
-    """Add what two axes imply: turns about both, one after the other, turn about every axis."""
-    for other in axes[1:]:
-        across = torch.linalg.cross(axes[0].direction, other.direction)
-        if float(across.norm()) > _OTHER_AXIS:
-            third = Axis(direction=across / across.norm(), point_m=_meeting_m(axes[0], other))
-            return axes[0], other, third
-    return axes[:1]
-
-
-def _meeting_m(first: Axis, other: Axis) -> Float[Tensor, "3"]:
-    """The centre: where two axes that are not parallel come nearest to each other."""
-    eye = torch.eye(3).to(first.direction)
-    across = torch.stack([eye - torch.outer(a.direction, a.direction) for a in (first, other)])
-    points_m = torch.stack([first.point_m, other.point_m])
-    return torch.linalg.solve(across.sum(0), (across @ points_m[..., None]).sum(0)).squeeze(-1)
+    """Give one axis, or three of a ball: turns about two make those about every axis."""
+    centre_m = Symmetries(continuous=axes).ball_centre_m
+    if centre_m is None:
+        return axes[:1]
+    return tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
 
 
 def _normal_equations(
