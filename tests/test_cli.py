@@ -127,6 +127,11 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
         (["export", "depth", "--out", "d.onnx", "--format", "onnx"],
          "'depthpose export depth' has no --format any more: ONNX is the one format"),
         (["export", "pose", "--format=onnx", "--out", "p.onnx"], "omit --format"),
+        (["depth", "predict", "--focal-px", "700", "--out", "o"], "name images, folders of them"),
+        (["depth", "evaluate", "--data", ".", "--weights", "default", "--cap", "-1", "--out", "o"],
+         "--cap -1: a distance in metres, above 0"),
+        (["weights", "list", "--folder", "nowhere"], "nowhere: there is no such file or folder"),
+        (["data", "check", "x" * 300], "File name too long"),
     ],
 )  # fmt: skip
 def test_wrong_words_are_refused(

@@ -142,6 +142,16 @@ def test_other_settings_need_another_folder(
     assert "color_range_m" in capsys.readouterr().err
 
 
+def test_a_manifest_of_somebody_else_is_not_written_over(
+    home: Path, tmp_path: Path, double: InProcessEngine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = shutil.copytree(home / "left", tmp_path / "in")
+    (images / "manifest.csv").write_text("image\n0.png\n")
+    assert predict(home, images, str(images / "manifest.csv"), *RAY) == 2
+    assert "manifest.csv: is there already, and no run" in capsys.readouterr().err
+    assert (images / "manifest.csv").read_text() == "image\n0.png\n"
+
+
 @pytest.fixture
 def truth(home: Path, tmp_path: Path) -> Path:
     """The five pairs as a data set with truth; the last one has none."""

@@ -148,6 +148,29 @@ def test_a_depth_image_alone_is_searched(
         assert (out / f"{name}.pose.png").is_file()
         assert len(read_cloud(out / f"{name}.pose.ply").points) > 5000
     assert (out / "report.html").is_file()
+    _search_again(["pose", "predict", *words, "--weights", str(weights), "--out"], out, capsys)
+
+
+def _search_again(words: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was found stays, what could not be read is read again, and no view is shown."""
+    depth = out.parent / "depth"
+    whole = (depth / "wall.png").read_bytes()
+    (depth / "torn.png").write_bytes(whole[:100])
+    before = poses_of(out)
+    assert main([*words, str(out)]) == 1
+    assert "failed: torn: cannot be read" in capsys.readouterr().err
+    rows = poses_of(out)
+    assert rows.pop("torn")["status"] == "unreadable"
+    assert rows == before
+    (depth / "torn.png").write_bytes(whole)
+    assert main([*words, str(out)]) == 0
+    assert poses_of(out)["torn"]["status"] == "doubtful"
+    (depth / "wall_1.png").write_bytes(whole)
+    assert main([*words, str(out)]) == 2
+    assert "two depth images are called 'wall' and 'wall_1'" in capsys.readouterr().err
+    (depth / "wall_1.png").unlink()
+    assert main([*words, str(out), "--view", "x.rrd"]) == 2
+    assert "--view shows inputs that have a mask" in capsys.readouterr().err
 
 
 def test_results_never_take_the_place_of_inputs(
@@ -234,6 +257,10 @@ def test_a_folder_of_depth_images_is_done_once(
     assert (out / "poses.json").read_text() == before
     assert main([*words, "--no-icp"]) == 2
     assert "holds results made with" in capsys.readouterr().err
+    camera = tmp_path / "camera.json"
+    camera.write_text(camera.read_text().replace("0.001", "0.0010001"))
+    assert main(words) == 2, "the same file with another content"
+    assert "camera_sha256" in capsys.readouterr().err
 
 
 def test_the_page_says_each_refusal_and_shows_few_of_many(weights: Path, tmp_path: Path) -> None:
@@ -346,6 +373,7 @@ def test_two_processes_share_the_work(
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera beside it"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
+        (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),
     ],
 )
 def test_what_cannot_be_predicted_is_refused(

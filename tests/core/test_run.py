@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.run import (
     ProcessRank,
@@ -45,6 +46,10 @@ def test_an_input_that_has_changed_is_refused(tmp_path: Path) -> None:
     image.write_bytes(b"one")
     claim_folder(out, {"a": 1})
     claim_names(out, {"x": image})
+    claim_names(out, {"x": image})
+    image.write_bytes(b"mended")
+    claim_names(out, {"x": image})
+    (out / "x.depth_m.npy").touch()
     claim_names(out, {"x": image})
     image.write_bytes(b"another")
     with pytest.raises(InputError, match=r"x\.png: has changed since its result 'x'"):
@@ -184,3 +189,8 @@ def test_a_nested_setting_is_named_by_its_path_and_a_new_one_may_be_off(tmp_path
         claim_folder(tmp_path, {"pairs": {"limit": 3, "share": 0.5}})
     with pytest.raises(InputError, match=r"pairs\.limit = 3, but now it is 4"):
         claim_folder(tmp_path, {"pairs": {"limit": 4}})
+
+
+def test_a_device_that_cannot_compute_is_refused() -> None:
+    with pytest.raises(InputError, match=r"device 'meta' cannot be used here .* take 'cpu'"):
+        usable_device("meta")

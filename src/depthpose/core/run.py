@@ -1,5 +1,6 @@
 """One folder per run, with what made it: settings, versions, machine, commit."""
 
+import glob
 import json
 import os
 import platform
@@ -188,7 +189,8 @@ def claim_names(
                 f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
                 "one name need two folders: choose another"
             )
-        if before and stamp and before != stamp:
+        is_other = before and stamp and before != stamp
+        if is_other and any(folder.glob(f"{glob.escape(name)}.*")):
             raise InputError(
                 f"{path}: has changed since its result {name!r} in {folder} was made; choose "
                 "another folder, or delete this one"
@@ -198,7 +200,7 @@ def claim_names(
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in known and (stem in new or is_frame):
             raise _not_ours(file)
-    if new:
+    if any(known.get(name) != entry for name, entry in wanted.items()):
         write_json(record, known | wanted)
 
 

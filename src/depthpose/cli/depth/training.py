@@ -158,6 +158,8 @@ def calibrate(
     from depthpose.depth.estimator import FakestereoNet
 
     refuse_to_replace(out)
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: end the name in .safetensors")
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
