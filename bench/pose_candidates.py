@@ -32,8 +32,8 @@ Case = tuple[list[dict[str, float]], int]
 
 def add_of(pose: Rigid, truth: Rigid, copies: PoseAmbiguities) -> float:
     """ADD in diameters to the nearest true copy."""
-    double = Rigid(truth.R.double(), truth.t_m.double()) @ copies.same
-    there_m = Rigid(pose.R.double(), pose.t_m.double()).apply(copies.points_m)
+    double = truth.double() @ copies.same
+    there_m = pose.double().apply(copies.points_m)
     gap_m = there_m - double.apply(copies.points_m.expand(len(double.R), -1, -1))
     return float(gap_m.norm(dim=-1).mean(-1).min()) / copies.diameter_m
 

@@ -33,7 +33,7 @@ def cases_in(folder: Path) -> list[Case]:
     for case in (*lm_cases(folder), *bunny_cases(folder, every=20)):
         if not case.name.endswith(("090", "270")):
             pose = case.sample.truth.camera_from_model
-            pose = Rigid(pose.R.double(), pose.t_m.double())
+            pose = pose.double()
             cases.append((case.name, case.sample.input.points_m, pose, case.model))
     return cases
 

@@ -58,7 +58,7 @@ def bench(case: RealCase, tries: int) -> list[dict]:
     points_m = case.sample.input.points_m.double()
     points_m = points_m[~is_flying(points_m, case.model.diameter_m)]
     given = case.sample.truth.camera_from_model
-    truth = Rigid(given.R.double(), given.t_m.double())
+    truth = given.double()
     middle_m = truth.apply(case.model.vertices_m.double()).mean(0)
     generator = torch.Generator().manual_seed(0)
     rows = []

@@ -116,7 +116,7 @@ def sequence(model: ObjectModel, number: int, speed: float, seed: int) -> Iterat
             name=f"{model.name}_{k:04d}", depth_m=measured_m.float(), K=K.float(),
             mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool), object=model.name,
         )  # fmt: skip
-        yield Frame(view, Rigid(truth.R.float(), truth.t_m.float()), not is_removed | is_covered)
+        yield Frame(view, truth.float(), not is_removed | is_covered)
 
 
 def verdict(model: ObjectModel, points_m: Tensor, frame: Frame, found: PoseEstimate) -> str:

@@ -103,3 +103,13 @@ def test_a_transform_is_one_readable_line() -> None:
     rows = "[1.0000, 0.0000, 0.0000], [0.0000, 1.0000, 0.0000], [0.0000, 0.0000, 1.0000]"
     assert repr(pose) == f"Rigid(R=[{rows}], t_m=[0.1000, -0.2500, 1.0000])"
     assert repr(random_rigid((2, 3))) == "Rigid(a batch of (2, 3))"
+
+
+def test_batches_are_stacked_joined_and_taken_apart() -> None:
+    one, other = (Rigid(torch.eye(3), torch.full((3,), k)) for k in (1.0, 2.0))
+    both = Rigid.stack([one, other])
+    assert both.t_m.shape == (2, 3)
+    assert torch.equal(both[1].t_m, other.t_m)
+    assert torch.equal(Rigid.cat([both[[1]], one[None]]).t_m, both[[1, 0]].t_m)
+    assert both.double().R.dtype == torch.float64
+    assert both.double().float().t_m.dtype == torch.float32

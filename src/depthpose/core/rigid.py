@@ -37,6 +37,28 @@ class Rigid:
         """Give ``source_from_target``."""
         return Rigid(self.R.mT, -(self.R.mT @ self.t_m[..., None]).squeeze(-1))
 
+    def double(self) -> "Rigid":
+        """Give it in float64."""
+        return Rigid(self.R.double(), self.t_m.double())
+
+    def float(self) -> "Rigid":
+        """Give it in float32."""
+        return Rigid(self.R.float(), self.t_m.float())
+
+    def __getitem__(self, index: int | list[int] | Tensor | None) -> "Rigid":
+        """Give one of a batch or several as a batch; of None a batch of one."""
+        return Rigid(self.R[index], self.t_m[index])
+
+    @classmethod
+    def stack(cls, poses: Sequence["Rigid"]) -> "Rigid":
+        """Make a batch; at least of one."""
+        return cls(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
+
+    @classmethod
+    def cat(cls, batches: Sequence["Rigid"]) -> "Rigid":
+        """Join batches; at least one."""
+        return cls(torch.cat([b.R for b in batches]), torch.cat([b.t_m for b in batches]))
+
     def matrix(self) -> Float64[Tensor, "*batch 4 4"]:
         """Give ``[[R, t], [0, 1]]``, the translation in metres."""
         top = torch.cat([self.R, self.t_m[..., None]], -1).double()

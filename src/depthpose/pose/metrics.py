@@ -212,7 +212,7 @@ def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch
 
 def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
     """Poses that look like the true one, in groups that fit into memory."""
-    pose = Rigid(true.R.double(), true.t_m.double())
+    pose = true.double()
     R, t_m = symmetries.R.double(), symmetries.t_m.double()
     size = max(1, _CHUNK // (3 * points))
     return [

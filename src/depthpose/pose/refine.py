@@ -107,7 +107,7 @@ def refine_pose(
     _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
     limits_m = _limits(config, surface.diameter_m)
-    pose = _iterated(cloud, _doubled(initial), surface, limits_m, surface.nearest)
+    pose = _iterated(cloud, initial.double(), surface, limits_m, surface.nearest)
     end_m = config.end_distance_diameters * surface.diameter_m
     equations = _normal_equations(cloud, pose, surface, end_m, surface.nearest)
     return _result(points_m, pose, equations, _middle(cloud))
@@ -139,7 +139,7 @@ def refine_best(
     config = IcpConfig() if config is None else config
     _refuse_no_points(points_m)
     given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    starts = _starts(_doubled(given), surface, config.starts)
+    starts = _starts(given.double(), surface, config.starts)
     tried = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
     worth = _worth(points_m, tried, surface, end_m)
@@ -147,15 +147,15 @@ def refine_best(
     short = replace(config, iterations=(config.iterations + 1) // 2)
     refined = None
     if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
-        refined = refine_pose(points_m, _one(given, best), surface, short)
-        exact, rough = _doubled(refined.camera_from_model), _one(tried, best)
-        both = Rigid(torch.stack([exact.R, rough.R]), torch.stack([exact.t_m, rough.t_m]))
+        refined = refine_pose(points_m, given[best], surface, short)
+        exact, rough = refined.camera_from_model.double(), tried[best]
+        both = Rigid.stack([exact, rough])
         if float(_worth(points_m, both, surface, end_m).diff()) > 0:
             refined = None  # it began farther off than exact steps reach
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
-        refined = refine_pose(points_m, _one(tried, best), surface, short)
-    away = _distances(tried, _doubled(refined.camera_from_model), surface) > _OTHER
+        refined = refine_pose(points_m, tried[best], surface, short)
+    away = _distances(tried, refined.camera_from_model.double(), surface) > _OTHER
     others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
     return Best(refined, best % len(given.R), float(away.double().mean()), others)
 
@@ -248,22 +248,10 @@ def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> R
     for k in worth.argsort(descending=True).tolist():
         if len(chosen) == _MOST_OTHERS or worth[k] == -torch.inf:
             break
-        if all(float(_distances(_pick(poses, [k]), _one(poses, c), surface)) > _OTHER
+        if all(float(_distances(poses[[k]], poses[c], surface)) > _OTHER
                for c in chosen):  # fmt: skip
             chosen.append(k)
-    return _pick(poses, chosen)
-
-
-def _pick(poses: Rigid, numbers: list[int]) -> Rigid:
-    return Rigid(poses.R[numbers], poses.t_m[numbers])
-
-
-def _one(poses: Rigid, number: int) -> Rigid:
-    return Rigid(poses.R[number], poses.t_m[number])
-
-
-def _doubled(pose: Rigid) -> Rigid:
-    return Rigid(pose.R.double(), pose.t_m.double())
+    return poses[chosen]
 
 
 def _limits(config: IcpConfig, diameter_m: float) -> list[float]:

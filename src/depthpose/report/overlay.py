@@ -53,7 +53,7 @@ def draw_pose(
         is_true: draw the box alone, green and dashed, as the truth beside an estimate; an estimate
             is blue.
     """
-    pose = Rigid(pose.R.double(), pose.t_m.double())
+    pose = pose.double()
     ends_m = pose.apply(box_edges(model).double().flatten(0, 1))
     ends_px = project(ends_m, K).unflatten(0, (12, 2))
     if is_true:
@@ -98,7 +98,7 @@ def pose_layers(
         is_true: draw it as the truth beside an estimate.
         with_box: whether an estimate's box is seen at first; that of a truth is.
     """
-    pose = Rigid(pose.R.double(), pose.t_m.double())
+    pose = pose.double()
 
     def posed(ends_m: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         return pose.apply(ends_m.double().flatten(0, 1)).unflatten(0, (-1, 2)).float()
@@ -122,7 +122,7 @@ def alternative_layers(found: PoseEstimate, model: ObjectModel) -> list[Layer]:
     """Show each alternative by its axes and its box, not shown at first."""
     layers: list[Layer] = []
     for other in found.alternatives:
-        pose = Rigid(other.camera_from_model.R.double(), other.camera_from_model.t_m.double())
+        pose = other.camera_from_model.double()
         ends_m = pose.apply(box_edges(model).double().flatten(0, 1)).unflatten(0, (12, 2)).float()
         said = f"{other.difference}, {other.probability:.0%}"
         box = colored_lines(ends_m, OTHER)

@@ -86,6 +86,10 @@ class ObjectsOptions:
         """
         from depthpose.pose.config import ObjectsConfig, SensorConfig
 
+        if self.number < 1:
+            raise InputError(f"--number {self.number}: at least 1 frame")
+        if not re.fullmatch(r"[\w-]+", self.split) or self.split == "models":
+            raise InputError(f"--split {self.split}: a name of letters and digits, not 'models'")
         sensor = SensorConfig(kinds=(self.sensor,))
         return ObjectsConfig(
             seed=self.seed, distance_m=self.distance, sensor=sensor, number=self.number
@@ -140,12 +144,9 @@ def make_objects(
     from depthpose.core.run import claim_folder
     from depthpose.pose.datasets import write_bop_models
 
-    if frames.number < 1:
-        raise InputError(f"--number {frames.number}: at least 1 frame")
-    if not re.fullmatch(r"[\w-]+", frames.split) or frames.split == "models":
-        raise InputError(f"--split {frames.split}: a name of letters and digits, not 'models'")
+    settings = _object_settings(cad, frames)
     models = _read_models(cad, frames)
-    claim_folder(out, _object_settings(cad, frames), ["models", frames.split])
+    claim_folder(out, settings, ["models", frames.split])
     write_bop_models(out, models)
     scenes = _scenes(frames)
     wanted = {k: v for k, v in scenes.items() if not _is_made(out / frames.split, k, v)}

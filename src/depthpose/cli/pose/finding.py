@@ -50,16 +50,25 @@ def find_all(
     facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     claim(out, settings, [], depth)
-    earlier = read_predictions(out) if is_started(out) else []
+    found = _find_left(jobs, objects, method, out)
+    claim(out, settings, [job for _, job in found], depth)
+    return _write(found, method, out)
+
+
+def _find_left(
+    jobs: Sequence[Job[Any]], objects: tuple[str, ...], method: PoseMethod, out: Path
+) -> list[tuple[Prediction, Job[Any]]]:
+    """Search the images of which no earlier run left a result; all are written after each."""
+    left = [p for p in read_predictions(out) if is_finished(p)] if is_started(out) else []
     found: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
-        own = [p for p in earlier if _image_of(p.estimate.name, job.name) and is_finished(p)]
+        own = [p for p in left if _image_of(p.estimate.name, job.name)]
+        left = [p for p in left if p not in own]
         found += [(p, explained_job(job, p.estimate, method)) for p in own] or list(
             _find(method, job, objects)
         )
-        write_predictions(out, [prediction for prediction, _ in found])
-    claim(out, settings, [job for _, job in found], depth)
-    return _write(found, method, out)
+        write_predictions(out, [*(prediction for prediction, _ in found), *left])
+    return found
 
 
 def _image_of(name: str, image: str) -> bool:

@@ -12,7 +12,6 @@ from depthpose.cli.thesis.depth_tables import claim_figure
 from depthpose.cli.thesis.views import Views
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image, write_image
-from depthpose.core.rigid import Rigid
 from depthpose.core.run import environment
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
@@ -171,5 +170,5 @@ def _picture_of(instance: Instance) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor
 
 
 def _true_keypoints(case: VotingCase) -> Float[Tensor, "k 3"]:
-    pose = Rigid(case.truth.R.float(), case.truth.t_m.float())
+    pose = case.truth.float()
     return pose.apply(case.model.keypoints_m.float())

@@ -75,28 +75,26 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     """
     points_m = sample_surface(model, 2000)[0].double()
     near = [one.model_from_model for one in near_symmetries(model)]
-    turns = (
-        _stacked(near) if near else Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
-    )
-    same = symmetry_transforms(find_true(model), _STEP)
-    same = Rigid(same.R.double(), same.t_m.double())
+    none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
+    turns = Rigid.stack(near) if near else none
+    same = symmetry_transforms(find_true(model), _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
-        same = _joined([same, Rigid(every.R.double(), every.t_m.double()), turns])
-        turns = Rigid(turns.R[:0], turns.t_m[:0])
+        same = Rigid.cat([same, every.double(), turns])
+        turns = none
     trained = symmetry_transforms(model.symmetries, 2 * _STEP)
     compared_m = take_evenly(points_m, _POINTS)
     centre_m = find_true(model).ball_centre_m
     if centre_m is not None:  # every turn of a ball is the same pose: its centre alone says where
         compared_m = centre_m.to(points_m)[None]
-        turns = Rigid(turns.R[:0], turns.t_m[:0])
+        turns = none
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
     return PoseAmbiguities(
         same=same,
         near=turns,
-        trained=Rigid(trained.R.double(), trained.t_m.double()),
+        trained=trained.double(),
         points_m=compared_m,
         middle_m=(points_m.amin(0) + points_m.amax(0)) / 2,
         axes=axes,
@@ -136,7 +134,7 @@ def find_candidates(
     Returns:
         The best first, then those that are other poses than it and than each other.
     """
-    starts = _joined([others, best.pose @ copies.near])
+    starts = Rigid.cat([others, best.pose @ copies.near])
     kept = [best]
     if len(starts.R) == 0:
         return kept
@@ -165,7 +163,7 @@ def _refined(
     found = refine_pose(cloud_m.double(), starts, surface, short)
     pose = found.camera_from_model
     return [
-        Candidate(Rigid(pose.R[k], pose.t_m[k]), found.covariance[k], float(found.residual_m[k]))
+        Candidate(pose[k], found.covariance[k], float(found.residual_m[k]))
         for k in range(len(starts.R))
         if float(found.inlier_share[k]) > 0
     ]
@@ -219,7 +217,7 @@ def alternatives_among(
     pose = candidates[best].pose
     return tuple(
         Alternative(
-            camera_from_model=Rigid(other.R.float(), other.t_m.float()),
+            camera_from_model=other.float(),
             probability=float(shares[k]),
             difference=difference_of(other, pose, copies),
             signals=evidence[k],
@@ -264,11 +262,3 @@ def _axis_of(R: Float64[Tensor, "3 3"]) -> Float64[Tensor, "3"]:
     axis = torch.linalg.svd(R - torch.eye(3, dtype=R.dtype)).Vh[-1]
     skew = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return axis if float(axis @ skew) >= 0 else -axis
-
-
-def _stacked(poses: Sequence[Rigid]) -> Rigid:
-    return Rigid(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
-
-
-def _joined(poses: Sequence[Rigid]) -> Rigid:
-    return Rigid(torch.cat([p.R for p in poses]), torch.cat([p.t_m for p in poses]))

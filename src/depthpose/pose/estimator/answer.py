@@ -53,7 +53,7 @@ class Found(NamedTuple):
 def candidate_of(source: PoseFit | Refined) -> Candidate:
     """Take a fitted or a refined pose as one that may be right."""
     given = source.camera_from_model
-    pose = Rigid(given.R.double(), given.t_m.double())
+    pose = given.double()
     return Candidate(pose, source.covariance, float(source.residual_m))
 
 
@@ -80,7 +80,7 @@ def answer_of(model: ObjectModel, found: Found, vote: Vote | None = None) -> Pos
         name="",
         object=model.name,
         status="ok",
-        camera_from_model=Rigid(found.pose.R.float(), found.pose.t_m.float()),
+        camera_from_model=found.pose.float(),
         keypoints_m=None if vote is None else vote.keypoints_m.float(),
         covariance=without_motions(found.covariance, free).float(),
         free_motions=free.float(),

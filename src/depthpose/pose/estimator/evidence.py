@@ -93,7 +93,7 @@ def surface_signals(
     distance_m, _ = _nearest(points_m, pose, surface)
     near_m = distance_m[distance_m < limit_m]
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
-    alone = Rigid(pose.R[None], pose.t_m[None])
+    alone = pose[None]
     front, unseen = look_along_rays(cloud_m.double(), alone, surface)
     tilt, rough = _tilt_and_roughness(cloud_m.double(), pose, surface)
     return {

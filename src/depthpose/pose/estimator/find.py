@@ -234,7 +234,7 @@ def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: SearchTargets) -> 
 
 
 def _is_explained(cloud: Tensor, pose: Rigid, surface: Surface) -> Tensor:
-    local_m = Rigid(pose.R.double(), pose.t_m.double()).inverse().apply(cloud.double())
+    local_m = pose.double().inverse().apply(cloud.double())
     distance_m = (local_m - surface.points_m[surface.nearest(local_m)]).norm(dim=-1)
     return distance_m < NEAR * surface.diameter_m
 
@@ -259,7 +259,7 @@ def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) ->
     if signals["unseen"] > _HIDDEN or signals["through"] > _SEEN_THROUGH:
         return False
     surface = known.surface_of(estimate.object)
-    posed_m = Rigid(pose.R.double(), pose.t_m.double()).apply(surface.points_m)
+    posed_m = pose.double().apply(surface.points_m)
     u, v = project(posed_m, scene.view.K.double()).round().long().unbind(-1)
     height, width = scene.view.depth_m.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (posed_m[:, 2] > 0)

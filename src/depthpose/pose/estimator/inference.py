@@ -107,7 +107,7 @@ class PoseInference(PoseEstimator):
         """When an answer is withheld: calibrated with the weights."""
         return self.weights.refusal
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate many at once, of any objects: the network is called for all of them together.
 
@@ -120,7 +120,7 @@ class PoseInference(PoseEstimator):
         estimates = {k: found for k, found, _ in self._each(inputs)}
         return [estimates[k] for k in range(len(inputs))]
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 

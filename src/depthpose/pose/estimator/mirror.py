@@ -49,7 +49,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
         return float(own - rough.min())
     nearest = rough.argmin()[None]  # one is enough: three found no other gain in 24 views
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
-    found = refine_pose(mirrored_m, Rigid(tried.R[nearest], tried.t_m[nearest]), surface, config)
+    found = refine_pose(mirrored_m, tried[nearest], surface, config)
     exact_m = found.camera_from_model.inverse().apply(mirrored_m[None])
     own = distance_to(local_m, surface, surface.nearest)
     return float(own - distance_to(exact_m, surface, surface.nearest).min())

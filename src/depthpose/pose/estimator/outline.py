@@ -78,7 +78,7 @@ def _across(
 ) -> tuple[Float64[Tensor, "k 2"], Float64[Tensor, "m 2"], Float64[Tensor, "m 3"]]:
     """Give points and posed surface across the view, in diameters, and the latter in the camera."""
     cloud_m = take_evenly(cloud_m.double(), _SAMPLED)
-    posed_m = Rigid(pose.R.double(), pose.t_m.double()).apply(surface.points_m)
+    posed_m = pose.double().apply(surface.points_m)
     posed_m[:, 2].clamp_(min=0.1 * float(cloud_m[:, 2].median()))
     scale = cloud_m[:, 2].median() / surface.diameter_m
     cloud, posed = (points[:, :2] / points[:, 2:] * scale for points in (cloud_m, posed_m))

@@ -138,7 +138,7 @@ def _none_of(pose: Rigid) -> Rigid:
 def _row(fits: PoseFit, number: int) -> PoseFit:
     pose = fits.camera_from_model
     return PoseFit(
-        camera_from_model=Rigid(pose.R[number], pose.t_m[number]),
+        camera_from_model=pose[number],
         covariance=fits.covariance[number],
         residual_m=fits.residual_m[number],
         misfit=fits.misfit[number],

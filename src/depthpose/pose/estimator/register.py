@@ -123,7 +123,7 @@ class Registration(PoseEstimator):
             self._copies_of(number)
             self._table(number)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate one after the other; a model is prepared when it is first asked for.
 

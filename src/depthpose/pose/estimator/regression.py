@@ -60,7 +60,7 @@ class DepthImageRegressor:
         """Names of the objects that the weights know."""
         return tuple(self._numbers)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
         """Estimate one after the other.
 

@@ -30,9 +30,9 @@ def seen_through(view: ViewInput, pose: Rigid, surface: Surface) -> float:
         pose: ``camera_from_model``.
         surface: of the model.
     """
-    pose = Rigid(pose.R.double(), pose.t_m.double())
+    pose = pose.double()
     whole = replace(view, mask=torch.ones_like(view.mask))
-    scene_m = scene_about(whole, Rigid(pose.R[None], pose.t_m[None]), surface)
+    scene_m = scene_about(whole, pose[None], surface)
     return compare_depths(scene_m, pose, surface)[1]
 
 

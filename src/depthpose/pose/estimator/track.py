@@ -4,10 +4,9 @@ A frame costs ICP alone as long as what was seen agrees with the pose that comes
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -71,7 +70,7 @@ def track(
         An estimate for each frame, whose ``tracking`` says how it came about. One that is lost has
         no pose, and the reason.
     """
-    last = None if first is None else _Last(pose=_doubled(first), moved=None, origin=None)
+    last = None if first is None else _Last(pose=first.double(), moved=None, origin=None)
     for given in frames:
         estimate = _next(given, last, known)
         if estimate.camera_from_model is None:
@@ -79,7 +78,7 @@ def track(
             is_scene = isinstance(given, CloudInput) and given.view is None
             last = replace(last, moved=None) if is_scene and last is not None else None
         else:
-            pose = _doubled(estimate.camera_from_model)
+            pose = estimate.camera_from_model.double()
             if estimate.tracking == "found" or last is None:
                 last = _Last(pose=pose, moved=None, origin=estimate)
             else:
@@ -114,9 +113,9 @@ def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal 
     """Compare a pose that was found with the frame, as one that was followed is."""
     if pose is None:
         return None
-    pose = _doubled(pose)
+    pose = pose.double()
     return _contradiction(
-        compare_depths(scene_about(given, _batch([pose]), surface), pose, surface)
+        compare_depths(scene_about(given, Rigid.stack([pose]), surface), pose, surface)
     )
 
 
@@ -155,11 +154,11 @@ def _accepted(
     refined: Refined, scene_m: Float64[Tensor, "n 3"], known: TrackedObject, last: _Last
 ) -> PoseEstimate | Refusal:
     """Accept a pose that the scene agrees with and that is observable."""
-    surface, pose = known.surface, _doubled(refined.camera_from_model)
+    surface, pose = known.surface, refined.camera_from_model.double()
     shares = compare_depths(scene_m, pose, surface)
     if (contradiction := _contradiction(shares)) is not None:
         return contradiction
-    own_m = _near(scene_m, _batch([pose]), surface, NEAR)
+    own_m = _near(scene_m, Rigid.stack([pose]), surface, NEAR)
     free = free_motions(known.model.symmetries.continuous, pose)
     observable, _ = observability(own_m, pose, surface, free)
     if observable < known.refusal.min_hold:
@@ -186,12 +185,12 @@ def _answer(
         name="",
         object=known.model.name,
         status="ok",
-        camera_from_model=Rigid(pose.R.float(), pose.t_m.float()),
+        camera_from_model=pose.float(),
         covariance=without_motions(refined.covariance, free).float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
         certainty=None if origin is None else origin.certainty,
-        alternatives=() if origin is None else _carried(origin, _doubled(pose)),
+        alternatives=() if origin is None else _carried(origin, pose.double()),
         signals=signals,
         tracking="tracked",
     )
@@ -200,11 +199,11 @@ def _answer(
 def _carried(origin: PoseEstimate, pose: Rigid) -> tuple[Alternative, ...]:
     """Move the alternatives of the first answer along with the object."""
     assert origin.camera_from_model is not None
-    back = _doubled(origin.camera_from_model).inverse()
+    back = origin.camera_from_model.double().inverse()
 
     def moved(other: Alternative) -> Rigid:
-        there = pose @ (back @ _doubled(other.camera_from_model))
-        return Rigid(there.R.float(), there.t_m.float())
+        there = pose @ (back @ other.camera_from_model.double())
+        return there.float()
 
     return tuple(replace(a, camera_from_model=moved(a)) for a in origin.alternatives)
 
@@ -215,7 +214,7 @@ def _starts(last: _Last) -> Rigid:
     if last.moved is not None:
         turned = Rigid(last.moved.R @ last.pose.R, last.pose.t_m + last.moved.t_m)
         every.insert(0, turned)
-    return _batch(every)
+    return Rigid.stack(every)
 
 
 def _motion(before: Rigid, after: Rigid) -> Rigid:
@@ -230,11 +229,3 @@ def _near(
     local_m = poses.inverse().apply(points_m.expand(len(poses.R), -1, -1))
     gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
     return points_m[(gap_m < limit * surface.diameter_m).any(0)]
-
-
-def _batch(poses: Sequence[Rigid]) -> Rigid:
-    return Rigid(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
-
-
-def _doubled(pose: Rigid) -> Rigid:
-    return Rigid(pose.R.double(), pose.t_m.double())

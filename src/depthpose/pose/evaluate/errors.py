@@ -170,7 +170,7 @@ def nearest_copy(
     copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
     one = Rigid(estimated.R.double().expand_as(R), estimated.t_m.double().expand_as(t_m))
     nearest = int(rotation_error_rad(one, copies).argmin())
-    copy = Rigid(copies.R[nearest], copies.t_m[nearest])
+    copy = copies[nearest]
     return copy if declared is None else _turned_to(copy, estimated.R.double(), declared)
 
 

@@ -176,7 +176,7 @@ def _alike(given: Symmetries, surface: SurfaceDeviation) -> Symmetries:
     discrete = given.discrete
     if discrete is not None:
         is_alike = surface.deviation(discrete.R.double()) <= ALIKE
-        discrete = Rigid(discrete.R[is_alike], discrete.t_m[is_alike]) if is_alike.any() else None
+        discrete = discrete[is_alike] if is_alike.any() else None
     return Symmetries(discrete=discrete, continuous=axes, is_found=True)
 
 

@@ -158,7 +158,7 @@ def symmetries_from_proposals(
     if not kept:
         return Symmetries(continuous=axes)
     kept = kept if axes else _completed(kept)
-    discrete = Rigid(torch.stack([t.R for t in kept]), torch.stack([t.t_m for t in kept]))
+    discrete = Rigid.stack(kept)
     return Symmetries(discrete=discrete, continuous=axes)
 
 

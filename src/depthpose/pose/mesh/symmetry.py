@@ -53,7 +53,7 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
         R = turns.R[:, None] @ eye.R[None]
         t_m = (turns.R[:, None] @ eye.t_m[None, :, :, None]).squeeze(-1) + turns.t_m[:, None]
         every.append(Rigid(R.flatten(0, 1), t_m.flatten(0, 1)))
-    return Rigid(torch.cat([r.R for r in every]), torch.cat([r.t_m for r in every]))
+    return Rigid.cat(every)
 
 
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:

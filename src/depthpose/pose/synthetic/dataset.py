@@ -157,7 +157,7 @@ class Objects:
         )
         everything = max(int(silhouette_of(clean).sum()), 1)
         truth = PoseTruth(
-            camera_from_model=Rigid(pose.R.float(), pose.t_m.float()),
+            camera_from_model=pose.float(),
             visible_fraction=int(visible.sum()) / everything,
         )
         return ViewSample(input=given, truth=truth)

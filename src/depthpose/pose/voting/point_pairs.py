@@ -126,7 +126,7 @@ def propose_poses(
     poses = _vote(points_m, _frames(normals), table)
     scores = _scores(points_m, normals, poses, surface)
     best = scores.argsort(descending=True, stable=True)[:count]
-    return Rigid(poses.R[best], poses.t_m[best])
+    return poses[best]
 
 
 def thin(
