@@ -163,7 +163,7 @@ def evaluate(
     dataset = evaluating.open_instances(bop, split, objects, estimates.targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
     rule = replace(estimates.evaluation, adds=adds)
-    about = {"bop": str(bop.resolve()), "split": split, "objects": sorted(objects)}
+    about = {"bop": str(bop.resolve()), "split": split}  # objects may be asked for later
     targets = None if estimates.targets is None else str(estimates.targets.resolve())
     how = {"targets": targets, "rule": config_to_dict(rule)}
     claim_folder(out, {"command": "pose evaluate", **about, **how}, files)
