@@ -163,10 +163,9 @@ def evaluate(
     dataset = evaluating.open_instances(bop, split, objects, estimates.targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
     rule = replace(estimates.evaluation, adds=adds)
-    about = {"bop": str(bop.resolve()), "split": split}  # objects may be asked for later
-    targets = None if estimates.targets is None else str(estimates.targets.resolve())
-    how = {"targets": targets, "rule": config_to_dict(rule)}
-    claim_folder(out, {"command": "pose evaluate", **about, **how}, files)
+    # More objects, or all of the targets, may be asked for later.
+    about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
+    claim_folder(out, {"command": "pose evaluate", **about}, files)
     methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
     paths = [predict_all(dataset, method, one, out) for method in methods for one in shown]
