@@ -1,6 +1,7 @@
 """``pose predict`` from the words to the files, with an oracle in place of the network."""
 
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -165,6 +166,9 @@ def _search_again(words: list[str], out: Path, capsys: pytest.CaptureFixture[str
     (depth / "torn.png").write_bytes(whole)
     assert main([*words, str(out)]) == 0
     assert poses_of(out)["torn"]["status"] == "doubtful"
+    other = shutil.copytree(depth, out.parent / "other")
+    assert main([*(str(other) if word == str(depth) else word for word in words), str(out)]) == 2
+    assert "is the result of" in capsys.readouterr().err
     (depth / "wall_1.png").write_bytes(whole)
     assert main([*words, str(out)]) == 2
     assert "two depth images are called 'wall' and 'wall_1'" in capsys.readouterr().err
@@ -257,6 +261,14 @@ def test_a_folder_of_depth_images_is_done_once(
     assert (out / "poses.json").read_text() == before
     assert main([*words, "--no-icp"]) == 2
     assert "holds results made with" in capsys.readouterr().err
+    seen = tmp_path / "depth/seen.png"
+    whole = seen.read_bytes()
+    facts = seen.stat()
+    shutil.copy(tmp_path / "mask/hidden.png", seen)
+    assert main(words) == 2, "another image of that name"
+    assert "has changed since its result 'seen'" in capsys.readouterr().err
+    seen.write_bytes(whole)
+    os.utime(seen, ns=(facts.st_atime_ns, facts.st_mtime_ns))
     camera = tmp_path / "camera.json"
     camera.write_text(camera.read_text().replace("0.001", "0.0010001"))
     assert main(words) == 2, "the same file with another content"

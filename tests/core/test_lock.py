@@ -14,23 +14,26 @@ from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
 from depthpose.core.lock import held_folders, lock_folder, release_folders, write_once
-from depthpose.core.loop import LoopConfig, Run, holds_folder
-from depthpose.core.run import RECORD, claim_folder
+from depthpose.core.loop import LoopConfig, Run, releases_folder
+from depthpose.core.run import RECORD, claim_folder, read_settings
 
 HOLDER = """
 import sys, time
 from pathlib import Path
 from depthpose.core.run import claim_folder
-claim_folder(Path(sys.argv[1]), {"a": 1})
+for a in sys.argv[3:] or [1]:
+    claim_folder(Path(sys.argv[1]), {"a": int(a)})
 print("held", flush=True)
 time.sleep(float(sys.argv[2]))
 """
 
 
 @contextmanager
-def holder(folder: Path, seconds: int, **environment: str) -> Iterator["subprocess.Popen[str]"]:
+def holder(
+    folder: Path, seconds: int, settings: str = "1", **environment: str
+) -> Iterator["subprocess.Popen[str]"]:
     """Start a process that claims a folder, and wait until it has."""
-    words = [sys.executable, "-c", HOLDER, str(folder), str(seconds)]
+    words = [sys.executable, "-c", HOLDER, str(folder), str(seconds), *settings]
     own = {**os.environ, **environment}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=own) as process:
         assert process.stdout is not None
@@ -82,7 +85,7 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
     """Not after its last step, but when its weights are measured and written."""
     config = LoopConfig(steps=1, batch_size=2, device="cpu")
 
-    @holds_folder
+    @releases_folder
     def stage(config: LoopConfig, run: Run) -> Path:
         claim_folder(run.folder, {"a": 1})
         run.train(ToyTask(), ToySamples(), config)
@@ -93,6 +96,15 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
     assert not held_folders()
     with holder(tmp_path, 0) as process:
         assert process.wait() == 0
+
+
+@pytest.mark.parametrize("settings", ["11", "01", "011", "010"])
+def test_a_folder_that_is_claimed_again_stays_locked(tmp_path: Path, settings: str) -> None:
+    """Reading the record lets a POSIX lock go; the claim takes it again."""
+    refused = pytest.raises(InputError, match="another command is writing there")
+    with holder(tmp_path, 600, settings), refused:
+        lock_folder(tmp_path / RECORD, is_shared=False, timeout_s=0.3)
+    assert read_settings(tmp_path) == {"a": int(settings[-1])}
 
 
 def test_a_command_within_another_releases_its_own_folders_alone(tmp_path: Path) -> None:

@@ -49,11 +49,18 @@ def test_an_input_that_has_changed_is_refused(tmp_path: Path) -> None:
     claim_names(out, {"x": image})
     image.write_bytes(b"mended")
     claim_names(out, {"x": image})
+    (out / "x.y.depth_m.npy").touch()  # of another input, x.y
+    claim_names(out, {"x": image}, [".depth_m.npy"])
+    image.write_bytes(b"mended again")
+    claim_names(out, {"x": image}, [".depth_m.npy"])
     (out / "x.depth_m.npy").touch()
-    claim_names(out, {"x": image})
+    claim_names(out, {"x": image}, [".depth_m.npy"])
     image.write_bytes(b"another")
     with pytest.raises(InputError, match=r"x\.png: has changed since its result 'x'"):
-        claim_names(out, {"x": image})
+        claim_names(out, {"x": image}, [".depth_m.npy"])
+    with pytest.raises(InputError, match=r"x\.png: has changed since its result 'x'"):
+        claim_names(out, {"x": image}, is_finished=lambda _: True)
+    claim_names(out, {"x": image}, is_finished=lambda _: False)
     assert read_sources(out) == {"x": image.resolve()}
 
 

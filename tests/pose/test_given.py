@@ -74,7 +74,19 @@ def test_a_crop_may_leave_the_centre_and_a_bare_matrix_may_not() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["uint8", "uint16", "uint32", ">u2", "<u4", ">f4", ">f8", "int16", "torch.uint16"]
+    "kind",
+    [
+        "uint8",
+        "uint16",
+        "uint32",
+        ">u2",
+        "<u4",
+        ">f4",
+        ">f8",
+        "longdouble",
+        "int16",
+        "torch.uint16",
+    ],
 )
 def test_depth_of_any_type_of_number(kind: str) -> None:
     metres = np.full((4, 6), 2.0)

@@ -133,7 +133,8 @@ _EXIT_CODES = """exit codes:
 
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """Errors of a disk where a library or a temporary file writes; our own writers catch them."""
-_OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
+_OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EISDIR,
+              errno.ENOTDIR)  # fmt: skip
 """Errors of a path that is looked at before it is read."""
 
 

@@ -1,5 +1,6 @@
 """One command at a time writes into a folder."""
 
+import json
 import os
 import time
 from collections.abc import Collection, Mapping
@@ -54,10 +55,12 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
         InputError: another command holds the folder, and goes on holding it; or nothing can be
             written there.
     """
-    if fcntl is None or record.resolve() in _locks:
+    if fcntl is None:
         return False
+    # Reading the record has let the lock go: a POSIX lock ends as its file is closed anywhere.
+    held = _locks.get(record.resolve())
     with refused_write(record):
-        file = os.open(record, os.O_RDWR)
+        file = os.open(record, os.O_RDWR) if held is None else held
     kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
     last = time.monotonic() + timeout_s
     while True:
@@ -65,18 +68,37 @@ def lock_folder(record: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
             fcntl.lockf(file, kind | fcntl.LOCK_NB)
         except BlockingIOError as error:
             if time.monotonic() > last:
-                os.close(file)
+                _close(record, file)
                 raise InputError(
                     f"{record.parent}: another command is writing there; wait until it has ended, "
                     "or choose another folder"
                 ) from error
             time.sleep(0.1)
         except OSError:  # no locks on this file system
-            os.close(file)
+            _close(record, file)
             return False
         else:
             _locks[record.resolve()] = file
-            return not is_shared
+            return held is None and not is_shared
+
+
+def rewrite_record(record: Path, content: Mapping[str, Any]) -> None:
+    """Write other content into the record of a folder that this process has locked.
+
+    Through the file that holds the lock: another one would let it go when it is closed.
+    """
+    file = _locks.get(record.resolve())
+    if file is None:  # no locks here
+        write_json(record, content)
+        return
+    data = f"{json.dumps(content, indent=2)}\n".encode()
+    os.pwrite(file, data, 0)
+    os.ftruncate(file, len(data))
+
+
+def _close(record: Path, file: int) -> None:
+    _locks.pop(record.resolve(), None)
+    os.close(file)
 
 
 def held_folders() -> frozenset[Path]:

@@ -1,7 +1,5 @@
 """One folder per run, with what made it: settings, versions, machine, commit."""
 
-import glob
-import json
 import os
 import platform
 import re
@@ -18,7 +16,7 @@ import torch
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, remove_parts, write_json
-from depthpose.core.lock import lock_folder, write_once
+from depthpose.core.lock import lock_folder, rewrite_record, write_once
 
 RECORD = "run.json"
 _SOURCES = "sources.json"
@@ -136,7 +134,8 @@ def claim_folder(
         lock_folder(record, is_shared=False)
         if _is_empty(folder):  # a run that failed before its first result
             (folder / _SOURCES).unlink(missing_ok=True)
-            record.write_text(f"{json.dumps(run_record(settings), indent=2)}\n")
+            rewrite_record(record, run_record(settings))
+            return
     refuse_other_settings(folder, read_json(record), settings)
     if lock_folder(record, is_shared=not is_alone):
         remove_parts(folder)
@@ -163,6 +162,7 @@ def claim_names(
     sources: Mapping[str, Path],
     endings: Sequence[str] = (),
     videos: Collection[str] = (),
+    is_finished: Callable[[str], bool] | None = None,
 ) -> None:
     """Reserve names of results for the files that they are made from.
 
@@ -171,16 +171,19 @@ def claim_names(
         sources: the file behind each name.
         endings: what follows a name in the names of its results.
         videos: those of the names whose results bear the number of a frame too.
+        is_finished: whether a name has a result; None: whether there is a file of the name and one
+            of the endings.
 
     Raises:
-        InputError: an earlier run made a result of that name from another file, or a file that no
-            run wrote bears the name of a result.
+        InputError: an earlier run made a result of that name from another file, or the file has
+            changed since, or a file that no run wrote bears the name of a result.
     """
     record = folder / _SOURCES
     # Listed before the record is read: what another process writes, its record names by then.
     results = _results_there(folder, endings)
     there = read_json(record) if record.exists() else {}
     known = there if isinstance(there, dict) else {}
+    made = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted = {name: [str(path.resolve()), _stamp(path)] for name, path in sources.items()}
     for name, (path, stamp) in wanted.items():
         earlier, before = _source(known.get(name, [path, stamp]))
@@ -190,7 +193,7 @@ def claim_names(
                 "one name need two folders: choose another"
             )
         is_other = before and stamp and before != stamp
-        if is_other and any(folder.glob(f"{glob.escape(name)}.*")):
+        if is_other and (name in made if is_finished is None else is_finished(name)):
             raise InputError(
                 f"{path}: has changed since its result {name!r} in {folder} was made; choose "
                 "another folder, or delete this one"

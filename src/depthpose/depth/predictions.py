@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -201,7 +202,7 @@ def predict(
         sources: the image behind each name, of all processes that write to the folder.
     """
     claim_folder(folder, settings, (f"{name}.{end}" for name in inputs for end in ENDINGS))
-    claim_names(folder, sources)
+    claim_names(folder, sources, is_finished=partial(is_finished, folder))
     for name, read_input in inputs.items():
         if not is_finished(folder, name):
             pair = read_input()

@@ -1,5 +1,6 @@
 """``depthpose depth ...``."""
 
+import re
 from pathlib import Path
 
 import tyro
@@ -218,7 +219,9 @@ def evaluate(
     chosen = evaluating.choose_methods(methods, matching.config)
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
-    about = {"data": str(data.resolve()), "split": None if split is None else str(split)}
+    is_url = re.match(r"\w+:/", str(data)) is not None
+    where = str(data if is_url else data.resolve())
+    about = {"data": where, "split": None if split is None else str(split)}
     about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
     claim_folder(out, {"command": "depth evaluate", **about}, files)
     folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]

@@ -65,7 +65,7 @@ def frame_sections(
     sections: list[Section] = []
     for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
         cap_m = of_folder[0].cap_m
-        of_cap = [row for row in of_folder if row.cap_m == cap_m]
+        of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
         metric = ranking_metric(cap_m)
         sign = 1 if metric.better == "lower" else -1
         cap = "" if cap_m is None else f", truth up to {cap_m:g} m"

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from depthpose.cli.pose.inputs import Unreadable, camera_facts, frame_jobs
 from depthpose.cli.pose.methods import PoseMethod
 from depthpose.cli.pose.page import write_pose_page
-from depthpose.cli.pose.predicting import claim, say_result, unread, write_files
+from depthpose.cli.pose.predicting import claim, is_result_of, say_result, unread, write_files
 from depthpose.core.errors import InputError
 from depthpose.core.run import find_rank
 from depthpose.pose.config import Unit
@@ -49,7 +49,7 @@ def find_all(
     _refuse_numbered(jobs)
     facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
-    claim(out, settings, [], depth)
+    claim(out, settings, jobs, depth)
     found = _find_left(jobs, objects, method, out)
     claim(out, settings, [job for _, job in found], depth)
     return _write(found, method, out)
@@ -62,18 +62,13 @@ def _find_left(
     left = [p for p in read_predictions(out) if is_finished(p)] if is_started(out) else []
     found: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
-        own = [p for p in left if _image_of(p.estimate.name, job.name)]
+        own = [p for p in left if is_result_of(p.estimate.name, job.name)]
         left = [p for p in left if p not in own]
         found += [(p, explained_job(job, p.estimate, method)) for p in own] or list(
             _find(method, job, objects)
         )
         write_predictions(out, [*(prediction for prediction, _ in found), *left])
     return found
-
-
-def _image_of(name: str, image: str) -> bool:
-    """Whether a result is of an image: its name, or that and a number."""
-    return re.fullmatch(rf"{re.escape(image)}(_\d+)?", name) is not None
 
 
 def _refuse_numbered(jobs: Sequence[Job[Any]]) -> None:

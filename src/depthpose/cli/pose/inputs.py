@@ -57,7 +57,10 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
         raise InputError(f"{cloud}: no {known} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
-    return [input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem)) for p in files]
+    return [
+        input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem), source=p)
+        for p in files
+    ]
 
 
 def camera_facts(camera: Path) -> dict[str, str]:
@@ -93,7 +96,10 @@ def view_jobs(
         )
     return [
         input_job(
-            p.stem, object, partial(view_input, p, masks[p.stem], camera, object, p.stem, unit)
+            p.stem,
+            object,
+            partial(view_input, p, masks[p.stem], camera, object, p.stem, unit),
+            source=p,
         )
         for p in depths
     ]
@@ -111,7 +117,9 @@ def frame_jobs(
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
     return [
-        input_job(p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit))
+        input_job(
+            p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit), source=p
+        )
         for p in depths
     ]
 
@@ -159,9 +167,10 @@ def input_job(
     object: str,
     read: Any,  # noqa: ANN401  any reader
     place: Place | None = None,
+    source: Path | None = None,
 ) -> Job[Any]:
     """Take one input; one that cannot be read stops no other."""
-    return _safe(Job(name=name, read=read, place=place), object)
+    return _safe(Job(name=name, read=read, place=place, source=source), object)
 
 
 def _safe(job: Job[Any], object: str) -> Job[Any]:

@@ -1,5 +1,6 @@
 """The work behind ``depthpose pose predict``."""
 
+import re
 import sys
 import time
 from collections import defaultdict
@@ -68,7 +69,16 @@ def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Pat
     """
     claim_folder(out, settings, [POSES, PAGE])
     endings = [f".{end}" for end in (PICTURE, CLOUD)]
-    claim_names(out, {job.name: source for job in jobs}, endings)
+    done = [name for name, prediction in _known(out).items() if is_finished(prediction)]
+    sources = {job.name: job.source or source for job in jobs}
+    claim_names(
+        out, sources, endings, is_finished=lambda name: any(is_result_of(n, name) for n in done)
+    )
+
+
+def is_result_of(name: str, image: str) -> bool:
+    """Whether a result is of an image without a mask: its name, or that and a number."""
+    return re.fullmatch(rf"{re.escape(image)}(_\d+)?", name) is not None
 
 
 def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:

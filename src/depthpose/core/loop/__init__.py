@@ -10,7 +10,7 @@ from depthpose.core.loop.journal import (
     write_card,
 )
 from depthpose.core.loop.loop import Interrupted, Progress, train
-from depthpose.core.loop.run import Run, holds_folder
+from depthpose.core.loop.run import Run, releases_folder
 from depthpose.core.loop.task import (
     Samples,
     Task,
@@ -33,9 +33,9 @@ __all__ = [
     "ValidationResult",
     "card_text",
     "held_out_text",
-    "holds_folder",
     "make_adam",
     "read_metrics",
+    "releases_folder",
     "run_files",
     "sample_generator",
     "shuffled_index",

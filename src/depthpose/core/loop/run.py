@@ -81,7 +81,7 @@ class Run:
         )
 
 
-def holds_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
+def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
     """Let other commands into the folder of a training when its weights are written."""
 
     @wraps(stage)

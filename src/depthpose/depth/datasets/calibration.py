@@ -112,7 +112,12 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         keys = read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    own = [numbers for line in lines if (numbers := _numbers_of(line)) is not None]
+    own = [numbers for line in lines if len(numbers := _numbers_of(line)) >= 6]
+    if lines and not own:
+        raise InputError(
+            f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
+            "with six numbers, width height focal_px cx cy baseline_m"
+        )
     if len(own) > 1:
         raise InputError(f"{path}: {len(own)} lines for {name!r}. Keep one of them.")
     if not own:
@@ -121,7 +126,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
     try:
-        numbers = own[0]
+        numbers = own[0] if len(own[0]) == 8 else own[0][:6]
         size = int(numbers[0]), int(numbers[1])
         names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
         values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
@@ -130,15 +135,15 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
 
-def _numbers_of(line: str) -> list[float] | None:
-    """Six or eight numbers that begin a line, words after them left out; None: it has others."""
+def _numbers_of(line: str) -> list[float]:
+    """Give the numbers that begin a line."""
     numbers = list[float]()
     for word in line.split():
         try:
             numbers.append(float(word))
         except ValueError:
             break
-    return numbers if len(numbers) in (6, 8) else None
+    return numbers
 
 
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:

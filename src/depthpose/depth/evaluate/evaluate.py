@@ -185,9 +185,8 @@ def _measure_disparity(prepared: Prepared) -> Measured | None:
     if prepared.frame.disparity_noc is not None:
         seen_px = read_truth_disparity(prepared.frame.disparity_noc)
         seen = torch.isfinite(seen_px) & torch.isfinite(prepared.disparity_px)
-        if not bool(seen.any()):
-            raise InputError(f"{prepared.frame.disparity_noc}: no pixel of it can be compared")
-        metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
+        if bool(seen.any()):
+            metrics |= measure("disparity_noc", prepared.disparity_px[seen], seen_px[seen])
     counted = replace(counted, metrics=metrics | prepared.view)
     return _score(counted, (predicted_px - true_px).abs(), prepared.confidence, mask)
 

@@ -61,8 +61,8 @@ class MeanRow(Row):
         frames: how many.
         pixels: sum of the pixels compared.
         coverage: share of the pixels with truth that have a prediction.
-        metrics: means of what all frames have, in the order of ``depth.metrics.METRICS``, then
-            those of the drawn view and of the confidence.
+        metrics: means of what all frames with a predicted pixel have, in the order of
+            ``depth.metrics.METRICS``, then those of the drawn view and of the confidence.
     """
 
     method: str | None = None

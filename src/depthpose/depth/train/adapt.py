@@ -215,6 +215,7 @@ def split_pairs(
         for n, frame in enumerate(dataset.frames)
         if frame.right and frame.calibration and frame.name not in exclude
     ]
+    usable.sort(key=lambda n: dataset.frames[n].name)
     if len(usable) < 2:
         raise InputError(
             f"{dataset.name}: {len(usable)} of {len(dataset.frames)} frames have a right view and "

@@ -15,7 +15,7 @@ from depthpose.core.loop import (
     Run,
     Task,
     held_out_text,
-    holds_folder,
+    releases_folder,
     write_card,
 )
 from depthpose.core.run import find_rank
@@ -64,7 +64,7 @@ _MEASURED = {
 """What the numbers of each stage's validation are."""
 
 
-@holds_folder
+@releases_folder
 def train_view(config: ViewTraining, run: Run) -> Path:
     """Train the generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
@@ -79,7 +79,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     return _leave(run, "view", facts, seconds, generator=generator)
 
 
-@holds_folder
+@releases_folder
 def train_select(config: SelectTraining, run: Run) -> Path:
     """Train the generator that selects; give its weights file."""
     refuse_frozen_random(config)
@@ -108,7 +108,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     return _leave(run, "select", facts, seconds, generator=generator)
 
 
-@holds_folder
+@releases_folder
 def train_stereo(config: StereoTraining, run: Run) -> Path:
     """Train the matcher; give its weights file."""
     _refuse_wrong_gradients(config)
@@ -120,7 +120,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     return _leave(run, "stereo", facts, seconds, matcher=matcher)
 
 
-@holds_folder
+@releases_folder
 def train_adapt(config: AdaptTraining, run: Run) -> Path:
     """Adapt a matcher to a rig by its pairs alone; give its weights file.
 
@@ -153,7 +153,7 @@ def train_adapt(config: AdaptTraining, run: Run) -> Path:
     return path
 
 
-@holds_folder
+@releases_folder
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)

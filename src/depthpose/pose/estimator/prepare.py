@@ -25,6 +25,7 @@ AnyInput = CloudInput | ViewInput
 _MOST = 0.5
 """Where most points lie farther from their median than the object is long, they are not its."""
 _FARTHEST_M = 1e6
+"""A coordinate beyond this marks a missing reading."""
 _BEFORE = 0.05
 """Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
 _THIN = 0.002

@@ -16,8 +16,8 @@ from depthpose.core.loop import (
     Update,
     ValidationResult,
     held_out_text,
-    holds_folder,
     make_adam,
+    releases_folder,
     sample_generator,
     shuffled_index,
     write_card,
@@ -172,7 +172,7 @@ class DepthImageTask:
         return self._views[occlusion]
 
 
-@holds_folder
+@releases_folder
 def train_depth_image(config: DepthImageTraining, run: Run) -> Path:
     """Train the regression of depth images; give its weights file."""
     torch.manual_seed(config.loop.seed)

@@ -10,7 +10,7 @@ from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
-from depthpose.core.loop import Run, holds_folder, write_card
+from depthpose.core.loop import Run, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
@@ -45,7 +45,7 @@ _STATISTICS_CLOUDS = 64
 """Clouds from which batch norm statistics, lost by folding, are computed again."""
 
 
-@holds_folder
+@releases_folder
 def train_pose(config: PoseTraining, run: Run) -> Path:
     """Train a network of directions, ours or the PointNet; give its weights file."""
     torch.manual_seed(config.loop.seed)

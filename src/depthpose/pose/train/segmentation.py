@@ -12,8 +12,8 @@ from depthpose.core.loop import (
     Update,
     ValidationResult,
     held_out_text,
-    holds_folder,
     make_adam,
+    releases_folder,
     write_card,
 )
 from depthpose.core.run import find_rank
@@ -82,7 +82,7 @@ class SegmentationTask:
         return ValidationResult(numbers=numbers, pictures=pictures)
 
 
-@holds_folder
+@releases_folder
 def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     """Train FCN; give its weights file."""
     torch.manual_seed(config.loop.seed)
