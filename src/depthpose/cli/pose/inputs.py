@@ -1,7 +1,7 @@
 """What ``depthpose pose predict`` is given: clouds, depth images, data sets, as jobs."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -57,10 +57,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
         raise InputError(f"{cloud}: no {known} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
-    return [
-        input_job(p.stem, object, partial(cloud_input, p, unit, object, p.stem), source=p)
-        for p in files
-    ]
+    return [_file_job(p, object, cloud_input, unit, object, p.stem) for p in files]
 
 
 def camera_facts(camera: Path) -> dict[str, str]:
@@ -95,12 +92,7 @@ def view_jobs(
             f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
     return [
-        input_job(
-            p.stem,
-            object,
-            partial(view_input, p, masks[p.stem], camera, object, p.stem, unit),
-            source=p,
-        )
+        _file_job(p, object, view_input, masks[p.stem], camera, object, p.stem, unit)
         for p in depths
     ]
 
@@ -116,12 +108,7 @@ def frame_jobs(
     depths = list_images(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
-    return [
-        input_job(
-            p.stem, object, partial(view_input, p, None, camera, object, p.stem, unit), source=p
-        )
-        for p in depths
-    ]
+    return [_file_job(p, object, view_input, None, camera, object, p.stem, unit) for p in depths]
 
 
 def _list_masks(mask: Path) -> list[Path]:
@@ -171,6 +158,11 @@ def input_job(
 ) -> Job[Any]:
     """Take one input; one that cannot be read stops no other."""
     return _safe(Job(name=name, read=read, place=place, source=source), object)
+
+
+def _file_job(path: Path, object: str, read: Callable[..., AnyInput], *rest: object) -> Job[Any]:
+    """Take one file, called as it is; ``read`` is given it and the rest."""
+    return input_job(path.stem, object, partial(read, path, *rest), source=path)
 
 
 def _safe(job: Job[Any], object: str) -> Job[Any]:
