@@ -126,7 +126,7 @@ def claim_folder(
         there = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
         # Looked at again: another process may have begun the same run.
         if there and not record.exists():
-            raise _not_ours(folder / there[0])
+            raise not_ours(folder / there[0])
     if not record.exists():
         write_once(record, run_record(settings))
     is_alone = find_rank().world == 1
@@ -202,7 +202,7 @@ def claim_names(
     for stem, file in results.items():
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in known and (stem in new or is_frame):
-            raise _not_ours(file)
+            raise not_ours(file)
     if any(known.get(name) != entry for name, entry in wanted.items()):
         write_json(record, known | wanted)
 
@@ -273,7 +273,8 @@ def read_settings(folder: Path) -> dict[str, Any] | None:
     return settings
 
 
-def _not_ours(path: Path) -> InputError:
+def not_ours(path: Path | str) -> InputError:
+    """Make the error for a file, by path or URL, that a run would write over."""
     return InputError(
         f"{path}: is there already, and no run of this command wrote it; choose another --out, or "
         "move it away"

@@ -23,7 +23,7 @@ from depthpose.core.files.store import (
     read_from,
     refuse_unsafe,
 )
-from depthpose.core.run import RECORD, refuse_other_settings, run_record
+from depthpose.core.run import RECORD, not_ours, refuse_other_settings, run_record
 
 MANIFEST = "manifest.csv"
 
@@ -100,10 +100,7 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
         return
     for name in (MANIFEST, PLAN, SHARDS):
         if exists(join(out, name)):
-            raise InputError(
-                f"{join(out, name)}: is there already, and no run of this command wrote it; choose "
-                "another --out, or move it away"
-            )
+            raise not_ours(join(out, name))
     publish_bytes(f"{json.dumps(run_record(settings), indent=2)}\n".encode(), record)
 
 

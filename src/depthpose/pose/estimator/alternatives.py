@@ -77,14 +77,15 @@ def find_copies(model: ObjectModel, *, up_to_symmetry: bool) -> PoseAmbiguities:
     near = [one.model_from_model for one in near_symmetries(model)]
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     turns = Rigid.stack(near) if near else none
-    same = symmetry_transforms(find_true(model), _STEP).double()
+    true = find_true(model)
+    same = symmetry_transforms(true, _STEP).double()
     if up_to_symmetry:
         every = symmetry_transforms(model.symmetries, _STEP)
         same = Rigid.cat([same, every.double(), turns])
         turns = none
     trained = symmetry_transforms(model.symmetries, 2 * _STEP)
     compared_m = take_evenly(points_m, _POINTS)
-    centre_m = find_true(model).ball_centre_m
+    centre_m = true.ball_centre_m
     if centre_m is not None:  # every turn of a ball is the same pose: its centre alone says where
         compared_m = centre_m.to(points_m)[None]
         turns = none

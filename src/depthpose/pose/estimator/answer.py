@@ -52,9 +52,7 @@ class Found(NamedTuple):
 
 def candidate_of(source: PoseFit | Refined) -> Candidate:
     """Take a fitted or a refined pose as one that may be right."""
-    given = source.camera_from_model
-    pose = given.double()
-    return Candidate(pose, source.covariance, float(source.residual_m))
+    return Candidate(source.camera_from_model.double(), source.covariance, float(source.residual_m))
 
 
 def choose(
