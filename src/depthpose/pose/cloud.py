@@ -9,6 +9,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.types import CloudInput, ViewInput
 
@@ -224,6 +225,11 @@ def local_planes(
         The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
     """
     count = min(_NEIGHBOURS, len(every_m))
+    if is_compiled():
+        from depthpose.pose.compiled.planes import planes_of
+
+        normals, bend = planes_of(every_m.numpy(), some_m.numpy(), count)
+        return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]
     index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
     near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]
     near_m = near_m - near_m.mean(1, keepdim=True)

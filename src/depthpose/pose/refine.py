@@ -1,17 +1,17 @@
 """Point-to-plane ICP: refines poses of a model's surface on a cloud."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, look_along_rays
 
@@ -35,10 +35,6 @@ _TRUST = 0.02
 """Another start must bring so large a share of the points nearer to the surface than the given one
 to be believed: a plane fits many places, and noise would choose among them. Where a start ended
 roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
-
-
-Nearest = Callable[[Float64[Tensor, "*batch n 3"]], Int64[Tensor, "*batch n"]]
-"""From points in the model frame to the numbers of the surface points near them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,9 +103,9 @@ def refine_pose(
     _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
     limits_m = _limits(config, surface.diameter_m)
-    pose = _iterated(cloud, initial.double(), surface, limits_m, surface.nearest)
+    pose = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
     end_m = config.end_distance_diameters * surface.diameter_m
-    equations = _normal_equations(cloud, pose, surface, end_m, surface.nearest)
+    equations = _normal_equations(cloud, pose, surface, end_m, is_exact=True)
     return _result(points_m, pose, equations, _middle(cloud))
 
 
@@ -174,7 +170,7 @@ def refine_roughly(
     few = take_evenly(points_m.double(), _ROUGH_POINTS)
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _iterated(few, starts, surface, limits_m, surface.boxes.look_up)
+    return _iterated(few, starts, surface, limits_m, is_exact=False)
 
 
 def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
@@ -190,12 +186,18 @@ def _iterated(
     pose: Rigid,
     surface: Surface,
     limits_m: list[float],
-    nearest: Nearest,
+    *,
+    is_exact: bool,
 ) -> Rigid:
     """Step by step to where the cloud lies on the surface, until nothing moves any more."""
+    if is_compiled():
+        from depthpose.pose.compiled.icp import refined
+
+        steps = (limits_m, _CONVERGED, surface.diameter_m)
+        return refined(cloud, pose, surface.target, steps, is_exact=is_exact)
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     for limit_m in limits_m:
-        H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m, nearest)
+        H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m, is_exact=is_exact)
         motion = torch.linalg.solve(H, pull)
         pose = _moved(pose, motion, _middle(cloud))
         if limit_m <= limits_m[-1] and bool(((motion / scale).abs() < _CONVERGED).all()):
@@ -222,9 +224,7 @@ def _worth(
     """
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
     few = take_evenly(cloud, _ROUGH_POINTS)
-    _, _, residual_m, weight = _normal_equations(
-        few, poses, surface, limit_m, surface.boxes.look_up
-    )
+    _, _, residual_m, weight = _normal_equations(few, poses, surface, limit_m, is_exact=False)
     near = (weight > 0).double().mean(-1)
     front, unseen = look_along_rays(cloud, poses, surface, every=4)
     # Of equals, the nearer one.
@@ -271,12 +271,13 @@ def _normal_equations(
     pose: Rigid,
     surface: Surface,
     limit_m: float,
-    nearest: Nearest,
+    *,
+    is_exact: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Linearise about the middle of the cloud, where turning and shifting hardly mix."""
     inverse = pose.inverse()
     local = cloud @ inverse.R.mT + inverse.t_m[..., None, :]
-    index = nearest(local)
+    index = surface.find(local, is_exact=is_exact)
     # In the camera frame, where the covariance is wanted.
     normal = surface.normals[index] @ pose.R.mT
     target = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]

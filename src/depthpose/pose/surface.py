@@ -1,6 +1,8 @@
 """The surface of a model: what of it lies near a point, and what of it a camera would see."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float64, Int64
@@ -9,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import ObjectModel
 
@@ -75,7 +78,26 @@ class Surface:
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""
+        if is_compiled():
+            from depthpose.pose.compiled.nearest import nearest_of
+
+            return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
+
+    def find(
+        self, points_m: Float64[Tensor, "*batch n 3"], *, is_exact: bool
+    ) -> Int64[Tensor, "*batch n"]:
+        """Give the number of the surface point near each point: searched, or looked up."""
+        return self.nearest(points_m) if is_exact else self.boxes.look_up(points_m)
+
+    @cached_property
+    def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
+        """The same for compiled functions."""
+        from depthpose.pose.compiled.target import target_of
+
+        boxes = self.boxes
+        table = (boxes.low_m.numpy(), boxes.side_m, boxes.counts.numpy(), boxes.nearest.numpy())
+        return target_of(self.points_m.numpy(), self.normals.numpy(), table)
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
@@ -115,12 +137,18 @@ def look_along_rays(
     if len(cloud_m) == 0:
         none = torch.ones(len(poses.R), dtype=torch.float64)
         return none, none
-    posed_m = poses.apply(surface.points_m[::every].expand(len(poses.R), -1, -1))
-    depth_m = posed_m[..., 2]
     scale = median_m / (_CELL * surface.diameter_m)
     seen = cloud_m[:, :2] / cloud_m[:, 2:] * scale
-    posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
     middle = seen.median(0).values.floor()
+    limit_m = 1.5 * NEAR * surface.diameter_m
+    if is_compiled():
+        from depthpose.pose.compiled.rays import compare_rays
+
+        rays = (scale, *middle.tolist(), _REACH)
+        return compare_rays(cloud_m, poses, surface.points_m[::every], rays, limit_m)
+    posed_m = poses.apply(surface.points_m[::every].expand(len(poses.R), -1, -1))
+    depth_m = posed_m[..., 2]
+    posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
     width = 2 * _REACH + 1
     cells = width**2
     mine, theirs = (
@@ -130,14 +158,14 @@ def look_along_rays(
     depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = depth_m.new_full((len(depth_m), cells), torch.inf)
     nearest_m = nearest_m.scatter_reduce_(1, mine, depth_m, "amin")
-    occluded = nearest_m[:, theirs] < cloud_m[:, 2] - 1.5 * NEAR * surface.diameter_m
+    occluded = nearest_m[:, theirs] < cloud_m[:, 2] - limit_m
     is_seen = torch.zeros(cells, dtype=torch.bool)
     is_seen[theirs] = True
     is_posed = nearest_m.isfinite()
     total = is_posed.sum(1)
-    unseen = (is_posed & ~is_seen).sum(1) / total.clamp(min=1)
+    unseen = (is_posed & ~is_seen).sum(1).double() / total.clamp(min=1)
     front = occluded.double().mean(1)
-    return torch.where(total > 0, front, 1.0), torch.where(total > 0, unseen.double(), 1.0)
+    return torch.where(total > 0, front, 1.0), torch.where(total > 0, unseen, 1.0)
 
 
 def compare_depths(

@@ -12,7 +12,12 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.estimator.evidence import disagreement, log_signal, surface_signals
+from depthpose.pose.estimator.evidence import (
+    cloud_normals,
+    disagreement,
+    log_signal,
+    surface_signals,
+)
 from depthpose.pose.estimator.prepare import Voted
 from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
 from depthpose.pose.mesh import true_symmetries as find_true
@@ -180,20 +185,28 @@ def is_same_pose(
 
 
 def evidence_of(
-    voted: Voted, pose: Rigid, model: ObjectModel, copies: PoseAmbiguities, surface: Surface
-) -> dict[str, float]:
-    """Give the signals by which candidates are compared.
+    voted: Voted,
+    poses: Sequence[Rigid],
+    model: ObjectModel,
+    copies: PoseAmbiguities,
+    surface: Surface,
+) -> list[dict[str, float]]:
+    """Give the signals by which candidates are compared, for the pose of each.
 
     The directions are compared with those to the nearest copy that the network could not learn to
     distinguish from the pose: which one it points at is chance.
     """
-    every = (pose @ copies.trained).apply(
-        model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
-    )
-    return {
-        **surface_signals(voted.cloud.cloud_m, pose, surface),
-        "disagree": min(disagreement(voted.cloud, voted.outputs, one) for one in every),
-    }
+    keypoints_m = model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
+    normals = cloud_normals(voted.cloud.cloud_m)
+
+    def signals(pose: Rigid) -> dict[str, float]:
+        every_m = (pose @ copies.trained).apply(keypoints_m)
+        return {
+            **surface_signals(voted.cloud.cloud_m, pose, surface, normals),
+            "disagree": disagreement(voted.cloud, voted.outputs, every_m),
+        }
+
+    return [signals(pose) for pose in poses]
 
 
 def share_out(

@@ -4,6 +4,7 @@ Each is larger where the pose is worse, but for those of :data:`CONTEXT`.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -24,6 +25,8 @@ _THINNED = 500
 sensor's noise, alike from pixel to pixel, does not turn."""
 _TILTED = 250
 """At so many of them the normal is looked at."""
+_COMPARED = 100
+"""At about so many points a copy is chosen."""
 _FLOOR = 0.01
 """Added to a signal before its logarithm is taken."""
 
@@ -67,12 +70,26 @@ def vote_signals(cloud: Prepared, fit: PoseFit) -> dict[str, float]:
 
 
 def disagreement(
-    cloud: Prepared, outputs: Float[Tensor, "n k c"], keypoints_m: Float[Tensor, "k 3"]
+    cloud: Prepared, outputs: Float[Tensor, "n k c"], copies_m: Float[Tensor, "b k 3"]
 ) -> float:
-    """Mean angle between the network's directions and those to the posed keypoints [rad]."""
-    way = normalize(keypoints_m[None] - cloud.points_m.double()[:, None], dim=-1)
-    cosine = (normalize(outputs[..., :3].double(), dim=-1) * way).sum(-1).clamp(-1, 1)
-    return float(cosine.arccos().mean())
+    """Mean angle between the network's directions and those to the posed keypoints [rad].
+
+    Args:
+        cloud: what the network saw.
+        outputs: its directions.
+        copies_m: keypoints of each pose that the network could not distinguish; the one counts at
+            which the directions point best, by their mean cosine.
+    """
+    directions = normalize(outputs[..., :3].double(), dim=-1)
+    points_m = cloud.points_m.double()
+
+    def cosines(some_m: Tensor, few: int) -> Float64[Tensor, "b m k"]:
+        way = normalize(some_m[:, None] - points_m[None, ::few, None], dim=-1)
+        return (directions[::few] * way).sum(-1)
+
+    few = max(1, len(points_m) // _COMPARED)
+    best = int(cosines(copies_m, few).mean((1, 2)).argmax()) if len(copies_m) > 1 else 0
+    return float(cosines(copies_m[[best]], 1).clamp(-1, 1).arccos().mean())
 
 
 def log_signal(signal: float) -> float:
@@ -80,14 +97,43 @@ def log_signal(signal: float) -> float:
     return math.log(_FLOOR + signal)
 
 
+class CloudNormals(NamedTuple):
+    """Some points of a cloud in float64, their normals, and the median curvature there.
+
+    The curvature shows how noisy the sensor is.
+    """
+
+    points_m: Float64[Tensor, "n 3"]
+    normals: Float64[Tensor, "n 3"]
+    rough: float
+
+
+def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
+    """Lay planes through some points of a cloud: once for all poses that are compared with it."""
+    thinned_m = take_evenly(cloud_m.double(), _THINNED)
+    some_m = take_evenly(thinned_m, _TILTED)
+    normals, bend = local_planes(thinned_m, some_m)
+    return CloudNormals(some_m, normals, max(_SMOOTH, float(bend.median())))
+
+
 def surface_signals(
-    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface
+    cloud_m: Float[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    normals: CloudNormals | None = None,
 ) -> dict[str, float]:
     """Say how well the posed surface explains the cloud, and the cloud the surface.
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
+
+    Args:
+        cloud_m: of the object, in the camera frame.
+        pose: of the object.
+        surface: of its model.
+        normals: of the cloud; None: they are computed.
     """
+    normals = cloud_normals(cloud_m) if normals is None else normals
     limit_m = NEAR * surface.diameter_m
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
     distance_m, _ = _nearest(points_m, pose, surface)
@@ -95,10 +141,9 @@ def surface_signals(
     gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
     alone = pose[None]
     front, unseen = look_along_rays(cloud_m.double(), alone, surface)
-    tilt, rough = _tilt_and_roughness(cloud_m.double(), pose, surface)
     return {
-        "tilt": tilt,
-        "rough": rough,
+        "tilt": tilt_of(normals, pose, surface),
+        "rough": normals.rough,
         "gap": gap_m / surface.diameter_m,
         "far": 1 - len(near_m) / len(distance_m),
         "front": float(front),
@@ -155,23 +200,14 @@ def without_motions(
     return (basis @ inner @ basis.T).to(covariance)
 
 
-def _tilt_and_roughness(
-    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
-) -> tuple[float, float]:
-    """Give the mean of 1 - |cosine| between normals of the cloud and of the posed surface near it.
-
-    And the median curvature of the cloud, which shows how noisy the sensor is.
-    """
-    thinned_m = take_evenly(cloud_m, _THINNED)
-    some_m = take_evenly(thinned_m, _TILTED)
-    normals, bend = local_planes(thinned_m, some_m)
-    rough = max(_SMOOTH, float(bend.median()))
-    distance_m, index = _nearest(some_m, pose, surface)
+def tilt_of(cloud: CloudNormals, pose: Rigid, surface: Surface) -> float:
+    """Mean of 1 - |cosine| between normals of the cloud and of the posed surface near it."""
+    distance_m, index = _nearest(cloud.points_m, pose, surface)
     near = distance_m < NEAR * surface.diameter_m
     if not bool(near.any()):
-        return 1.0, rough
-    cosine = (normals[near] * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
-    return float(1 - cosine.abs().mean()), rough
+        return 1.0
+    cosine = (cloud.normals[near] * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
+    return float(1 - cosine.abs().mean())
 
 
 def _nearest(

@@ -43,16 +43,16 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     config = IcpConfig()
     tried = refine_roughly(mirrored_m, _mirrored(middle_m), surface, config)
     few_m = take_evenly(mirrored_m, 100).expand(len(tried.R), -1, -1)
-    rough = distance_to(tried.inverse().apply(few_m), surface, surface.boxes.look_up)
-    own = distance_to(take_evenly(local_m, 100), surface, surface.boxes.look_up)
+    rough = distance_to(tried.inverse().apply(few_m), surface, is_exact=False)
+    own = distance_to(take_evenly(local_m, 100), surface, is_exact=False)
     if float(rough.min() - own) > _CLEAR:
         return float(own - rough.min())
     nearest = rough.argmin()[None]  # one is enough: three found no other gain in 24 views
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
     found = refine_pose(mirrored_m, tried[nearest], surface, config)
     exact_m = found.camera_from_model.inverse().apply(mirrored_m[None])
-    own = distance_to(local_m, surface, surface.nearest)
-    return float(own - distance_to(exact_m, surface, surface.nearest).min())
+    own = distance_to(local_m, surface, is_exact=True)
+    return float(own - distance_to(exact_m, surface, is_exact=True).min())
 
 
 def _mirrored(middle_m: Float64[Tensor, "3"]) -> Rigid:

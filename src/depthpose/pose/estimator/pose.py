@@ -126,7 +126,8 @@ def _refine(
     first = candidate_of(fit if refined is None else refined)
     icp = None if refined is None else config.icp
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
-    evidence = [evidence_of(voted, one.pose, model, copies, surface) for one in candidates]
+    poses = [one.pose for one in candidates]
+    evidence = evidence_of(voted, poses, model, copies, surface)
     signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
     return choose(candidates, evidence, signals, copies, refusal)
 

@@ -25,7 +25,12 @@ from depthpose.pose.estimator.answer import (
 )
 from depthpose.pose.estimator.base import PoseEstimator, refused
 from depthpose.pose.estimator.doubt import Posed
-from depthpose.pose.estimator.evidence import surface_signals
+from depthpose.pose.estimator.evidence import (
+    CloudNormals,
+    cloud_normals,
+    surface_signals,
+    tilt_of,
+)
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
 from depthpose.pose.mesh import read_model, with_found_symmetries
 from depthpose.pose.refine import refine_best
@@ -184,7 +189,8 @@ def pose_from_proposals(
         return withheld(model.name, Refusal(status="votes do not meet", reason=reason), clock)
     first = candidate_of(best.refined)
     candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
-    evidence = [_evidence_of(cloud.cloud_m, one.pose, surface) for one in candidates]
+    normals = cloud_normals(cloud.cloud_m)
+    evidence = [_evidence_of(cloud.cloud_m, normals, one.pose, surface) for one in candidates]
     signals = {"few": 10 / len(cloud.points_m), "scatter": best.scatter}
     found = choose(candidates, evidence, signals, copies, refusal)
     clock.note("icp")
@@ -195,16 +201,18 @@ def pose_from_proposals(
     return checked(posed, found, answer, refusal, clock)
 
 
-def _evidence_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> dict[str, float]:
+def _evidence_of(
+    cloud_m: Float[Tensor, "n 3"], normals: CloudNormals, pose: Rigid, surface: Surface
+) -> dict[str, float]:
     """Give the signals of a pose; of the tilt what its own surface does not cause.
 
     The plane through neighbours is tilted where a part has edges and thin features too, whatever
     the pose: so it is on the cloud moved onto the posed surface, which is subtracted.
     """
-    signals = surface_signals(cloud_m, pose, surface)
+    signals = surface_signals(cloud_m, pose, surface, normals)
     local_m = pose.inverse().apply(cloud_m.double())
     ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
-    own = surface_signals(ideal_m, pose, surface)["tilt"]
+    own = tilt_of(cloud_normals(ideal_m), pose, surface)
     return {**signals, "tilt": max(0.0, signals["tilt"] - own)}
 
 

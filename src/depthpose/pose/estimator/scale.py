@@ -8,7 +8,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.refine import Nearest
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.surface import NEAR, Surface
 
 POINTS = 400
@@ -72,13 +72,13 @@ def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Sc
     middle_m = (surface.points_m.amin(0) + surface.points_m.amax(0)) / 2
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, turned_m, _ = _grow(few_m, starts, middle_m, surface, surface.boxes.look_up)
-    costs = _distance(turned_m, times, middle_m, surface, surface.boxes.look_up).square()
+    times, turned_m, _ = _grow(few_m, starts, middle_m, surface, is_exact=False)
+    costs = _distance(turned_m, times, middle_m, surface, is_exact=False).square()
     costs[0] -= _TRUST
     start = starts[costs.argmin()][None]
-    times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, surface.nearest)
-    reached = _distance(turned_m, times, middle_m, surface, surface.nearest)
-    gain = distance_to(local_m, surface, surface.nearest) - reached[0]
+    times, turned_m, sigma = _grow(local_m[None], start, middle_m, surface, is_exact=True)
+    reached = _distance(turned_m, times, middle_m, surface, is_exact=True)
+    gain = distance_to(local_m, surface, is_exact=True) - reached[0]
     return Scale(float(times), float(sigma), float(gain))
 
 
@@ -87,13 +87,23 @@ def _grow(
     times: Float64[Tensor, " b"],
     middle_m: Float64[Tensor, "3"],
     surface: Surface,
-    nearest: Nearest,
+    *,
+    is_exact: bool,
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"], Float64[Tensor, " b"]]:
     """Step by step to the scale and place that fit; give also the moved points and the spread."""
-    sigma, limit_m = torch.ones_like(times), NEAR * surface.diameter_m
-    for step in range(_STEPS):
-        near_m = limit_m * (1 + (_WIDE - 1) * max(0.0, 1 - 2 * step / _STEPS))
-        motion, variance = _similar_step(local_m, times, (middle_m, near_m), surface, nearest)
+    widths = (1 + (_WIDE - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
+    limits_m = [NEAR * surface.diameter_m * width for width in widths]
+    if is_compiled():
+        from depthpose.pose.compiled.scale import grown
+
+        start = (local_m, times, middle_m)
+        times, local_m, variance = grown(start, surface.target, limits_m, _CONVERGED, is_exact)
+        return times, local_m, (_INDEPENDENT * variance).sqrt()
+    sigma = torch.ones_like(times)
+    for near_m in limits_m:
+        motion, variance = _similar_step(
+            local_m, times, (middle_m, near_m), surface, is_exact=is_exact
+        )
         times = (times * (1 + motion[:, 6].clamp(-0.1, 0.1))).clamp(0.5, 2.0)
         sigma = variance.clamp(min=0).sqrt()
         turn = rotation_by(motion[:, :3])
@@ -108,11 +118,13 @@ def _similar_step(
     times: Float64[Tensor, " b"],
     about: tuple[Float64[Tensor, "3"], float],
     surface: Surface,
-    nearest: Nearest,
+    *,
+    is_exact: bool,
 ) -> tuple[Float64[Tensor, "b 7"], Float64[Tensor, " b"]]:
     """One step of turn, shift and growth about the middle, with a limit; the growth's variance."""
     middle_m, limit_m = about
-    index = nearest((local_m - middle_m) / times[:, None, None] + middle_m)
+    own_m = (local_m - middle_m) / times[:, None, None] + middle_m
+    index = surface.find(own_m, is_exact=is_exact)
     normal = surface.normals[index]
     arm_m = times[:, None, None] * (surface.points_m[index] - middle_m)
     gap_m = local_m - middle_m - arm_m
@@ -135,28 +147,30 @@ def _distance(
     times: Float64[Tensor, " b"],
     middle_m: Float64[Tensor, "3"],
     surface: Surface,
-    nearest: Nearest,
+    *,
+    is_exact: bool,
 ) -> Float64[Tensor, " b"]:
     """Distance to the surface so many times as large."""
     own_m = (local_m - middle_m) / times[:, None, None] + middle_m
-    return distance_to(own_m, surface, nearest, times)
+    return distance_to(own_m, surface, times, is_exact=is_exact)
 
 
 def distance_to(
     local_m: Float64[Tensor, "*batch n 3"],
     surface: Surface,
-    nearest: Nearest,
     times: Float64[Tensor, "*batch"] | None = None,
+    *,
+    is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
     """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
 
     Args:
         local_m: in the model frame, where the surface has its own size.
         surface: of the model.
-        nearest: finds its points.
         times: by which all lengths are measured; None: 1.
+        is_exact: whether the nearest point is searched, or looked up.
     """
-    gap_m = (local_m - surface.points_m[nearest(local_m)]).norm(dim=-1)
+    gap_m = (local_m - surface.points_m[surface.find(local_m, is_exact=is_exact)]).norm(dim=-1)
     if times is not None:
         gap_m = times[..., None] * gap_m
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.sparse.kernel_map import KernelMap
 
 BLOCK_PRODUCTS = 1 << 23
@@ -85,6 +86,10 @@ TABLE_ELEMENTS = 1 << 25
 """Largest such table."""
 
 
+TABLE_ROWS = 1 << 17
+"""Up to so many offsets times outputs the compiled loop, which has no gradient, is the faster."""
+
+
 def conv(
     features: Float[Tensor, "rows_in c_in"],
     weight: Float[Tensor, "volume c_in c_out"],
@@ -99,6 +104,11 @@ def conv(
     if torch.is_autocast_enabled(device):
         narrower = torch.get_autocast_dtype(device)
         features, weight = features.to(narrower), weight.to(narrower)
+    if _is_compiled(features, weight, kernel_map):
+        from depthpose.pose.compiled.convolve import convolved
+
+        m = kernel_map
+        return convolved(features, weight, m.neighbours.table, m.outputs, m.is_transposed)
     return _Convolution.apply(features, weight, kernel_map)
 
 
@@ -227,6 +237,12 @@ def _table(x: Tensor, m: KernelMap) -> Tensor:
     rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
+
+
+def _is_compiled(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
+    is_plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32
+    is_used = is_plain and not torch.is_grad_enabled() and is_compiled()
+    return is_used and m.neighbours.table.numel() <= TABLE_ROWS
 
 
 def _is_narrow(x: Tensor, m: KernelMap) -> bool:

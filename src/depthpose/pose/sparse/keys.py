@@ -14,6 +14,7 @@ from jaxtyping import Int, Int32, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.pose.compiled import is_compiled
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
@@ -119,7 +120,8 @@ class VoxelIndex:
         self._keys, self._step = keys, step
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
-        if len(keys):
+        self._is_compiled = is_compiled() and keys.device.type == "cpu"
+        if len(keys) and not self._is_compiled:
             self._lay_out()
 
     def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
@@ -129,6 +131,11 @@ class VoxelIndex:
         """
         if not len(self._keys):
             return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
+        if self._is_compiled:
+            from depthpose.pose.compiled.convolve import rows_of
+
+            packed = [packed_move(*move) * self._step for move in moves]
+            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), packed))
         if self._table is None:
             return self._by_search(standing, moves)
         cells = self._cells(standing)

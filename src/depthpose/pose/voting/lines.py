@@ -8,6 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.types import Vote
 
 _SMALLEST = 1e-12
@@ -80,6 +81,15 @@ def prepare_lines(
 def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
     """Do as :func:`meet_lines` does, for what :func:`prepare_lines` gave."""
     w = lines[2]
+    if _is_single(lines):
+        from depthpose.pose.compiled.vote import met
+
+        p, covariance, condition = met(lines, refinements, _NEAREST)
+        every = torch.ones(len(w), dtype=w.dtype)
+        return Vote(
+            keypoints_m=p + centre_m, covariance_m2=covariance, condition=condition,
+            inlier_share=every,
+        )  # fmt: skip
     A, p = _nearest(lines)
     condition = _condition(A)
     gradient = None
@@ -101,11 +111,22 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
 
 def locate(lines: Lines, refinements: int) -> Float64[Tensor, "*b k 3"]:
     """Give the point alone, about the points' mean, without its covariance."""
+    if _is_single(lines):
+        from depthpose.pose.compiled.vote import met
+
+        return met(lines, refinements, _NEAREST)[0]
     _, p = _nearest(lines)
     for _ in range(refinements):
         A, gradient = _score(lines, p)
         p = p + _short_step(A, gradient.sum(-1).double(), lines[0], p)
     return p
+
+
+def _is_single(lines: Lines) -> bool:
+    """Whether compiled functions serve: one object, on the processor, in float64."""
+    n = lines[1]
+    is_plain = n.ndim == 3 and n.device.type == "cpu" and n.dtype == torch.float64
+    return is_plain and is_compiled() and not torch.is_grad_enabled()
 
 
 def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor, "*b k 3"]]:
@@ -159,7 +180,7 @@ def _short_step(A: Tensor, gradient: Tensor, local: Tensor, p: Tensor) -> Float6
 def _sandwich(A: Tensor, gradient: Tensor, votes: Tensor) -> Float64[Tensor, "*b k 3 3"]:
     inverse = torch.linalg.inv(_damped(A))
     # n lines of rank 2 fix 3 unknowns: few lines look surer than they are.
-    spare = (2 * votes / (2 * votes - 3).clamp(min=1)).double()[..., None, None]
+    spare = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
     return spare * (inverse @ (gradient @ gradient.mT).double() @ inverse)
 
 

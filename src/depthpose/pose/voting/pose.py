@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
+from depthpose.pose.compiled import is_compiled
 from depthpose.pose.types import Axis, PoseFit, Symmetries
 
 _STEPS = 4
@@ -43,10 +44,7 @@ def fit_pose(
     information = information * used[..., None, None]
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
     pose = fit_rigid(model, found, _balanced(trace))
-    for _ in range(_STEPS):
-        H, step = _normal_equations(pose, (model, found, information))
-        pose = perturb(pose, torch.linalg.solve(H, step))
-    H, _ = _normal_equations(pose, (model, found, information))
+    pose, H = _polished(pose, (model, found, information))
     error_m = pose.apply(model) - found
     count = used.sum(-1)
     misfit = (error_m[..., None, :] @ information @ error_m[..., None]).sum((-1, -2, -3))
@@ -83,6 +81,20 @@ def _with_third(axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
     if centre_m is None:
         return axes[:1]
     return tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
+
+
+def _polished(
+    pose: Rigid, terms: tuple[Tensor, Tensor, Tensor]
+) -> tuple[Rigid, Float64[Tensor, "*batch 6 6"]]:
+    """Go to the most likely pose; give its information matrix too."""
+    if is_compiled() and pose.R.device.type == "cpu" and not torch.is_grad_enabled():
+        from depthpose.pose.compiled.fit import fitted
+
+        return fitted(pose, terms, _STEPS)
+    for _ in range(_STEPS):
+        H, step = _normal_equations(pose, terms)
+        pose = perturb(pose, torch.linalg.solve(H, step))
+    return pose, _normal_equations(pose, terms)[0]
 
 
 def _normal_equations(

@@ -1,0 +1,8 @@
+"""Inner loops of a pose, compiled by numba where the extra ``fast`` is installed.
+
+Each gives what the torch code beside it gives, to rounding, in a small part of the time: clouds
+have hundreds of points, and most of torch's time is the overhead of its calls. The first call of
+each function compiles it, once on a machine.
+"""
+
+from depthpose.pose.compiled.choice import is_compiled as is_compiled

@@ -1,0 +1,89 @@
+"""Sparse convolution of small clouds: no call for each offset, nothing gathered."""
+
+import numpy as np
+from torch import Tensor
+
+from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.nearest import Array
+
+
+def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:
+    """Give the row of each key ``standing + move``; one past the last where there is none.
+
+    Args:
+        keys: (n,), ascending.
+        standing: (m,), ascending.
+        moves: packed.
+
+    Returns:
+        (moves, m), int32.
+    """
+    rows = np.empty((len(moves), len(standing)), np.int32)
+    _find_rows(keys, standing, np.array(moves, np.int64), rows)
+    return rows
+
+
+@compiled
+def _find_rows(keys, standing, moves, rows):
+    """Walk along both ascending lists at once."""
+    for k in range(len(moves)):
+        row = 0
+        for j in range(len(standing)):
+            wanted = standing[j] + moves[k]
+            while row < len(keys) and keys[row] < wanted:
+                row += 1
+            is_there = row < len(keys) and keys[row] == wanted
+            rows[k, j] = row if is_there else len(keys)
+
+
+@compiled
+def _add_row(out, row, weight):
+    """``out += row @ weight``: four inputs at once, outputs along the vector unit."""
+    inputs, outputs = weight.shape
+    whole = inputs - inputs % 4
+    for c in range(0, whole, 4):
+        a, b, e, f = row[c], row[c + 1], row[c + 2], row[c + 3]
+        wa, wb, we, wf = weight[c], weight[c + 1], weight[c + 2], weight[c + 3]
+        for k in range(outputs):
+            out[k] += a * wa[k] + b * wb[k] + e * we[k] + f * wf[k]
+    for c in range(whole, inputs):
+        a, wa = row[c], weight[c]
+        for k in range(outputs):
+            out[k] += a * wa[k]
+
+
+def convolved(
+    x: Tensor,
+    weight: Tensor,
+    table: Tensor,
+    rows: int,
+    is_transposed: bool,
+) -> Tensor:
+    """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``.
+
+    Args:
+        x: (rows in, c in), float32 on the processor.
+        weight: (volume, c in, c out).
+        table: (volume, coarse rows), int32: the fine row that each coarse row has at each offset;
+            one past the last where it has none.
+        rows: that are written.
+        is_transposed: from the coarse rows to the fine ones.
+    """
+    out = x.new_zeros(rows, weight.shape[2])
+    given = (a.detach().contiguous().numpy() for a in (x, weight, table))
+    _convolve(*given, is_transposed, out.numpy())
+    return out
+
+
+@compiled
+def _convolve(x, weight, table, is_transposed, out):
+    fine = len(out) if is_transposed else len(x)
+    for k in range(len(table)):
+        kernel = weight[k]
+        for coarse in range(table.shape[1]):
+            row = table[k, coarse]
+            if row < fine:
+                if is_transposed:
+                    _add_row(out[row], x[coarse], kernel)
+                else:
+                    _add_row(out[coarse], x[row], kernel)

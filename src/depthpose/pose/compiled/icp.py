@@ -1,0 +1,127 @@
+"""Steps of point-to-plane ICP for a batch of poses."""
+
+import numpy as np
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled.algebra import damp, rotation, solve
+from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.target import Target, find_places
+
+
+def refined(
+    cloud: Tensor,
+    pose: Rigid,
+    target: Target,
+    steps: tuple[list[float], float, float],
+    *,
+    is_exact: bool,
+) -> Rigid:
+    """Refine a pose or a batch of poses.
+
+    Args:
+        cloud: (n, 3), float64, in the camera frame.
+        pose: ``camera_from_model``, float64.
+        target: the surface.
+        steps: limits of the steps, turn and shift below which one is the last, and the length by
+            which a shift is measured.
+        is_exact: whether the nearest surface point is searched, or looked up.
+    """
+    limits, converged, scale = steps
+    R, t_m = pose.R.contiguous().clone(), pose.t_m.contiguous().clone()
+    poses = (R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
+    _refine(
+        cloud.contiguous().numpy(), *poses, np.array(limits), scale, converged, target, is_exact
+    )
+    return Rigid(R, t_m)
+
+
+@compiled
+def _localise(cloud, R, t, local):
+    """Move a cloud into the frame of the model."""
+    for i in range(len(cloud)):
+        x, y, z = cloud[i, 0] - t[0], cloud[i, 1] - t[1], cloud[i, 2] - t[2]
+        for c in range(3):
+            local[i, c] = R[0, c] * x + R[1, c] * y + R[2, c] * z
+
+
+@compiled
+def _add_equations(local, places, R, arm, limit, points, normals, H, b):
+    """Add up the normal equations of one pose about a point, from which ``arm`` is its origin."""
+    H[:] = 0.0
+    b[:] = 0.0
+    J = np.empty(6)
+    for i in range(len(local)):
+        place = places[i]
+        if place < 0:
+            continue
+        px, py, pz = points[place, 0], points[place, 1], points[place, 2]
+        mx, my, mz = normals[place, 0], normals[place, 1], normals[place, 2]
+        gx, gy, gz = local[i, 0] - px, local[i, 1] - py, local[i, 2] - pz
+        share = 1 - (gx * gx + gy * gy + gz * gz) / (limit * limit)
+        if share <= 0:
+            continue
+        residual = mx * gx + my * gy + mz * gz
+        nx = R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz
+        ny = R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz
+        nz = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz
+        ax = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + arm[0]
+        ay = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + arm[1]
+        az = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + arm[2]
+        J[0], J[1], J[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        J[3], J[4], J[5] = nx, ny, nz
+        for k in range(6):
+            scaled = share * share * J[k]
+            b[k] += scaled * residual
+            for m in range(k + 1):
+                H[k, m] += scaled * J[m]
+
+
+@compiled
+def _move(turn, motion, middle, R, t):
+    """Turn a pose about a point and shift it."""
+    x, y, z = t[0] - middle[0], t[1] - middle[1], t[2] - middle[2]
+    for c in range(3):
+        t[c] = turn[c, 0] * x + turn[c, 1] * y + turn[c, 2] * z + middle[c] + motion[3 + c]
+        x_c, y_c, z_c = R[0, c], R[1, c], R[2, c]
+        for k in range(3):
+            R[k, c] = turn[k, 0] * x_c + turn[k, 1] * y_c + turn[k, 2] * z_c
+
+
+@compiled
+def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact):
+    """Move poses in place, step by step, until none of them moves any more.
+
+    Args:
+        cloud: (n, 3), in the camera frame.
+        Rs: (b, 3, 3), rotations ``camera_from_model``.
+        ts: (b, 3), translations.
+        limits: (steps,), distances up to which a point counts.
+        scale: length that a shift is measured by.
+        converged: turn [rad] and shift of a step below which it is the last.
+        target: the surface.
+        is_exact: whether the nearest point is searched, or looked up.
+    """
+    middle = np.zeros(3)
+    for i in range(len(cloud)):
+        middle += cloud[i]
+    middle /= len(cloud)
+    places = np.full((len(ts), len(cloud)), -1)
+    points, normals = target[0][0], target[1]
+    local, turn = np.empty_like(cloud), np.empty((3, 3))
+    H, b, motion = np.empty((6, 6)), np.empty(6), np.empty(6)
+    for limit in limits:
+        most = 0.0
+        for p in range(len(ts)):
+            R, t = Rs[p], ts[p]
+            _localise(cloud, R, t, local)
+            find_places(local, limit, target, is_exact, places[p])
+            _add_equations(local, places[p], R, t - middle, limit, points, normals, H, b)
+            damp(H, 1e-6)
+            solve(H, b, motion)
+            rotation(motion[0], motion[1], motion[2], turn)
+            _move(turn, motion, middle, R, t)
+            for k in range(6):
+                most = max(most, abs(motion[k]) / (1.0 if k < 3 else scale))
+        if limit <= limits[-1] and most < converged:
+            break

@@ -1,0 +1,154 @@
+"""Lines to the point where they meet, for the keypoints of one object.
+
+The formulas are those of :mod:`depthpose.pose.voting`.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from depthpose.pose.compiled.algebra import jacobi, solve
+from depthpose.pose.compiled.choice import compiled
+
+_SMALLEST = 1e-12
+
+
+def met(
+    lines: tuple[Tensor, Tensor, Tensor], refinements: int, nearest: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the point where the lines of each keypoint meet best.
+
+    Args:
+        lines: points (1, 3, n) about their mean, unit directions (k, 3, n), weights (k, n), all
+            float64.
+        refinements: steps after the nearest point.
+        nearest: points nearer to a keypoint than this share of the mean distance weigh no more.
+
+    Returns:
+        Points (k, 3) about the points' mean, covariances (k, 3, 3), condition numbers (k,).
+    """
+    count = len(lines[1])
+    out = [torch.empty(count, *shape, dtype=torch.float64) for shape in ((3,), (3, 3), ())]
+    given = (a.contiguous().numpy() for a in lines)
+    _meet(*given, refinements, nearest, *(a.numpy() for a in out))
+    return out[0], out[1], out[2]
+
+
+@compiled
+def _damped(A, out):
+    size = max(A[0, 0] + A[1, 1] + A[2, 2], 1e-300)
+    out[:] = A
+    for c in range(3):
+        out[c, c] += 1e-12 * size
+
+
+@compiled
+def _add_outer(A, amount, x, y, z):
+    """Add ``amount (I - q q^T)``, of the lower half."""
+    A[0, 0] += amount * (1 - x * x)
+    A[1, 1] += amount * (1 - y * y)
+    A[2, 2] += amount * (1 - z * z)
+    A[1, 0] -= amount * x * y
+    A[2, 0] -= amount * x * z
+    A[2, 1] -= amount * y * z
+
+
+@compiled
+def _mirror(A):
+    A[0, 1], A[0, 2], A[1, 2] = A[1, 0], A[2, 0], A[2, 1]
+
+
+@compiled
+def _start(local, n, w, A, p, memory):
+    """Find the point nearest to all lines, and its matrix over the sum of weights."""
+    b = np.zeros(3)
+    A[:] = 0.0
+    total = 0.0
+    for i in range(len(w)):
+        x, y, z = local[0, i], local[1, i], local[2, i]
+        along = n[0, i] * x + n[1, i] * y + n[2, i] * z
+        _add_outer(A, w[i], n[0, i], n[1, i], n[2, i])
+        b[0] += w[i] * (x - n[0, i] * along)
+        b[1] += w[i] * (y - n[1, i] * along)
+        b[2] += w[i] * (z - n[2, i] * along)
+        total += w[i]
+    A /= total
+    b /= total
+    _mirror(A)
+    _damped(A, memory)
+    solve(memory, b, p)
+
+
+@compiled
+def _gradients(local, n, w, p, nearest, A, gradient):
+    """Write the information matrix and the gradient of each line, over the sum of weights."""
+    total, mean = 0.0, 0.0
+    for i in range(len(w)):
+        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
+        mean += np.sqrt(x * x + y * y + z * z) / len(w)
+        total += w[i]
+    least = nearest * max(mean, _SMALLEST)
+    A[:] = 0.0
+    for i in range(len(w)):
+        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
+        reach = max(np.sqrt(x * x + y * y + z * z), _SMALLEST)
+        x, y, z = x / reach, y / reach, z / reach
+        reach = max(reach, least)
+        cosine = n[0, i] * x + n[1, i] * y + n[2, i] * z
+        pull = w[i] / reach / total
+        gradient[0, i] = (n[0, i] - x * cosine) * pull
+        gradient[1, i] = (n[1, i] - y * cosine) * pull
+        gradient[2, i] = (n[2, i] - z * cosine) * pull
+        _add_outer(A, pull / reach * max(cosine, 0.5), x, y, z)
+    _mirror(A)
+
+
+@compiled
+def _nearest_gradients(local, n, w, p, gradient):
+    total = 0.0
+    for i in range(len(w)):
+        total += w[i]
+    for i in range(len(w)):
+        x, y, z = p[0] - local[0, i], p[1] - local[1, i], p[2] - local[2, i]
+        along = n[0, i] * x + n[1, i] * y + n[2, i] * z
+        gradient[0, i] = (x - n[0, i] * along) * w[i] / total
+        gradient[1, i] = (y - n[1, i] * along) * w[i] / total
+        gradient[2, i] = (z - n[2, i] * along) * w[i] / total
+
+
+@compiled
+def _meet(local, n, w, refinements, nearest, points, covariances, conditions):
+    local = local[0]
+    count = local.shape[1]
+    A, V, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    gradient, pull, step, unit = np.empty((3, count)), np.empty(3), np.empty(3), np.empty(3)
+    inverse, spread = np.empty((3, 3)), 0.0
+    for i in range(count):
+        spread += (local[0, i] ** 2 + local[1, i] ** 2 + local[2, i] ** 2) / count
+    for k in range(len(points)):
+        p = points[k]
+        _start(local, n[k], w[k], A, p, M)
+        M[:] = A
+        jacobi(M, V)
+        low, high = min(M[0, 0], M[1, 1], M[2, 2]), max(M[0, 0], M[1, 1], M[2, 2])
+        conditions[k] = high / low if low > 1e-7 else np.inf
+        for _ in range(refinements):
+            _gradients(local, n[k], w[k], p, nearest, A, gradient)
+            for c in range(3):
+                pull[c] = gradient[c].sum()
+            _damped(A, M)
+            solve(M, pull, step)
+            limit = np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 + spread)
+            size = max(np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2), _SMALLEST)
+            for c in range(3):
+                p[c] += step[c] * min(limit / size, 1.0)
+        if refinements == 0:
+            _nearest_gradients(local, n[k], w[k], p, gradient)
+        for c in range(3):
+            unit[:] = 0.0
+            unit[c] = 1.0
+            _damped(A, M)
+            solve(M, unit, inverse[c])
+        votes = (w[k] > 0).sum()
+        spare = 2 * votes / max(2 * votes - 3, 1)
+        covariances[k] = spare * (inverse @ (gradient @ gradient.T) @ inverse)

@@ -1,0 +1,261 @@
+"""What numba compiles gives what torch gives."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.pose.cloud import local_planes
+from depthpose.pose.compiled import choice
+from depthpose.pose.config import IcpConfig, VotingConfig
+from depthpose.pose.estimator.outline import overhang
+from depthpose.pose.estimator.scale import scale_of
+from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.refine import Refined, refine_best, refine_pose, refine_roughly
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
+from depthpose.pose.synthetic.parts import make_part
+from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
+
+pytest.importorskip("numba")
+
+T = TypeVar("T")
+PARTS = ("bracket", "spool")
+
+
+@pytest.fixture(autouse=True)
+def _without_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+    choice.is_compiled.cache_clear()
+
+
+def both(compute: Callable[[], T], monkeypatch: pytest.MonkeyPatch) -> tuple[T, T]:
+    """Compute with torch, then with compiled functions."""
+    found = []
+    for switch in ("0", "1"):
+        monkeypatch.setenv("DEPTHPOSE_COMPILED", switch)
+        choice.is_compiled.cache_clear()
+        assert choice.is_compiled() == (switch == "1")
+        found.append(compute())
+    return found[0], found[1]
+
+
+@pytest.fixture(params=PARTS)
+def surface(request: pytest.FixtureRequest) -> Surface:
+    return prepare_surface(make_part(request.param), 4000)
+
+
+def seen(surface: Surface, pose: Rigid, count: int = 800) -> Tensor:
+    """Noisy points of a posed surface, and some that lie elsewhere."""
+    generator = torch.Generator().manual_seed(3)
+    index = torch.randint(len(surface.points_m), (count,), generator=generator)
+    noise = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    noise *= 0.003 * surface.diameter_m
+    noise[::10] *= 60
+    return pose.apply(surface.points_m[index] + noise)
+
+
+def poses(surface: Surface, count: int, spread: float = 0.2) -> Rigid:
+    """Poses about one that lies before the camera; the first is that one."""
+    generator = torch.Generator().manual_seed(5)
+    turn, shift = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    turn[0] = shift[0] = 0
+    middle_m = torch.tensor([0.03, -0.02, 0.7], dtype=torch.float64)
+    return Rigid(rotation_by(spread * turn), middle_m + 0.1 * spread * shift * surface.diameter_m)
+
+
+def is_near(a: Tensor, b: Tensor, limit: float) -> bool:
+    return bool(((a - b).abs() <= limit).all())
+
+
+def test_nearest_surface_points(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(1)
+    asked_m = surface.diameter_m * torch.randn(3, 300, 3, generator=generator).double()
+    first, second = both(lambda: surface.nearest(asked_m), monkeypatch)
+    assert torch.equal(first, second)
+    assert first.shape == (3, 300)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
+def test_trees_of_few_points(count: int) -> None:
+    from depthpose.pose.compiled.nearest import nearest_of, tree_of
+
+    generator = torch.Generator().manual_seed(count)
+    points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    points[count // 2] = points[0]  # two alike
+    asked = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+    _, found = nearest_of(asked.numpy(), tree_of(points.numpy()))
+    true = torch.cdist(asked, points, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    assert is_near(torch.from_numpy(found), true, 1e-12)
+
+
+def equal(a: Refined, b: Refined, limit: float) -> bool:
+    pairs = [
+        (a.camera_from_model.R, b.camera_from_model.R),
+        (a.camera_from_model.t_m, b.camera_from_model.t_m),
+        (a.residual_m, b.residual_m),
+        (a.inlier_share, b.inlier_share),
+    ]
+    return all(is_near(*pair, limit) for pair in pairs)
+
+
+def test_refined_poses(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts = poses(surface, 4)
+    cloud_m = seen(surface, starts[0])
+    a, b = both(lambda: refine_pose(cloud_m, starts, surface), monkeypatch)
+    # A spool turns freely about its axis, where rounding decides.
+    assert equal(a, b, 1e-6 if surface.is_symmetric else 1e-10)
+    one, other = both(lambda: refine_pose(cloud_m, starts[1], surface), monkeypatch)
+    assert one.camera_from_model.R.shape == (3, 3)
+    assert equal(one, other, 1e-6 if surface.is_symmetric else 1e-10)
+
+
+def test_nothing_near_moves_nothing(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = poses(surface, 1)[0]
+    away_m = seen(surface, start) + 5.0
+    for found in both(lambda: refine_pose(away_m, start, surface), monkeypatch):
+        assert torch.equal(found.camera_from_model.R, start.R)
+        assert float(found.inlier_share) == 0
+
+
+def test_rough_poses(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts = poses(surface, 6)
+    cloud_m = seen(surface, starts[0])
+    a, b = both(lambda: refine_roughly(cloud_m, starts, surface, IcpConfig()), monkeypatch)
+    assert is_near(a.R, b.R, 1e-6)
+    assert is_near(a.t_m, b.t_m, 1e-7)
+
+
+def test_the_best_pose(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts = poses(surface, 2)
+    cloud_m = seen(surface, starts[0])
+    a, b = both(lambda: refine_best(cloud_m, starts, surface), monkeypatch)
+    assert (a.start, a.scatter) == (b.start, b.scatter)
+    assert equal(a.refined, b.refined, 1e-6)
+
+
+@pytest.mark.parametrize("times", [1.0, 1.06, 0.9])
+def test_scales(times: float, surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = poses(surface, 1)[0]
+    cloud_m = pose.apply(times * pose.inverse().apply(seen(surface, pose)))
+    a, b = both(lambda: scale_of(cloud_m, pose, surface), monkeypatch)
+    assert abs(a.times - b.times) < 1e-6
+    assert abs(a.sigma - b.sigma) < 1e-6
+    assert abs(a.gain - b.gain) < 1e-6
+
+
+def test_planes(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud_m = seen(surface, poses(surface, 1)[0])
+    (a, bend), (b, other) = both(lambda: local_planes(cloud_m, cloud_m[::3]), monkeypatch)
+    assert is_near(bend, other, 1e-10)
+    assert is_near((a * b).sum(-1), torch.ones(len(a)).double(), 1e-10)
+
+
+def test_planes_of_fewer_points_than_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud_m = torch.randn(7, 3, generator=torch.Generator().manual_seed(2)).double()
+    (a, bend), (b, other) = both(lambda: local_planes(cloud_m, cloud_m), monkeypatch)
+    assert is_near(a, b, 1e-10)
+    assert is_near(bend, other, 1e-10)
+
+
+def test_rays(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    every = poses(surface, 5, spread=1.0)
+    every = Rigid(every.R, torch.cat([every.t_m[:4], -every.t_m[4:]]))  # the last behind the camera
+    cloud_m = seen(surface, every[0])
+    a, b = both(lambda: look_along_rays(cloud_m, every, surface, every=2), monkeypatch)
+    for first, second in zip(a, b, strict=True):
+        assert is_near(first, second, 1e-12)
+    assert float(a[0][-1]) == float(a[1][-1]) == 1
+
+
+def test_outlines(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = poses(surface, 1)[0]
+    cloud_m = seen(surface, pose)
+    a, b = both(lambda: overhang(cloud_m, pose, surface), monkeypatch)
+    assert abs(a - b) < 1e-12
+
+
+@pytest.mark.parametrize("is_weighted", [True, False])
+@pytest.mark.parametrize("refinements", [0, 3])
+def test_votes(refinements: int, is_weighted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(4)
+    points_m = 0.05 * torch.randn(60, 3, generator=generator).double()
+    keypoints_m = 0.05 * torch.randn(8, 3, generator=generator).double()
+    directions = torch.nn.functional.normalize(keypoints_m - points_m[:, None], dim=-1)
+    directions += 0.05 * torch.randn(60, 8, 3, generator=generator).double()
+    weight = torch.rand(60, 8, generator=generator).double() if is_weighted else None
+    config = VotingConfig(refinements=refinements)
+    ways = (
+        lambda: meet_lines(points_m, directions, weight, refinements),
+        lambda: vote_ransac(points_m, directions, weight, config),
+    )
+    for way in ways:
+        a, b = both(way, monkeypatch)
+        assert is_near(a.keypoints_m, b.keypoints_m, 1e-12)
+        assert is_near(a.covariance_m2, b.covariance_m2, 1e-12)
+        assert is_near(a.condition, b.condition, 1e-9)
+        assert torch.equal(a.inlier_share, b.inlier_share)
+
+
+def test_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(6)
+    model_m = 0.1 * torch.randn(8, 3, generator=generator).double()
+    found_m = model_m @ rotation_by(torch.tensor([0.3, -0.2, 2.0]).double()).T + 0.5
+    found_m = found_m + 0.002 * torch.randn(2, 8, 3, generator=generator).double()
+    root = 0.002 * torch.randn(2, 8, 3, 3, generator=generator).double()
+    covariance_m2 = root @ root.mT + 1e-8 * torch.eye(3).double()
+    used = torch.ones(2, 8, dtype=torch.bool)
+    used[1, 2] = False
+    for part in (slice(None), 0):
+        given = (found_m[part], covariance_m2[part], model_m, used[part])
+        a, b = both(lambda given=given: fit_pose(*given), monkeypatch)
+        assert is_near(a.camera_from_model.R, b.camera_from_model.R, 1e-9)
+        assert is_near(a.covariance, b.covariance, 1e-9)
+        assert is_near(a.misfit, b.misfit, 1e-6)
+
+
+def test_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    widths = {"encoder": (8, 8, 16, 16), "decoder": (8, 8, 8, 8), "first_kernel": 5}
+    network = ResUNet(ResUNetConfig(classes=2, keypoints=8, inputs=9, **widths)).eval()
+    generator = torch.Generator().manual_seed(8)
+    cells = torch.randint(-9, 9, (400, 3), generator=generator).unique(dim=0)
+    clouds = torch.cat([torch.nn.functional.pad(cells, (1, 0), value=k) for k in (0, 3)])
+    features = torch.randn(len(clouds), 9, generator=generator)
+    a, b = both(lambda: network(Voxels.from_points(clouds, features)), monkeypatch)
+    assert is_near(a, b, 1e-5)
+    assert float(a.abs().max()) > 1e-3
+
+
+def test_gradients_are_torch_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = ResUNet(ResUNetConfig(classes=1, encoder=(4, 4, 4, 4), decoder=(4, 4, 4, 4)))
+    cells = torch.nn.functional.pad(torch.randint(0, 6, (60, 3)).unique(dim=0), (1, 0))
+
+    def gradient() -> Tensor:
+        with torch.enable_grad():
+            network.zero_grad()
+            network(Voxels.from_points(cells)).square().sum().backward()
+        found = network.final.weight.grad
+        assert found is not None
+        return found.clone()
+
+    a, b = both(gradient, monkeypatch)
+    assert torch.equal(a, b)
+
+
+@pytest.mark.slow
+def test_the_rest_of_the_tests_with_torch_alone() -> None:
+    """Edge cases are tested once, by what is installed: here without numba."""
+    names = ("refine", "surface", "voting", "scale", "mirror", "outline", "sparse", "cloud",
+             "refusal", "keypoint_pose", "network", "estimator", "alternatives")  # fmt: skip
+    files = [f"tests/pose/test_{name}.py" for name in names]
+    environment = {**os.environ, "DEPTHPOSE_COMPILED": "0"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
+    subprocess.run(command, check=True, env=environment)
