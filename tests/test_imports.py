@@ -40,6 +40,15 @@ def test_the_command_line_loads_nothing_heavy() -> None:
     )
 
 
+def test_loading_weights_imports_no_compiler() -> None:
+    loaded = modules_after(
+        "from depthpose import FakestereoNet, GeoPoseNet; FakestereoNet.load('default'); "
+        "FakestereoNet.load('psmnet-compact'); GeoPoseNet.load('parts')"
+    )
+    assert "depthpose.pose.network" in loaded
+    assert not {"torch._dynamo", "torch._inductor", "sympy", "numba"} & loaded
+
+
 def test_an_estimator_is_imported_when_asked_for() -> None:
     assert depthpose.FakestereoNet.__name__ == "FakestereoNet"
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import pickle
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +14,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import refused_as, write_bytes
@@ -21,6 +22,8 @@ from depthpose.core.hub import SHIPPED as SHIPPED
 from depthpose.core.hub import find_weights as find_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
+_DRAWS = ("normal_", "uniform_", "trunc_normal_", "kaiming_normal_", "kaiming_uniform_")
+"""Functions that draw random weights in place."""
 
 
 class LicenceNotice(Notice):
@@ -109,12 +112,34 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
     Raises:
         InputError: as there, or a config of which no network can be made.
     """
-    with refused_as(source, "config of a network", "file and config are of different versions"):
+    with (
+        refused_as(source, "config of a network", "file and config are of different versions"),
+        _WithoutDrawing(),
+    ):
         with torch.device("meta"):
             _refuse_misfits(make(), checkpoint, source)
         network = make()
     load_weights(network, checkpoint, source)
     return network
+
+
+class _WithoutDrawing(TorchFunctionMode):
+    """Draws no random weights, which are replaced anyway.
+
+    On the meta device torch would first import its compiler for that, a second and more.
+    """
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:  # noqa: ANN401
+        given = kwargs or {}
+        if getattr(func, "__name__", "") in _DRAWS:
+            return args[0] if args else given["tensor"]
+        return func(*args, **given)
 
 
 def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:

@@ -74,7 +74,8 @@ class SelectionGenerator(nn.Module):
 def make_planes(config: SelectionConfig) -> Planes:
     """Give the disparities that are distinguished [px], evenly spaced in their logarithm."""
     low, high = config.disparity_px
-    return torch.linspace(math.log(low), math.log(high), config.planes).exp()
+    # On the processor in any case: for the meta device torch would import its compiler.
+    return torch.linspace(math.log(low), math.log(high), config.planes, device="cpu").exp()
 
 
 @dataclass(frozen=True, eq=False)
