@@ -52,7 +52,7 @@ class Arm:
     seed: int = 0
 
 
-OTHER_RIGS = StreetsConfig(number=700, seed=33, scale=0.5, rigs="varied", with_lidar=False)
+OTHER_RIGS = StreetsConfig(frames=700, seed=33, scale=0.5, rigs="varied", with_lidar=False)
 """Half of them by rigs of 0.12 to 0.8 m and other fields of view."""
 SCRATCH = {"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0}
 ARMS = (
