@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from depthpose.core.errors import Notice
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.compiled import choice
@@ -248,6 +249,17 @@ def test_gradients_are_torch_s(monkeypatch: pytest.MonkeyPatch) -> None:
 
     a, b = both(gradient, monkeypatch)
     assert torch.equal(a, b)
+
+
+def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise ImportError(f"{name} needs NumPy 2.3 or less")
+
+    monkeypatch.setenv("DEPTHPOSE_COMPILED", "1")
+    monkeypatch.setattr(choice, "import_module", fail)
+    choice.is_compiled.cache_clear()
+    with pytest.warns(Notice, match=r"numba needs NumPy 2.3 or less.*computed by torch"):
+        assert not choice.is_compiled()
 
 
 @pytest.mark.slow
