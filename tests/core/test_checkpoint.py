@@ -14,6 +14,7 @@ from torch import nn
 from depthpose.core.checkpoint import (
     Checkpoint,
     bound_facts,
+    build_network,
     file_sha256,
     find_weights,
     join_terms,
@@ -227,3 +228,26 @@ def test_metadata_is_text_that_others_can_read(tmp_path: Path) -> None:
     raw = saved(tmp_path).read_bytes()
     header = json.loads(raw[8 : 8 + int.from_bytes(raw[:8], "little")])
     assert header["__metadata__"]["kind"] == "toy"
+
+
+class Drawn(nn.Module):
+    """A network whose weights are drawn in every way that torch has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        names = ("normal_", "uniform_", "trunc_normal_", "kaiming_normal_", "kaiming_uniform_")
+        names += ("xavier_normal_", "xavier_uniform_", "orthogonal_")
+        for name in names:
+            self.register_parameter(name, nn.Parameter(torch.ones(8, 4)))
+            getattr(nn.init, name)(self.get_parameter(name))
+
+
+def test_a_network_is_built_without_drawing_its_weights() -> None:
+    state = {name: weight.detach().clone() for name, weight in Drawn().named_parameters()}
+    built = build_network(Drawn, Checkpoint(kind="toy", config={}, state=state), "w")
+    for name, weight in built.named_parameters():
+        assert torch.equal(weight, state[name])
+    plain = Checkpoint(kind="toy", config={}, state=nn.Linear(3, 2).state_dict())
+    before = torch.get_rng_state()
+    build_network(lambda: nn.Linear(3, 2), plain, "w")
+    assert torch.equal(torch.get_rng_state(), before)

@@ -1,9 +1,11 @@
 """What numba compiles gives what torch gives."""
 
+import inspect
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 import pytest
@@ -19,7 +21,7 @@ from depthpose.pose.estimator.outline import overhang
 from depthpose.pose.estimator.scale import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.refine import Refined, refine_best, refine_pose, refine_roughly
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.sparse import Voxels, conv
 from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
@@ -249,6 +251,73 @@ def test_gradients_are_torch_s(monkeypatch: pytest.MonkeyPatch) -> None:
 
     a, b = both(gradient, monkeypatch)
     assert torch.equal(a, b)
+
+
+def test_what_is_not_finite_is_refused(surface: Surface) -> None:
+    pose = poses(surface, 1)
+    cloud_m = seen(surface, pose[0])
+    cloud_m[3, 1] = torch.nan
+    strange = Rigid(pose.R, pose.t_m * torch.nan)
+    calls = (
+        lambda: surface.nearest(cloud_m),
+        lambda: local_planes(cloud_m, cloud_m),
+        lambda: look_along_rays(cloud_m, pose, surface),
+        lambda: look_along_rays(cloud_m[5:], strange, surface),
+        lambda: overhang(cloud_m, pose[0], surface),
+        lambda: refine_roughly(cloud_m[5:], strange, surface, IcpConfig()),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="finite"):
+            call()
+
+
+def test_rows_that_do_not_fit_are_refused() -> None:
+    cells = torch.nn.functional.pad(torch.randint(0, 6, (60, 3)).unique(dim=0), (1, 0))
+    kernel_map = Voxels.from_points(cells).cache.kernel_map(0, 3)
+    with pytest.raises(AssertionError, match="a row for each voxel"):
+        conv(torch.zeros(3, 8), torch.zeros(27, 8, 5), kernel_map)
+
+
+def test_gradients_pass_through_rays_and_rough_poses(surface: Surface) -> None:
+    starts = poses(surface, 2)
+    cloud_m = seen(surface, starts[0])
+    with torch.enable_grad():
+        moved = Rigid(starts.R, starts.t_m.clone().requires_grad_())
+        look_along_rays(cloud_m, moved, surface)
+        assert refine_roughly(cloud_m, moved, surface, IcpConfig()).t_m.requires_grad
+
+
+def test_without_a_folder_for_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numba
+
+    given = []
+
+    def njit(*, cache: bool = False, **words: object) -> Callable[[T], T]:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        given.append(words)
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", njit)
+    assert choice.compiled(test_networks) is inspect.unwrap(test_networks)
+    assert len(given) == 1
+
+
+def test_what_is_compiled_is_kept_by_all_sources(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import numba
+
+    before = numba.config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    names = []
+    for text in ("one", "another"):
+        (tmp_path / "loop.py").write_text(text)
+        monkeypatch.setattr(choice, "__file__", str(tmp_path / "choice.py"))
+        choice._digest.cache_clear()
+        names.append(choice._digest())
+    choice._digest.cache_clear()
+    assert names[0] != names[1]
+    assert before == numba.config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ from depthpose.core.hub import SHIPPED as SHIPPED
 from depthpose.core.hub import find_weights as find_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
-_DRAWS = ("normal_", "uniform_", "trunc_normal_", "kaiming_normal_", "kaiming_uniform_")
-"""Functions that draw random weights in place."""
+_DRAWS = (nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_)
+"""Functions that draw random weights, and may be skipped as a whole."""
 
 
 class LicenceNotice(Notice):
@@ -137,7 +137,7 @@ class _WithoutDrawing(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:  # noqa: ANN401
         given = kwargs or {}
-        if getattr(func, "__name__", "") in _DRAWS:
+        if func in _DRAWS:
             return args[0] if args else given["tensor"]
         return func(*args, **given)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import turn_axis_to
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.types import CloudInput, ViewInput
 
@@ -225,7 +225,7 @@ def local_planes(
         The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
     """
     count = min(_NEIGHBOURS, len(every_m))
-    if is_compiled():
+    if serves(every_m, some_m):
         from depthpose.pose.compiled.planes import planes_of
 
         normals, bend = planes_of(every_m.numpy(), some_m.numpy(), count)

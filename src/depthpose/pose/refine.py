@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, look_along_rays
 
@@ -190,7 +190,7 @@ def _iterated(
     is_exact: bool,
 ) -> Rigid:
     """Step by step to where the cloud lies on the surface, until nothing moves any more."""
-    if is_compiled():
+    if serves(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.icp import refined
 
         steps = (limits_m, _CONVERGED, surface.diameter_m)

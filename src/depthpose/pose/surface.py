@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import ObjectModel
 
@@ -78,7 +78,7 @@ class Surface:
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point nearest to each point of the model frame."""
-        if is_compiled():
+        if serves(points_m):
             from depthpose.pose.compiled.nearest import nearest_of
 
             return torch.from_numpy(nearest_of(points_m.numpy(), self.target.tree)[0])
@@ -92,7 +92,7 @@ class Surface:
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
-        """The same for compiled functions."""
+        """Points, normals and table as compiled functions take them."""
         from depthpose.pose.compiled.target import target_of
 
         boxes = self.boxes
@@ -141,7 +141,7 @@ def look_along_rays(
     seen = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = seen.median(0).values.floor()
     limit_m = 1.5 * NEAR * surface.diameter_m
-    if is_compiled():
+    if serves(cloud_m, poses.R, poses.t_m):
         from depthpose.pose.compiled.rays import compare_rays
 
         rays = (scale, *middle.tolist(), _REACH)

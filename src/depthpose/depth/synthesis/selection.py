@@ -74,8 +74,10 @@ class SelectionGenerator(nn.Module):
 def make_planes(config: SelectionConfig) -> Planes:
     """Give the disparities that are distinguished [px], evenly spaced in their logarithm."""
     low, high = config.disparity_px
-    # On the processor in any case: for the meta device torch would import its compiler.
-    return torch.linspace(math.log(low), math.log(high), config.planes, device="cpu").exp()
+    # Computed on the processor: for the meta device torch would import its compiler.
+    planes = torch.linspace(math.log(low), math.log(high), config.planes, device="cpu").exp()
+    device = torch.get_default_device()
+    return planes if device.type == "meta" else planes.to(device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 Each gives what the torch code beside it gives, to rounding, in a small part of the time: clouds
 have hundreds of points, and most of torch's time is the overhead of its calls. The first call of
-each function compiles it, once on a machine.
+each function compiles it; what was compiled is kept on disk until a source changes.
 """
 
 from depthpose.pose.compiled.choice import is_compiled as is_compiled
+from depthpose.pose.compiled.choice import serves as serves

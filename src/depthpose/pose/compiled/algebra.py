@@ -9,7 +9,7 @@ from depthpose.pose.compiled.choice import compiled
 def solve(H, b, x):
     """Solve a symmetric system, of which the lower half is read; ``H`` is used up.
 
-    By elimination with pivots, as rounding may make a matrix that was positive indefinite.
+    By elimination with pivots, as rounding may make a positive matrix indefinite.
     """
     n = len(b)
     for i in range(n):

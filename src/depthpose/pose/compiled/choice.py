@@ -1,13 +1,20 @@
-"""Whether compiled functions are used, and how they are compiled."""
+"""Whether compiled functions are used, how they are compiled, and what they are given."""
 
 import inspect
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
+from hashlib import sha256
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from depthpose.core.errors import Notice
 
@@ -38,9 +45,55 @@ def is_compiled() -> bool:
     return True
 
 
+def serves(*tensors: Tensor) -> bool:
+    """Whether compiled functions serve for these: on the processor, and without gradients."""
+    with_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    return not with_gradients and all(t.device.type == "cpu" for t in tensors) and is_compiled()
+
+
+def finite_array(values: Tensor | np.ndarray) -> np.ndarray:
+    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    array = values.detach().numpy() if isinstance(values, Tensor) else values
+    if not np.isfinite(array).all():
+        raise ValueError("values must be finite; leave out what is not")
+    return np.ascontiguousarray(array)
+
+
 def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's dispatcher
     """Compile a function when it is first called; what was compiled is kept on disk."""
     from numba import njit
 
     # Tests check annotations by wrapping every function: numba wants what is inside.
-    return njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+    inner = inspect.unwrap(function)
+    try:
+        with _cached_by_source():
+            return njit(cache=True, nogil=True, error_model="numpy")(inner)
+    except RuntimeError:  # no folder that may be written to
+        return njit(nogil=True, error_model="numpy")(inner)
+
+
+@contextmanager
+def _cached_by_source() -> Iterator[None]:
+    """Keep what is compiled in a folder for all sources as they are.
+
+    numba itself looks at the file of a function alone, and functions call those of other files.
+    """
+    config: Any = import_module("numba").config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(Path(__file__).parent / "__pycache__" / f"numba-{_digest()}")
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before
+
+
+@cache
+def _digest() -> str:
+    digest = sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]

@@ -56,7 +56,7 @@ def convolved(
     x: Tensor,
     weight: Tensor,
     table: Tensor,
-    rows: int,
+    fine_rows: int,
     is_transposed: bool,
 ) -> Tensor:
     """Convolve: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``.
@@ -66,10 +66,14 @@ def convolved(
         weight: (volume, c in, c out).
         table: (volume, coarse rows), int32: the fine row that each coarse row has at each offset;
             one past the last where it has none.
-        rows: that are written.
+        fine_rows: number of the fine rows.
         is_transposed: from the coarse rows to the fine ones.
     """
-    out = x.new_zeros(rows, weight.shape[2])
+    coarse_rows = table.shape[1]
+    read, written = (coarse_rows, fine_rows) if is_transposed else (fine_rows, coarse_rows)
+    assert x.shape == (read, weight.shape[1]), "a row for each voxel, a channel for each weight"
+    assert len(weight) == len(table), "a weight for each offset"
+    out = x.new_zeros(written, weight.shape[2])
     given = (a.detach().contiguous().numpy() for a in (x, weight, table))
     _convolve(*given, is_transposed, out.numpy())
     return out

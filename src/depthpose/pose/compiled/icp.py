@@ -1,11 +1,12 @@
 """Steps of point-to-plane ICP for a batch of poses."""
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled.algebra import damp, rotation, solve
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 from depthpose.pose.compiled.target import Target, find_places
 
 
@@ -26,13 +27,15 @@ def refined(
         steps: limits of the steps, turn and shift below which one is the last, and the length by
             which a shift is measured.
         is_exact: whether the nearest surface point is searched, or looked up.
+
+    Raises:
+        ValueError: a value is not finite.
     """
     limits, converged, scale = steps
-    R, t_m = pose.R.contiguous().clone(), pose.t_m.contiguous().clone()
-    poses = (R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
-    _refine(
-        cloud.contiguous().numpy(), *poses, np.array(limits), scale, converged, target, is_exact
-    )
+    assert pose.R.shape[:-2] == pose.t_m.shape[:-1], "a translation for each rotation"
+    R, t_m = (torch.from_numpy(finite_array(a).copy()) for a in (pose.R, pose.t_m))
+    given = (finite_array(cloud), R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy())
+    _refine(*given, np.array(limits), scale, converged, target, is_exact)
     return Rigid(R, t_m)
 
 

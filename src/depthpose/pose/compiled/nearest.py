@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 
 Array = np.ndarray
 _LEAF = 8
@@ -28,16 +28,21 @@ class Tree(NamedTuple):
 
 
 def tree_of(points: Array) -> Tree:
-    """Sort points into a tree: (m, 3), or (m, 2) of a plane; one at least, finite."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    if points.shape[1] == 2:
-        points = np.concatenate([points, np.zeros((len(points), 1))], 1)
-    return Tree(*planted(points))
+    """Sort points (m, 3) into a tree; one at least, float64.
+
+    Raises:
+        ValueError: one is not finite.
+    """
+    return Tree(*planted(finite_array(points)))
 
 
 def nearest_of(points: Array, tree: Tree) -> tuple[Array, Array]:
-    """Give the number of the point nearest to each of (..., 3), and its distance."""
-    queries = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    """Give the number of the point nearest to each of (..., 3), float64, and its distance.
+
+    Raises:
+        ValueError: one is not finite.
+    """
+    queries = finite_array(points).reshape(-1, 3)
     index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
     _nearest_many(queries, tree, index, distance)
     return index.reshape(points.shape[:-1]), distance.reshape(points.shape[:-1])

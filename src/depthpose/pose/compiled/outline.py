@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 from depthpose.pose.compiled.nearest import Array
 
 
@@ -13,9 +13,12 @@ def distances_to(them: Array, points: Array, side: float) -> Array:
         them: one at least.
         points: near them, most of them.
         side: of the cells that the others are sorted into.
+
+    Raises:
+        ValueError: one is not finite.
     """
     out = np.empty(len(points))
-    _distances(np.ascontiguousarray(them), np.ascontiguousarray(points), side, out)
+    _distances(finite_array(them), finite_array(points), side, out)
     return out
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from depthpose.pose.compiled.algebra import jacobi
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 from depthpose.pose.compiled.nearest import Array, neighbours, planted
 
 
@@ -12,10 +12,15 @@ def planes_of(every: Array, some: Array, count: int) -> tuple[Array, Array]:
 
     Returns:
         Normals (m, 3) toward the origin, and how bent the cloud is there (m,), 0 to 1.
+
+    Raises:
+        ValueError: a point is not finite, or ``count`` is 0.
     """
+    if count < 1:
+        raise ValueError(f"a plane goes through points, and count is {count}")
     normals, bend = np.empty((len(some), 3)), np.empty(len(some))
-    every, some = (np.ascontiguousarray(a, dtype=np.float64) for a in (every, some))
-    _lay_planes(every, some, count, normals, bend)
+    given = (finite_array(a.astype(np.float64, copy=False)) for a in (every, some))
+    _lay_planes(*given, count, normals, bend)
     return normals, bend
 
 
@@ -32,7 +37,7 @@ def _lay_planes(every, some, count, normals, bend):
     """
     points, _, axes, values = planted(every)
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
-    places, squares = np.empty(count, np.int64), np.empty(count)
+    places, squares = np.zeros(count, np.int64), np.empty(count)
     A, V = np.empty((3, 3)), np.empty((3, 3))
     mean = np.empty(3)
     for i in range(len(some)):

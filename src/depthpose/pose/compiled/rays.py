@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 
 
 def compare_rays(
@@ -27,10 +27,14 @@ def compare_rays(
     Returns:
         For each pose the share of points that the surface would have occluded, and the share of the
         surface's cells in which nothing was seen.
+
+    Raises:
+        ValueError: a value is not finite.
     """
+    assert len(poses.R) == len(poses.t_m), "a translation for each rotation"
     front = torch.empty(len(poses.R), dtype=torch.float64)
     unseen = torch.empty_like(front)
-    given = (a.contiguous().numpy() for a in (cloud, poses.R, poses.t_m, points))
+    given = (finite_array(a) for a in (cloud, poses.R, poses.t_m, points))
     _look(*given, *rays, limit, front.numpy(), unseen.numpy())
     return front, unseen
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from depthpose.pose.compiled.algebra import damp, rotation, solve
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 from depthpose.pose.compiled.target import Target, find_places
 
 
@@ -27,9 +27,12 @@ def grown(
 
     Returns:
         Scales, moved points, and the variance of each scale for independent errors.
+
+    Raises:
+        ValueError: a point is not finite.
     """
     local, times, middle = start
-    local, times = local.contiguous().clone(), times.clone()
+    local, times = torch.from_numpy(finite_array(local).copy()), times.clone()
     variance = torch.ones_like(times)
     arrays = (local.numpy(), times.numpy(), middle.numpy(), np.array(limits))
     _grow(*arrays, target, is_exact, converged, variance.numpy())

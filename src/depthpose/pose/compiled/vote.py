@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from depthpose.pose.compiled.algebra import jacobi, solve
-from depthpose.pose.compiled.choice import compiled
+from depthpose.pose.compiled.choice import compiled, finite_array
 
 _SMALLEST = 1e-12
 
@@ -26,10 +26,13 @@ def met(
 
     Returns:
         Points (k, 3) about the points' mean, covariances (k, 3, 3), condition numbers (k,).
+
+    Raises:
+        ValueError: a value is not finite.
     """
     count = len(lines[1])
     out = [torch.empty(count, *shape, dtype=torch.float64) for shape in ((3,), (3, 3), ())]
-    given = (a.contiguous().numpy() for a in lines)
+    given = (finite_array(a) for a in lines)
     _meet(*given, refinements, nearest, *(a.numpy() for a in out))
     return out[0], out[1], out[2]
 

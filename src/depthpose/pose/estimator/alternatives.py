@@ -193,8 +193,8 @@ def evidence_of(
 ) -> list[dict[str, float]]:
     """Give the signals by which candidates are compared, for the pose of each.
 
-    The directions are compared with those to the nearest copy that the network could not learn to
-    distinguish from the pose: which one it points at is chance.
+    The directions are compared with those to one of the copies that the network could not learn to
+    distinguish from the pose: the one at which they point best, as which it is, is chance.
     """
     keypoints_m = model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
     normals = cloud_normals(voted.cloud.cloud_m)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import ViewInput
 
@@ -71,7 +71,7 @@ def _distances(
     them: Float64[Tensor, "n 2"], points: Float64[Tensor, "m 2"]
 ) -> Float64[Tensor, " m"]:
     """Give the distance of points to the nearest of others."""
-    if is_compiled():
+    if serves(them, points):
         from depthpose.pose.compiled.outline import distances_to
 
         return torch.from_numpy(distances_to(them.numpy(), points.numpy(), _CELL))

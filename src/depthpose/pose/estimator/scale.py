@@ -8,7 +8,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.surface import NEAR, Surface
 
 POINTS = 400
@@ -93,7 +93,7 @@ def _grow(
     """Step by step to the scale and place that fit; give also the moved points and the spread."""
     widths = (1 + (_WIDE - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
-    if is_compiled():
+    if serves(local_m, times):
         from depthpose.pose.compiled.scale import grown
 
         start = (local_m, times, middle_m)

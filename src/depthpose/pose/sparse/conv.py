@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.sparse.kernel_map import KernelMap
 
 BLOCK_PRODUCTS = 1 << 23
@@ -86,7 +86,7 @@ TABLE_ELEMENTS = 1 << 25
 """Largest such table."""
 
 
-TABLE_ROWS = 1 << 17
+COMPILED_ELEMENTS = 1 << 17
 """Up to so many offsets times outputs the compiled loop, which has no gradient, is the faster."""
 
 
@@ -108,7 +108,9 @@ def conv(
         from depthpose.pose.compiled.convolve import convolved
 
         m = kernel_map
-        return convolved(features, weight, m.neighbours.table, m.outputs, m.is_transposed)
+        return convolved(
+            features, weight, m.neighbours.table, m.neighbours.fine_rows, m.is_transposed
+        )
     return _Convolution.apply(features, weight, kernel_map)
 
 
@@ -240,9 +242,8 @@ def _table(x: Tensor, m: KernelMap) -> Tensor:
 
 
 def _is_compiled(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
-    is_plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32
-    is_used = is_plain and not torch.is_grad_enabled() and is_compiled()
-    return is_used and m.neighbours.table.numel() <= TABLE_ROWS
+    is_plain = x.dtype == weight.dtype == torch.float32
+    return is_plain and serves(x, weight) and m.neighbours.table.numel() <= COMPILED_ELEMENTS
 
 
 def _is_narrow(x: Tensor, m: KernelMap) -> bool:

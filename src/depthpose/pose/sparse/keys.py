@@ -4,7 +4,8 @@ A key holds 12 bits of the cloud's number and 17 bits of each coordinate, z lowe
 offsets to a key moves the voxel; coordinates keep off the ends of their field by more than any
 kernel reaches, so that a move never carries into the next field.
 
-Rows are found by keys through a table of a box, or by binary search.
+Rows are found by keys through a table of a box, by binary search, or by a compiled walk along both
+lists.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from jaxtyping import Int, Int32, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
@@ -112,7 +113,8 @@ class VoxelIndex:
     """Finds rows of one level's voxels.
 
     Where the clouds' common box is small enough, a table of its cells answers by one gather, some
-    five times faster than binary search; both find the same.
+    five times faster than binary search; a compiled walk along the sorted keys needs neither. All
+    find the same.
     """
 
     def __init__(self, keys: Keys, step: int) -> None:
@@ -120,7 +122,7 @@ class VoxelIndex:
         self._keys, self._step = keys, step
         self._low = self._strides = keys.new_zeros(4)
         self._table: Tensor | None = None
-        self._is_compiled = is_compiled() and keys.device.type == "cpu"
+        self._is_compiled = serves(keys)
         if len(keys) and not self._is_compiled:
             self._lay_out()
 

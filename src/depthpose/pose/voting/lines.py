@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.types import Vote
 
 _SMALLEST = 1e-12
@@ -125,8 +125,7 @@ def locate(lines: Lines, refinements: int) -> Float64[Tensor, "*b k 3"]:
 def _is_single(lines: Lines) -> bool:
     """Whether compiled functions serve: one object, on the processor, in float64."""
     n = lines[1]
-    is_plain = n.ndim == 3 and n.device.type == "cpu" and n.dtype == torch.float64
-    return is_plain and is_compiled() and not torch.is_grad_enabled()
+    return n.ndim == 3 and n.dtype == torch.float64 and serves(*lines)
 
 
 def _nearest(lines: Lines) -> tuple[Float64[Tensor, "*b k 3 3"], Float64[Tensor, "*b k 3"]]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, perturb
-from depthpose.pose.compiled import is_compiled
+from depthpose.pose.compiled import serves
 from depthpose.pose.types import Axis, PoseFit, Symmetries
 
 _STEPS = 4
@@ -87,7 +87,7 @@ def _polished(
     pose: Rigid, terms: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Rigid, Float64[Tensor, "*batch 6 6"]]:
     """Go to the most likely pose; give its information matrix too."""
-    if is_compiled() and pose.R.device.type == "cpu" and not torch.is_grad_enabled():
+    if serves(pose.R, *terms):
         from depthpose.pose.compiled.fit import fitted
 
         return fitted(pose, terms, _STEPS)
