@@ -59,6 +59,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     dataset = open_bop(out / "parts", cloud=net.weights.cloud)
     views = [dataset.view(instance).input for instance in dataset.instances]
     _write_sample(out / "part", next(view for view in views if view.object == _SAMPLE))
+    net.estimate_many(views)  # prepares the models: times below are those of further estimates
     found = net.estimate_many(views)
     predictions = [
         Prediction(estimate=estimate, place=place_of(instance))
