@@ -1,4 +1,4 @@
-"""Sparse convolution in plain torch operations: nothing to build, CPU and CUDA alike.
+"""Sparse convolution in torch operations, CPU and CUDA alike; small ones compiled by numba.
 
 Conventions are MinkowskiEngine's (Choy et al., CVPR 2019), so that its published weights fit:
 a coarser level holds ``floor(c / 2) * 2`` of the finer one's coordinates, the offsets of a kernel

@@ -1,7 +1,7 @@
 """The sparse convolution, ``conv(features, weight, kernel_map)``, and its matrix products.
 
 Every way of computing it is gather, multiply, add up; the ways differ in how much is gathered at
-once. A faster kernel would replace :func:`conv` and nothing else.
+once. Without gradients small ones go through a compiled loop, where numba is installed.
 
 Products go in blocks of rows through the faster of torch's two CPU libraries.
 """
