@@ -5,8 +5,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 import torch
@@ -306,9 +307,8 @@ def test_without_a_folder_for_what_is_compiled(monkeypatch: pytest.MonkeyPatch) 
 def test_what_is_compiled_is_kept_by_all_sources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import numba
-
-    before = numba.config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    config: Any = import_module("numba").config
+    before = config.CACHE_DIR
     names = []
     for text in ("one", "another"):
         (tmp_path / "loop.py").write_text(text)
@@ -317,7 +317,7 @@ def test_what_is_compiled_is_kept_by_all_sources(
         names.append(choice._digest())
     choice._digest.cache_clear()
     assert names[0] != names[1]
-    assert before == numba.config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    assert before == config.CACHE_DIR
 
 
 def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
