@@ -194,7 +194,7 @@ def evidence_of(
     """Give the signals by which candidates are compared, for the pose of each.
 
     The directions are compared with those to one of the copies that the network could not learn to
-    distinguish from the pose: the one at which they point best, as which it is, is chance.
+    distinguish from the pose. Which of them it points at is chance, so the best one counts.
     """
     keypoints_m = model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
     normals = cloud_normals(voted.cloud.cloud_m)

@@ -109,7 +109,11 @@ class CloudNormals(NamedTuple):
 
 
 def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
-    """Lay planes through some points of a cloud: once for all poses that are compared with it."""
+    """Lay planes through some points of a cloud, once for all poses that are compared with it.
+
+    Args:
+        cloud_m: of the object, in the camera frame.
+    """
     thinned_m = take_evenly(cloud_m.double(), _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
     normals, bend = local_planes(thinned_m, some_m)
