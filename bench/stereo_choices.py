@@ -64,7 +64,8 @@ ARMS = (
     Arm(name="no clutter", data=("streets",)),
     Arm(name="no streets", data=("clutter",)),
     Arm(name="half of the rigs others than KITTI's", data=("clutter",), streets=OTHER_RIGS),
-    Arm(name="the sky has no truth", change={"with_sky": False}),
+    Arm(name="the sky has no truth", change={"sky_weight": 0.0}),
+    Arm(name="the sky counts a tenth", change={"sky_weight": 0.1}),
     Arm(name="encoder from scratch", change=SCRATCH),
     Arm(name="the recipe", seed=1),
 )

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from depthpose.core.errors import InputError
 from depthpose.depth.losses import (
     adversarial_loss,
     discriminator_loss,
@@ -13,6 +14,7 @@ from depthpose.depth.losses import (
     plane_loss,
     view_loss,
 )
+from depthpose.depth.train.config import StereoTraining
 
 NAN = float("nan")
 LOGITS = torch.tensor([2.0, -1.0]).reshape(1, 1, 1, 2)
@@ -57,7 +59,8 @@ def test_smooth_l1_by_hand() -> None:
 def test_the_sky_may_be_learnt_as_no_disparity() -> None:
     found, truth = torch.full((1, 1, 2), 3.0), torch.tensor([[[3.0, 0.0]]])
     assert float(disparity_loss(found, truth, 96)) == 0
-    assert float(disparity_loss(found, truth, 96, with_sky=True)) == pytest.approx(2.5 / 2)
+    assert float(disparity_loss(found, truth, 96, sky_weight=1.0)) == pytest.approx(2.5 / 2)
+    assert float(disparity_loss(found, truth, 96, sky_weight=0.25)) == pytest.approx(0.625 / 1.25)
 
 
 def test_the_heads_weigh_a_half_seven_tenths_and_one() -> None:
@@ -121,3 +124,10 @@ def test_unknown_truth_gives_the_selecting_losses_no_nan() -> None:
         assert part.grad is not None
         assert bool(part.grad.isfinite().all())
         assert not bool(part.grad[..., 0].any())
+
+
+@pytest.mark.parametrize("name", ["sky_weight", "encoder_rate"])
+@pytest.mark.parametrize("value", [-0.1, 1.1])
+def test_a_weight_that_is_no_share_is_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=rf"{name} must be from 0 to 1, got {value}"):
+        StereoTraining(**{name: value})

@@ -45,11 +45,9 @@ def l1_loss(
     return (generated - real).abs().mean()
 
 
-def valid_disparity(
-    truth_px: Float[Tensor, "b h w"], max_px: int, *, with_sky: bool = False
-) -> Bool[Tensor, "b h w"]:
-    """Where the truth can be learnt: known, positive (0 is the sky) and in the matcher's range."""
-    return ((truth_px >= 0) if with_sky else (truth_px > 0)) & (truth_px < max_px)
+def valid_disparity(truth_px: Float[Tensor, "b h w"], max_px: int) -> Bool[Tensor, "b h w"]:
+    """Where the truth is known, positive (0 is the sky) and in the matcher's range."""
+    return (truth_px > 0) & (truth_px < max_px)
 
 
 def disparity_loss(
@@ -57,14 +55,17 @@ def disparity_loss(
     truth_px: Float[Tensor, "b h w"],
     max_px: int,
     *,
-    with_sky: bool = False,
+    sky_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Smooth L1 over the pixels with truth (eq. 2.6 of the thesis); 0 where there are none."""
-    is_valid = valid_disparity(truth_px, max_px, with_sky=with_sky)
+    """Smooth L1 over the pixels with truth (eq. 2.6 of the thesis); 0 where there are none.
+
+    A pixel of the sky (truth 0) counts as ``sky_weight`` pixels of a disparity of 0.
+    """
+    weights = valid_disparity(truth_px, max_px).float() + sky_weight * (truth_px == 0)
     # NaN truth must not reach the subtraction: its gradient would be NaN even where masked.
-    difference = torch.where(is_valid, found_px - truth_px.nan_to_num(0.0), 0.0)
-    losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="sum")
-    return losses / is_valid.sum().clamp(min=1)
+    difference = torch.where(weights > 0, found_px - truth_px.nan_to_num(0.0), 0.0)
+    losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")
+    return (weights * losses).sum() / weights.sum().clamp(min=1)
 
 
 def heads_loss(
@@ -72,10 +73,10 @@ def heads_loss(
     truth_px: Float[Tensor, "b h w"],
     max_px: int,
     *,
-    with_sky: bool = False,
+    sky_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
     """Sum the loss of up to three heads, the later the heavier; the last has the weight 1."""
-    losses = [disparity_loss(head, truth_px, max_px, with_sky=with_sky) for head in heads_px]
+    losses = [disparity_loss(head, truth_px, max_px, sky_weight=sky_weight) for head in heads_px]
     weights = HEAD_WEIGHTS[-len(losses) :]
     return torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum()
 

@@ -168,8 +168,9 @@ class StereoTraining:
     encoder_rate: float = 0.3
     """light: learning rate of the encoder as a share of the rest's."""
 
-    with_sky: bool = False
-    """Learn a disparity of 0 where the truth knows the sky, in place of leaving it out."""
+    sky_weight: float = 0.0
+    """Weight of a pixel of the sky, which is taught a disparity of 0, where another pixel with
+    truth has 1; 0 leaves the sky out."""
 
     adam: AdamConfig = field(default_factory=lambda: AdamConfig(schedule="halving"))
     """The optimiser: 1e-4, halved every quarter of the training."""
@@ -185,8 +186,9 @@ class StereoTraining:
 
     def __post_init__(self) -> None:
         """Refuse a share that is none."""
-        if not 0 <= self.encoder_rate <= 1:
-            raise InputError(f"encoder_rate must be from 0 to 1, got {self.encoder_rate}")
+        for name in ("encoder_rate", "sky_weight"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
 
     @property
     def network(self) -> PSMNetConfig | LightConfig:

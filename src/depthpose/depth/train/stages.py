@@ -62,7 +62,7 @@ class StereoTask:
         heads = self.matcher(normalise(batch.left), normalise(batch.right))
         reach = self.matcher.config.max_disparity_px
         heads = tuple(head.float() for head in heads)
-        loss = heads_loss(heads, batch.left_px, reach, with_sky=self.config.with_sky)
+        loss = heads_loss(heads, batch.left_px, reach, sky_weight=self.config.sky_weight)
         yield Update("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
 
     def validate(self) -> ValidationResult:
