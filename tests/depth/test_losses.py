@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.losses import (
     adversarial_loss,
@@ -130,4 +131,4 @@ def test_unknown_truth_gives_the_selecting_losses_no_nan() -> None:
 @pytest.mark.parametrize("value", [-0.1, 1.1])
 def test_a_weight_that_is_no_share_is_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=rf"{name} must be from 0 to 1, got {value}"):
-        StereoTraining(**{name: value})
+        config_from_dict({name: value}, StereoTraining, source="here")

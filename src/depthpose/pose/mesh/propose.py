@@ -67,12 +67,13 @@ class SurfaceDeviation:
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Give distance and index of the nearest sample."""
-        distance, index = self._tree.query(moved.numpy())
+        distance, index = self._tree.query(moved.numpy(), workers=torch.get_num_threads())
         return np.asarray(distance), np.asarray(index)
 
     def rough_distance(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
         """Mean distance of few turned points to a rough surface: for thousands of turns."""
-        distance, _ = self._rough_tree.query((self.few @ R.mT).numpy())
+        turned = (self.few @ R.mT).numpy()
+        distance, _ = self._rough_tree.query(turned, workers=torch.get_num_threads())
         return torch.from_numpy(np.asarray(distance)).mean(-1)
 
     def is_promising(self, R: Float[Tensor, "*batch 3 3"]) -> Tensor:
