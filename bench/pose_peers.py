@@ -123,13 +123,18 @@ def run_method(
     return rows
 
 
-def summary(rows: list[Row]) -> list[Row]:
-    """One row for each instance and method, over its seeds."""
-    groups: dict[tuple[object, object], list[Row]] = {}
+def grouped(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows of all seeds by instance and method, in the order in which they come."""
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["instance"], row["method"]), []).append(row)
+    return groups
+
+
+def summary(rows: list[Row]) -> list[Row]:
+    """One row for each instance and method, over its seeds."""
     table = []
-    for (instance, method), group in groups.items():
+    for (instance, method), group in grouped(rows).items():
         shares = {
             name: sum(bool(r[name]) for r in group) for name in ("success", "refused", "wrong")
         }
@@ -149,11 +154,8 @@ def summary(rows: list[Row]) -> list[Row]:
 
 def verdicts(rows: list[Row]) -> list[Row]:
     """One row for each instance and method: verdicts by ADD with declared symmetries alone."""
-    groups: dict[tuple[object, object], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["instance"], row["method"]), []).append(row)
     table = []
-    for (instance, method), group in groups.items():
+    for (instance, method), group in grouped(rows).items():
         answered = [r for r in group if not r["refused"]]
         wrong = [r for r in answered if r["add_declared"] >= 0.1]
         sure = [r for r in wrong if (1.0 if r["certainty"] is None else r["certainty"]) >= 0.9]

@@ -14,13 +14,11 @@ other engines, see bench/sparse_speed.py.
 
 import argparse
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from sparse_speed import status_bytes, surface
+from sparse_speed import child_memory, status_bytes, surface
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
@@ -87,6 +85,7 @@ def bench(voxels: int, args: argparse.Namespace) -> list[dict]:
     """Time RANSAC and least squares on one cloud."""
     points_m, model = cloud_of(voxels)
     given = CloudInput(name="c", points_m=points_m + torch.tensor([0.0, 0, 3]), object="bumpy")
+    words = ("--threads", args.threads, "--memory-of", voxels, "--width", args.width)
     rows = []
     for method in ("ransac", "least squares"):
         net = estimator(model, args.width, VotingConfig(method=method))
@@ -95,7 +94,7 @@ def bench(voxels: int, args: argparse.Namespace) -> list[dict]:
         stages = {stage: min(e.seconds[stage] for e in estimates) for stage in STAGES}
         rows.append({"voxels": voxels, "votes_by": method, **stages})
         rows[-1] |= {"whole": min(sum(e.seconds.values()) for e in estimates)}
-        rows[-1] |= {"memory_mb": child_memory(args, voxels) if method == "ransac" else None}
+        rows[-1] |= {"memory_mb": child_memory(__file__, *words) if method == "ransac" else None}
         print(as_line(rows[-1]), flush=True)
     return rows
 
@@ -117,16 +116,6 @@ def measure_memory(voxels: int, width: str) -> int:
         Path("/proc/self/clear_refs").write_text("5")
         net.estimate_many([given])
     return status_bytes("VmHWM") - before
-
-
-def child_memory(args: argparse.Namespace, voxels: int) -> float:
-    """Measure in a fresh process [MB]; NaN where there is no /proc."""
-    if not Path("/proc/self/clear_refs").exists():
-        return float("nan")
-    words = [sys.executable, "-W", "ignore", __file__, "--threads", str(args.threads)]
-    words += ["--memory-of", str(voxels), "--width", args.width]
-    answer = subprocess.run(words, check=True, capture_output=True, text=True)
-    return int(answer.stdout.split()[-1]) / 1e6
 
 
 def main() -> None:

@@ -161,13 +161,12 @@ def measure_memory(network: ResUNet, voxels: int, engine: str) -> int:
     return status_bytes("VmHWM") - before
 
 
-def child_memory(args: argparse.Namespace, voxels: int, engine: str) -> float:
-    """Measure in a fresh process [MB]; NaN where there is no /proc."""
+def child_memory(script: str, *words: object) -> float:
+    """Memory that a script prints, run in a fresh process [MB]; NaN where there is no /proc."""
     if not Path("/proc/self/clear_refs").exists():
         return float("nan")
-    words = [sys.executable, "-W", "ignore", __file__, "--threads", str(args.threads)]
-    words += ["--memory-of", engine, "--voxels", str(voxels)]
-    answer = subprocess.run(words, check=True, capture_output=True, text=True)
+    command = [sys.executable, "-W", "ignore", script, *map(str, words)]
+    answer = subprocess.run(command, check=True, capture_output=True, text=True)
     return int(answer.stdout.split()[-1]) / 1e6
 
 
@@ -185,7 +184,8 @@ def bench(network: ResUNet, voxels: int, args: argparse.Namespace) -> list[dict]
     for name in runs:
         ahead, whole = (min(times[name, what][1:]) for what in ("forward", "step"))
         rows.append({"voxels": len(answers[name]), "engine": name, "forward_s": ahead})
-        rows[-1] |= {"step_s": whole, "memory_mb": child_memory(args, voxels, name)}
+        words = ("--threads", args.threads, "--memory-of", name, "--voxels", voxels)
+        rows[-1] |= {"step_s": whole, "memory_mb": child_memory(__file__, *words)}
         difference = (answers[name] - answers["ours"]).abs().max() / answers["ours"].abs().max()
         rows[-1] |= {"forward_ratio": ahead / rows[0]["forward_s"], "difference": float(difference)}
         rows[-1] |= {"step_ratio": whole / rows[0]["step_s"]}

@@ -27,6 +27,19 @@ def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of an untrained Geo-PoseNet for the objects of the synthetic frames."""
+    from tests.pose.synthetic_frames import frame_models
+    from tests.pose.synthetic_objects import tiny_weights
+
+    from depthpose.pose.weights import write_pose_weights
+
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    write_pose_weights(path, tiny_weights(*frame_models()))
+    return path
+
+
 # How long an example takes is the machine's, not the code's.
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")

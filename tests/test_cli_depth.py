@@ -14,6 +14,7 @@ from unittest.mock import patch
 import pytest
 import torch
 from tests.depth.constant_selection import sure_of
+from tests.depth.small_training import TINY_MATCHER, write_tiny_weights
 from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
@@ -31,9 +32,7 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.loop import Progress, read_metrics
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.stereo import PSMNet, SGBMMatcher
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
 
 CAMERA = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]]}
@@ -43,11 +42,7 @@ CAMERA = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Small weights of both networks, three images and a camera."""
     folder = tmp_path_factory.mktemp("predict")
-    torch.manual_seed(0)
-    generator = UNetGenerator(GeneratorConfig(width=2, levels=3, virtual_focal_px=70.0))
-    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
-    facts = {"trained_on": "nothing", "licence": "MIT"}
-    write_depth_weights(folder / "w.safetensors", generator=generator, matcher=matcher, facts=facts)
+    write_tiny_weights(folder)
     for number in range(3):
         image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(number))
         write_image(folder / "images" / f"{number}.png", image)
@@ -157,8 +152,8 @@ def test_where_depth_comes_from_is_one_word(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     weights = str(tmp_path / "w.safetensors")
-    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
-    write_depth_weights(Path(weights), generator=sure_of(1), matcher=matcher.eval(), facts={})
+    matcher = PSMNet(TINY_MATCHER).eval()
+    write_depth_weights(Path(weights), generator=sure_of(1), matcher=matcher, facts={})
     words = [str(home / "images/0.png"), "--camera", str(home / "cam.json"), "--weights", weights]
     found = {}
     for answer in ("own", "matched", "joined"):

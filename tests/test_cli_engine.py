@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from tests.core.engine.doubles import InProcessEngine, unpacked
+from tests.depth.small_training import write_tiny_weights
 from tests.pose.synthetic_frames import draw_frame, frame_models, make_dataset, pose_in_frame
 from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 from tests.test_cli_pose_predict import oracle_weights
@@ -24,10 +25,6 @@ from depthpose.core.files import (
     write_disparity_png,
     write_image,
 )
-from depthpose.depth.config import GeneratorConfig, PSMNetConfig
-from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
-from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_scene
 from depthpose.pose.synthetic import Objects, make_part, write_part
@@ -44,12 +41,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_home(folder: Path) -> Path:
-    torch.manual_seed(0)
-    generator = UNetGenerator(GeneratorConfig(width=2, levels=3, virtual_focal_px=70.0))
-    matcher = PSMNet(PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), pools=(2,)))
-    facts = {"trained_on": "nothing", "licence": "MIT"}
-    write_depth_weights(folder / "w.safetensors", generator=generator, matcher=matcher, facts=facts)
-    write_depth_weights(folder / "m.safetensors", matcher=matcher, facts=facts)
+    write_tiny_weights(folder)
     for number in range(5):
         image = torch.rand(3, 48, 70, generator=torch.Generator().manual_seed(number))
         write_image(folder / "left" / f"{number}.png", image[:, :, 4:68])

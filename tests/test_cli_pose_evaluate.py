@@ -26,13 +26,6 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_dataset(tmp_path_factory.mktemp("cli") / "made", frames=2)
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*frame_models()))
-    return path
-
-
 def rows_of(out: Path) -> list[dict[str, object]]:
     return json.loads((out / "rows.json").read_text())
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.synthetic_frames import HEIGHT, WIDTH, frame_models, make_dataset
-from tests.pose.synthetic_objects import tiny_weights
+from tests.pose.synthetic_frames import HEIGHT, WIDTH, make_dataset
 
 from depthpose.cli import main
 from depthpose.core.files import write_image
@@ -27,7 +26,6 @@ from depthpose.pose.segmentation import (
     SegmentationWeights,
     write_segmentation,
 )
-from depthpose.pose.weights import write_pose_weights
 
 LEFT = torch.arange(WIDTH).expand(HEIGHT, WIDTH) < WIDTH // 2
 PICTURE = torch.stack([LEFT, ~LEFT, LEFT & False]).float()
@@ -41,13 +39,6 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
         assert instance.rgb is not None
         write_image(instance.rgb, PICTURE)
     return data
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*frame_models()))
-    return path
 
 
 def halves(

@@ -4,27 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.pose.synthetic_frames import frame_models, moved, predictions_of
+from tests.pose.synthetic_frames import moved, predictions_of
 from tests.pose.synthetic_linemod import make_linemod
-from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import read_image
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.predictions import write_bop_results
-from depthpose.pose.weights import write_pose_weights
 
 
 @pytest.fixture(scope="module")
 def linemod(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_linemod(tmp_path_factory.mktemp("lm") / "Linemod_preprocessed")
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    write_pose_weights(path, tiny_weights(*frame_models()))
-    return path
 
 
 def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:

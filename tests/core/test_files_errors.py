@@ -168,7 +168,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("x.bin", b"", "0 bytes are no whole number of rows of 4 float32"),
     ("x.bin", bytes(17), "17 bytes are no whole number of rows of 4 float32; it is empty"),
     ("x.bin", struct.pack("<4f", 0, 0, np.nan, 0), "holds NaN or infinity; it is damaged"),
-    ("x.json", "{", "not a readable JSON file .*; mend it there"),
+    ("x.json", "{", "not a readable JSON file .*; correct it there"),
     ("x.json", '{"a": NaN}', "NaN is not a JSON number"),
     ("x.json", '{"a": -Infinity}', "-Infinity is not a JSON number"),
     ("x.json", "[1e999]", "1e999|inf.* is not a JSON number"),

@@ -15,7 +15,7 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import write_json, write_map
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.exchange import read_colmap_map, write_colmap_map
+from depthpose.depth.exchange import write_colmap_map
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
 H, W, F = 4, 6, 8.0
@@ -106,23 +106,6 @@ def test_colmap_maps_come_back(tmp_path: Path) -> None:
     write_colmap_map(tmp_path / "a.bin", DEPTH_M)
     assert (tmp_path / "a.bin").read_bytes().startswith(b"6&4&1&")
     assert same(read_as_colmap_does(tmp_path / "a.bin"))
-    assert torch.equal(read_colmap_map(tmp_path / "a.bin").nan_to_num(), DEPTH_M.nan_to_num())
-
-
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"", "no 'WIDTH&HEIGHT&CHANNELS&'"),
-        (b"6&4&1", "no 'WIDTH&HEIGHT&CHANNELS&'"),
-        (b"6&4&3&" + bytes(288), "3 channels, a map of normals"),
-        (b"6&4&1&" + bytes(95), "declares 6x4 floats but 95 bytes follow"),
-        (b"0&4&1&", "declares 0x4 floats"),
-    ],
-)
-def test_other_files_are_no_colmap_maps(tmp_path: Path, data: bytes, said: str) -> None:
-    (tmp_path / "a.bin").write_bytes(data)
-    with pytest.raises(InputError, match=said):
-        read_colmap_map(tmp_path / "a.bin")
 
 
 def test_infinite_depth_is_no_colmap_map(tmp_path: Path) -> None:

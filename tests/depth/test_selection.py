@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.depth.config import EncoderKind, SelectionConfig
+from depthpose.depth.config import SelectionConfig
 from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
 from depthpose.depth.synthesis.selection import (
@@ -48,19 +48,6 @@ def test_parameters_are_those_of_lite0_without_its_classifier() -> None:
     counted = sum(p.numel() for p in LiteEncoder().parameters())
     assert counted == 4_652_008 - 320 * 1280 - 2 * 1280 - 1281 * 1000
     assert LiteEncoder().channels == [16, 24, 40, 112, 320]
-
-
-def test_parameters_are_those_of_lite2_without_its_classifier() -> None:
-    """6,092,072 published, less 352 x 1280 + 2 x 1280 of the last layer, 1281 x 1000 of classes."""
-    encoder = LiteEncoder(kind="efficientnet-lite2")
-    counted = sum(p.numel() for p in encoder.parameters())
-    assert counted == 6_092_072 - 352 * 1280 - 2 * 1280 - 1281 * 1000
-    assert encoder.channels == [16, 24, 48, 120, 352]
-    assert len(encoder.blocks) == 21
-    encoder.freeze_early()
-    assert [all(not p.requires_grad for p in b.parameters()) for b in encoder.blocks].index(
-        False
-    ) == 4
 
 
 def test_features_and_logits_have_their_strides() -> None:
@@ -154,10 +141,6 @@ def test_gradients_reach_the_right_view_through_the_drawn_one() -> None:
     assert float(head[TINY.planes + 1 :].abs().sum()) > 0
 
 
-LITE0: EncoderKind = "efficientnet-lite0"
-LITE2: EncoderKind = "efficientnet-lite2"
-
-
 def published_names(encoder: LiteEncoder) -> dict[str, Tensor]:
     """State dict of the encoder under the names that its publisher uses, with a classifier."""
     state = {}
@@ -176,13 +159,12 @@ def published_names(encoder: LiteEncoder) -> dict[str, Tensor]:
     return state | {name: torch.zeros(shape) for name, shape in extra.items()}
 
 
-@pytest.mark.parametrize("kind", [LITE0, LITE2])
-def test_the_published_encoder_is_imported_whole(tmp_path: Path, kind: EncoderKind) -> None:
+def test_the_published_encoder_is_imported_whole(tmp_path: Path) -> None:
     torch.manual_seed(1)
-    encoder = LiteEncoder(kind=kind)
+    encoder = LiteEncoder()
     torch.save(published_names(encoder), tmp_path / "lite0.pth")
-    import_encoder(tmp_path / "lite0.pth", kind, tmp_path / "lite0.safetensors")
-    found = read_encoder(tmp_path / "lite0.safetensors", kind).state_dict()
+    import_encoder(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
+    found = read_encoder(tmp_path / "lite0.safetensors").state_dict()
     for name, tensor in encoder.state_dict().items():
         assert torch.equal(found[name], tensor), name
 
@@ -200,7 +182,7 @@ def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) 
     change(state)
     torch.save(state, tmp_path / "lite0.pth")
     with pytest.raises(InputError, match=message):
-        import_encoder(tmp_path / "lite0.pth", LITE0, tmp_path / "lite0.safetensors")
+        import_encoder(tmp_path / "lite0.pth", tmp_path / "lite0.safetensors")
     assert not (tmp_path / "lite0.safetensors").exists()
 
 

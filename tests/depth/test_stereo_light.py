@@ -361,7 +361,7 @@ def test_an_encoder_takes_a_file_as_far_as_it_reaches(tmp_path: Path) -> None:
     torch.manual_seed(0)
     whole, path = LiteEncoder(), tmp_path / "lite0.safetensors"
     save_checkpoint(
-        path, Checkpoint(kind=whole.kind, config={}, state=whole.state_dict(), facts={})
+        path, Checkpoint(kind="efficientnet-lite0", config={}, state=whole.state_dict(), facts={})
     )
     short = LiteEncoder(levels=4)
     load_encoder(short, path)

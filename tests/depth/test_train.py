@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.synthetic_street import make_street, write_pairs
-from torch import Tensor, nn
+from tests.depth.small_training import LOOP, folder, pairs, snapshot
+from tests.synthetic_street import make_street
+from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import LicenceNotice
@@ -36,35 +37,18 @@ from depthpose.depth.train import (
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
+__all__ = ["folder", "pairs"]  # fixtures
 GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
 LIGHT = LightConfig(
     max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.25
 )
 MATCHER = PSMNetConfig(width=4, max_disparity_px=32, blocks=(1, 1, 1, 1), pools=(4, 2))
-LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A plain folder of three synthetic pairs with disparity."""
-    return write_pairs(tmp_path_factory.mktemp("pairs"), (0.2, 0.2, 0.25))
-
-
-@pytest.fixture
-def pairs(folder: Path) -> PairsConfig:
-    return PairsConfig(
-        folders=(str(folder),), focal_px=130.0, augment=AugmentConfig(crop_px=(64, 96))
-    )
 
 
 def batch(pairs: PairsConfig, count: int = 2) -> TrainingPair:
     samples = TrainingPairs(pairs, 0, needs_truth=True)
     parts = zip(*(samples[index] for index in range(count)), strict=True)
     return TrainingPair(*(torch.stack(part) for part in parts))
-
-
-def snapshot(module: nn.Module) -> dict[str, Tensor]:
-    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
 
 def take_step(task: ViewTask | StereoTask | FinetuneTask, given: TrainingPair) -> list[str]:

@@ -6,12 +6,11 @@ from typing import Any
 
 import pytest
 import torch
-from tests.synthetic_street import write_pairs
-from torch import Tensor, nn
+from tests.depth.small_training import LOOP, folder, pairs, snapshot
 
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
+from depthpose.core.loop import AdamConfig, Run, read_metrics
 from depthpose.depth.config import (
     AugmentConfig,
     DegradeConfig,
@@ -35,6 +34,7 @@ from depthpose.depth.train.config import FinetuneTraining, SelectTraining
 from depthpose.depth.train.select import SelectionSample, SelectionSamples
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 
+__all__ = ["folder", "pairs"]  # fixtures
 TINY = SelectionConfig(
     encoder_width=0.1,
     widths=(8, 8, 8, 8),
@@ -43,19 +43,6 @@ TINY = SelectionConfig(
     virtual_focal_px=130.0,
     virtual_baseline_m=0.54,
 )
-LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_pairs(tmp_path_factory.mktemp("select") / "pairs", (0.2, 0.2, 0.25))
-
-
-@pytest.fixture
-def pairs(folder: Path) -> PairsConfig:
-    return PairsConfig(
-        folders=(str(folder),), focal_px=130.0, augment=AugmentConfig(crop_px=(64, 96))
-    )
 
 
 def samples(*sources: PairsConfig, share: float = 0.5) -> SelectionSamples:
@@ -66,10 +53,6 @@ def samples(*sources: PairsConfig, share: float = 0.5) -> SelectionSamples:
 def batch(source: SelectionSamples, count: int = 2) -> SelectionSample:
     parts = zip(*(source[index] for index in range(count)), strict=True)
     return SelectionSample(*(torch.stack(part) for part in parts))
-
-
-def snapshot(module: nn.Module) -> dict[str, Tensor]:
-    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
 
 def test_only_the_input_is_degraded(pairs: PairsConfig) -> None:
@@ -223,7 +206,8 @@ def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     file = tmp_path / "lite0.safetensors"
     facts = {"licence": "Apache-2.0"}
     save_checkpoint(
-        file, Checkpoint(kind=encoder.kind, config={}, state=encoder.state_dict(), facts=facts)
+        file,
+        Checkpoint(kind="efficientnet-lite0", config={}, state=encoder.state_dict(), facts=facts),
     )
     still = AdamConfig(learning_rate=1e-30)
     loop = dataclasses.replace(LOOP, steps=1)

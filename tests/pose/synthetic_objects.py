@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from depthpose.core.camera import back_project
+from depthpose.core.camera import Camera, back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
@@ -72,12 +72,23 @@ def tiny_weights(*models: ObjectModel, **changes: Any) -> PoseWeights:  # noqa: 
 
 K = torch.tensor([[500.0, 0, 160], [0, 500, 120], [0, 0, 1]], dtype=torch.float64)
 """Of the views here: 320 x 240 pixels."""
+CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def random_pose(seed: int, batch: tuple[int, ...] = ()) -> Rigid:
+    """Poses before the camera in double precision, turned by chance."""
+    q, _ = torch.linalg.qr(torch.randn(*batch, 3, 3, generator=generator(seed)).double())
+    shift = torch.tensor([0.1, -0.1, 0.9]).double().expand(*batch, 3)
+    return Rigid(q * torch.linalg.det(q)[..., None, None], shift)
 
 
 def pose_at(x_m: float = 0.0, z_m: float = 0.8, seed: int = 0) -> Rigid:
     """A pose before the camera, turned by chance."""
-    generator = torch.Generator().manual_seed(seed)
-    q, r = torch.linalg.qr(torch.randn(3, 3, generator=generator))
+    q, r = torch.linalg.qr(torch.randn(3, 3, generator=generator(seed)))
     R = q * r.diagonal().sign()
     R = R * torch.linalg.det(R).sign()
     return Rigid(R, torch.tensor([x_m, 0.0, z_m]))
@@ -94,6 +105,11 @@ def cloud_of(model: ObjectModel, pose: Rigid) -> Tensor:
     """What a camera sees of one object, without noise."""
     depth_m, mask = view_of(model, pose)
     return back_project(depth_m, K)[mask]
+
+
+def noisy(cloud_m: Tensor) -> Tensor:
+    """The cloud with noise of 1 mm."""
+    return cloud_m.float() + 0.001 * torch.randn(cloud_m.shape, generator=generator(0))
 
 
 class Oracle(GeoPoseNet):
@@ -120,7 +136,7 @@ class Oracle(GeoPoseNet):
         keypoints_m = pose.apply(self.weights.models[number].keypoints_m)
         directions = keypoints_m[None] - points_m[:, None]
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        generator = torch.Generator().manual_seed(1)
-        noise = torch.randn(directions.shape, generator=generator)
-        is_wrong = torch.rand(len(points_m), generator=generator) < self.wrong
+        chance = generator(1)
+        noise = torch.randn(directions.shape, generator=chance)
+        is_wrong = torch.rand(len(points_m), generator=chance) < self.wrong
         return torch.where(is_wrong[:, None, None], noise, directions + self.noise * noise)

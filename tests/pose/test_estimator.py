@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from tests.pose.synthetic_objects import (
+    CAMERA,
     FACTS,
     K,
     Oracle,
@@ -21,7 +22,7 @@ from tests.pose.synthetic_objects import (
 )
 
 import depthpose
-from depthpose.core.camera import Camera, back_project, write_camera
+from depthpose.core.camera import back_project, write_camera
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
@@ -34,7 +35,6 @@ from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
-CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
 VOTE_ALONE = EstimateConfig(with_icp=False)
 
 

@@ -4,9 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, pose_at, tiny_weights, view_of
+from tests.pose.synthetic_objects import (
+    CAMERA,
+    K,
+    Oracle,
+    bottle,
+    bracket,
+    pose_at,
+    tiny_weights,
+    view_of,
+)
 
-from depthpose.core.camera import Camera, back_project
+from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
@@ -14,7 +23,6 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud
 from depthpose.pose.types import ObjectModel
 
-CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
 

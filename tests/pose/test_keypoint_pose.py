@@ -3,9 +3,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.pose.synthetic_objects import generator, random_pose
 
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix, perturb
+from depthpose.core.rigid import cross_matrix, perturb
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
@@ -20,16 +21,6 @@ from depthpose.pose.voting import (
     free_motions,
     vote_ransac,
 )
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def random_pose(seed: int, batch: tuple[int, ...] = ()) -> Rigid:
-    q, _ = torch.linalg.qr(torch.randn(*batch, 3, 3, generator=generator(seed)).double())
-    shift = torch.tensor([0.1, -0.1, 0.9]).double().expand(*batch, 3)
-    return Rigid(q * torch.linalg.det(q)[..., None, None], shift)
 
 
 def test_covariances_of_poses_are_honest() -> None:

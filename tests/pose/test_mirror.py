@@ -1,8 +1,15 @@
 """A mirrored copy is not the object, unless the object is its own mirror image."""
 
 import pytest
-import torch
-from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import (
+    Oracle,
+    bottle,
+    bracket,
+    cloud_of,
+    noisy,
+    pose_at,
+    tiny_weights,
+)
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
@@ -15,11 +22,6 @@ from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate
 
 TRUTH = pose_at(seed=1)
-
-
-def noisy(cloud_m: torch.Tensor) -> torch.Tensor:
-    noise = torch.randn(cloud_m.shape, generator=torch.Generator().manual_seed(0))
-    return cloud_m.float() + 0.001 * noise
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """What a 3D view shows of a pose."""
 
 import torch
-from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, box_faces, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.files import Cloud
 from depthpose.pose.mesh import make_model
@@ -11,12 +11,10 @@ from depthpose.report.scene import Lines
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
-    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    every = torch.tensor([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])[:faces]
+    corners, every = box_faces()
     if with_repeats:  # as STL has them
         return make_model(corners[every].flatten(0, 1), torch.arange(36).view(12, 3), name="cube")
-    return make_model(corners, every, name="cube")
+    return make_model(corners, every[:faces], name="cube")
 
 
 def lengths(ends_m: torch.Tensor) -> list[float]:

@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, pose_at, tiny_weights
+from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_at, tiny_weights
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
@@ -17,11 +17,6 @@ from depthpose.pose.synthetic.negatives import NegativeKind, mirrored, negative_
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)
-
-
-def noisy(cloud_m: torch.Tensor) -> torch.Tensor:
-    noise = torch.randn(cloud_m.shape, generator=torch.Generator().manual_seed(0))
-    return cloud_m.float() + 0.001 * noise
 
 
 @pytest.mark.parametrize("times", [0.8, 0.9, 0.97, 1.0, 1.1, 1.2])

@@ -327,14 +327,11 @@ def test_coordinates_out_of_range_are_refused(row: list[int], text: str) -> None
         Voxels.from_points(torch.tensor([row]))
 
 
-def test_points_in_one_voxel_are_refused_or_averaged() -> None:
+def test_points_in_one_voxel_are_refused() -> None:
     coordinates = torch.tensor([[0, 1, 0, 0], [0, -2, 0, 5], [0, 1, 0, 0]])
     x = torch.tensor([[1.0], [10.0], [3.0]])
     with pytest.raises(InputError, match=r"1 points share .* \[1, 0, 0\] of cloud 0; keep one"):
         Voxels.from_points(coordinates, x)
-    merged = Voxels.from_points(coordinates, x, duplicates="mean")
-    assert merged.features.tolist() == [[10.0], [2.0]]
-    assert merged.at_points().tolist() == [[2.0], [10.0], [2.0]]
 
 
 def test_a_batch_needs_a_cloud() -> None:

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import K, Oracle, bracket, pose_at, tiny_weights, view_of
+from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, tiny_weights, view_of
 
-from depthpose.core.camera import Camera, back_project
+from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.estimator.track import TrackedObject, track
@@ -18,8 +18,6 @@ from depthpose.pose.predictions import (
 )
 from depthpose.pose.surface import compare_depths, prepare_surface
 from depthpose.pose.types import Alternative, PoseEstimate
-
-CAMERA = Camera(width=320, height=240, K=K, depth_unit_m=0.001)
 
 
 def moving(count: int, step_m: float = 0.008, step_deg: float = 2.0) -> list[Rigid]:

@@ -157,7 +157,7 @@ def test_crops_carry_the_truth_of_their_view() -> None:
 def test_points_and_copies_have_one_shape_for_all_objects() -> None:
     models = [bracket(), bottle()]
     assert surface_points(models, 40).shape == (2, 40, 3)
-    copies = symmetric_copies(models)
+    copies = symmetric_copies(models, 0.2).float()
     assert copies.R.shape[:2] == (2, 16)
     assert bool((copies.R[0] == torch.eye(3)).all())
     around = copies.apply(models[1].vertices_m.expand(2, 16, -1, -1))[1]

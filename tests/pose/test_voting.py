@@ -2,11 +2,12 @@ import math
 
 import pytest
 import torch
+from tests.pose.synthetic_objects import generator, random_pose
 from torch import Tensor
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.voting import (
     fit_pose,
@@ -22,16 +23,6 @@ METHODS = {
         *votes, config=VotingConfig(inlier_test="distance")
     ),
 }
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def random_pose(seed: int, batch: tuple[int, ...] = ()) -> Rigid:
-    q, _ = torch.linalg.qr(torch.randn(*batch, 3, 3, generator=generator(seed)).double())
-    shift = torch.tensor([0.1, -0.1, 0.9]).double().expand(*batch, 3)
-    return Rigid(q * torch.linalg.det(q)[..., None, None], shift)
 
 
 def exact_votes(

@@ -41,7 +41,7 @@ _PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
 
 
 def refuse_missing(given: Mapping[str, object]) -> None:
-    """Refuse what a command would look for in vain.
+    """Refuse paths and weights that do not exist.
 
     Args:
         given: the arguments of a command by name.

@@ -38,9 +38,9 @@ def list_weights(folder: Path | None = None) -> int:
     return 0
 
 
-def _in_short(text: str, most: int = 34) -> str:
+def _in_short(text: str) -> str:
     """Cut a sentence at a word."""
-    return text if len(text) <= most else text[: most - 4].rpartition(" ")[0].rstrip(",;") + " ..."
+    return text if len(text) <= 34 else text[:30].rpartition(" ")[0].rstrip(",;") + " ..."
 
 
 def show_weights(weights: tyro.conf.Positional[str]) -> int:
@@ -71,9 +71,7 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[
-        Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0", "efficientnet-lite2"]
-    ],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -87,7 +85,7 @@ def import_weights(
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
             MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors); efficientnet-lite0 or -lite2, an
+            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an
             encoder that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
@@ -113,7 +111,7 @@ def import_weights(
     else:
         from depthpose.depth.encoder import import_encoder
 
-        import_encoder(file, kind, out)
+        import_encoder(file, out)
     return show_weights(str(out))
 
 

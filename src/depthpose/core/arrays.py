@@ -5,7 +5,7 @@ of a map are NaN in memory and in NPY files, and 0 in 16-bit PNG files.
 """
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -13,11 +13,8 @@ from depthpose.core.errors import InputError
 Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
-Mask = Bool[Tensor, "h w"]
-"""True where a pixel counts."""
-
-Points = Float[Tensor, "n 3"]
-"""Points of a cloud, in the frame and unit of the variable's name."""
+_LUMA = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in the brightness, ITU-R BT.601."""
 
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:
@@ -25,6 +22,11 @@ def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m 
     if len(rows) <= count:
         return rows
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]
+
+
+def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+    """Give the brightness of an RGB image (luma of ITU-R BT.601)."""
+    return (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
 
 
 def check_image(image: object, name: str, slack: float = 0.5) -> Image:

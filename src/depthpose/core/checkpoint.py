@@ -62,8 +62,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def _in_order(content: bytes) -> bytes:
     """Sort the header of a safetensors file.
 
-    Its writer puts the metadata in an order by chance: equal weights would have another checksum
-    each time that they are written.
+    Its writer writes the metadata in random order, so equal weights would get different checksums.
     """
     size = int.from_bytes(content[:8], "little")
     header = json.dumps(
@@ -233,10 +232,16 @@ def save_imported(
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
 
 
-def warn_of_terms(facts: Mapping[str, str], stacklevel: int = 2) -> None:
+def half_state(network: nn.Module) -> dict[str, Tensor]:
+    """Give the state of a network with its floating-point numbers in 16 bits."""
+    state = network.state_dict()
+    return {k: t.to(torch.float16) if t.is_floating_point() else t for k, t in state.items()}
+
+
+def warn_of_terms(facts: Mapping[str, str]) -> None:
     """Warn of the terms of use of weights that have any."""
     if terms := facts.get("terms", ""):
-        warnings.warn(terms, LicenceNotice, stacklevel=stacklevel + 1)
+        warnings.warn(terms, LicenceNotice, stacklevel=3)
 
 
 def join_terms(*cards: Mapping[str, str]) -> str:

@@ -41,7 +41,7 @@ def computes_bf16(device: str | torch.device) -> bool:
 
 
 def usable_precision(wanted: str, device: str | torch.device) -> str:
-    """Give ``wanted``, or ``fp32`` with a :class:`PrecisionNotice` where that is bf16 in vain.
+    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16.
 
     Args:
         wanted: fp32, bf16 or fp16.

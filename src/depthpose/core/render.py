@@ -192,7 +192,7 @@ def barycentric_shares(
 def _check(triangles: Tensor, width: int, height: int) -> None:
     for name, size in (("width", width), ("height", height)):
         if size < 1:
-            raise InputError(f"{name} is {size}, but a picture has a pixel at least; mend it")
+            raise InputError(f"{name} is {size}, but a picture has a pixel at least; correct it")
     if not bool(triangles.isfinite().all()):
         raise InputError("a corner of the triangles is not finite; leave such triangles out")
 

@@ -77,9 +77,9 @@ class Rigid:
         return f"Rigid(R=[{rows}], t_m=[{numbers_text(self.t_m.tolist())}])"
 
 
-def numbers_text(numbers: Sequence[float], digits: int = 4) -> str:
+def numbers_text(numbers: Sequence[float]) -> str:
     """Write numbers for people: ``0.1234, -1.0000``."""
-    return ", ".join(f"{number:.{digits}f}" for number in numbers)
+    return ", ".join(f"{number:.4f}" for number in numbers)
 
 
 def fit_rigid(

@@ -176,7 +176,7 @@ def claim_names(
 
     Raises:
         InputError: an earlier run made a result of that name from another file, or the file has
-            changed since, or a file that no run wrote bears the name of a result.
+            changed since, or a file that no run wrote has the name of a result.
     """
     record = folder / _SOURCES
     # Listed before the record is read: what another process writes, its record names by then.

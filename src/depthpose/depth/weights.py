@@ -5,10 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    build_network,
+    half_state,
+    read_checkpoint,
+    save_checkpoint,
+)
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, SelectionConfig
@@ -155,7 +160,4 @@ def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
 
 
 def _state(module: nn.Module, *, with_half: bool) -> dict[str, Tensor]:
-    state = module.state_dict()
-    if not with_half:
-        return state
-    return {k: t.to(torch.float16) if t.is_floating_point() else t for k, t in state.items()}
+    return half_state(module) if with_half else module.state_dict()

@@ -71,7 +71,7 @@ def cloud_from_depth(
 
 
 def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the finite points of an input, those of a depth image without what flies about."""
+    """Give the finite points of an input, those of a depth image without flying pixels."""
     if isinstance(given, ViewInput):
         return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
     return given.points_m[given.points_m.isfinite().all(-1)].float()

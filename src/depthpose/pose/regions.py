@@ -32,7 +32,6 @@ def find_regions(
     depth_m: Float[Tensor, "h w"],
     K: Float[Tensor, "3 3"],
     largest_m: float,
-    seed: int = 0,
 ) -> tuple[list[Float[Tensor, "_ 3"]], Bool[Tensor, "h w"]]:
     """Take dominant planes away and part what is left where its depth jumps.
 
@@ -43,7 +42,6 @@ def find_regions(
         depth_m: along the optical axis; NaN where there is no reading.
         K: intrinsic matrix.
         largest_m: diameter of the largest object.
-        seed: of RANSAC.
 
     Returns:
         The points of each region in the camera frame, the largest first, 40 at most; and which
@@ -53,7 +51,7 @@ def find_regions(
     is_left = points_m.isfinite().all(-1) & (depth_m > 0)
     is_plane = torch.zeros_like(is_left)
     total = int(is_left.sum())
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
         plane = _largest_plane(points_m[is_left], generator)
         if plane is None:

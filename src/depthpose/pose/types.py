@@ -236,7 +236,8 @@ class PoseFit:
             nothing of other answers, such as a half-turn away, that explain the data as well.
         residual_m: root mean square distance of the keypoints that were used.
         misfit: squared distances in units of their covariance, over the degrees of freedom: about 1
-            where the covariances of the keypoints are honest, far above where they break rigidity.
+            where the covariances of the keypoints are right, far above 1 where the keypoints do
+            not fit the rigid model.
         is_used: the keypoints that agree with the shape of the model.
     """
 

@@ -9,7 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    build_network,
+    half_state,
+    read_checkpoint,
+    save_checkpoint,
+)
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_as
@@ -93,7 +99,8 @@ def write_pose_weights(
             the file cannot be used until :func:`complete_weights` has put them in again.
     """
     network = weights.network
-    state = {f"network.{name}": _half(t, with_half) for name, t in network.state_dict().items()}
+    learnt = half_state(network) if with_half else network.state_dict()
+    state = {f"network.{name}": tensor for name, tensor in learnt.items()}
     for k, model in enumerate(weights.models):
         kept = _TENSORS if with_meshes else ("keypoints_m",)
         state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in kept}
@@ -254,10 +261,6 @@ def _refuse_strays(checkpoint: Checkpoint, models: int, source: str) -> None:
 def _under(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
     found = checkpoint.state.items()
     return {name.removeprefix(prefix): t for name, t in found if name.startswith(prefix)}
-
-
-def _half(tensor: Tensor, with_half: bool) -> Tensor:
-    return tensor.to(torch.float16) if with_half and tensor.is_floating_point() else tensor
 
 
 def _small(tensor: Tensor) -> Tensor:

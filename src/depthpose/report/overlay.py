@@ -9,9 +9,10 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import project
 from depthpose.core.draw import draw_lines, draw_outline
-from depthpose.core.files import Cloud
+from depthpose.core.files import Cloud, read_depth_png, read_image
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
+from depthpose.pose.datasets import Instance
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.synthetic import drawn_triangles
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -33,6 +34,13 @@ _CROSS = 0.04
 _VOTES = 40
 """Points whose votes are drawn."""
 _DASH_PX = 6.0
+
+
+def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
+    """Read the picture of an instance, or its depth in grey where there is none."""
+    if instance.rgb is not None:
+        return read_image(instance.rgb)
+    return grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
 
 
 def draw_pose(

@@ -85,7 +85,7 @@ class VotingRow:
 
 
 def cases_of(
-    net: GeoPoseNet, views: Iterable[ViewSample], points: int, *, is_adds: bool | None = None
+    net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
     """Give the votes of up to so many points of each view; None where it has too few to be posed.
 
@@ -95,7 +95,6 @@ def cases_of(
         net: whose directions; its objects have the names in the views.
         views: with truth.
         points: at most so many of each, chosen at random, the same each time.
-        is_adds: whether ADD-S decides; None: by what the object declares.
 
     Raises:
         InputError: the weights are of another kind.
@@ -113,13 +112,12 @@ def cases_of(
         if refusal_of(points_m, net.weights.cloud) is not None:
             yield None
             continue
-        is_symmetric = not model.symmetries.is_none if is_adds is None else is_adds
         yield VotingCase(
             points_m=points_m,
             directions=_directions(network, points_m, number, net.weights.cloud),
             model=model,
             truth=view.truth.camera_from_model,
-            is_adds=is_symmetric,
+            is_adds=not model.symmetries.is_none,
         )
 
 

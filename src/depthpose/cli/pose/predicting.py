@@ -16,8 +16,6 @@ from tqdm import tqdm
 from depthpose.cli.pose.inputs import Unreadable
 from depthpose.cli.pose.methods import EstimateMany, PoseMethod
 from depthpose.core.files import (
-    read_depth_png,
-    read_image,
     write_cloud,
     write_image,
 )
@@ -47,7 +45,7 @@ from depthpose.pose.predictions import (
     write_predictions,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud
+from depthpose.report.overlay import draw_pose, grey_depth, picture_of, posed_cloud
 from depthpose.report.pose import alternative_lines
 from depthpose.report.tables import plain_table
 from depthpose.report.viewer import Viewer, open_viewer
@@ -196,10 +194,7 @@ def _picture_name(scene: int, image: int) -> str:
 
 
 def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
-    if instance.rgb is not None:
-        picture = read_image(instance.rgb)
-    else:
-        picture = grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
+    picture = picture_of(instance)
     for estimate in estimates:
         assert estimate.camera_from_model is not None
         model = _model(method, estimate.object)

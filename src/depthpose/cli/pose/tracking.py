@@ -96,7 +96,7 @@ def _whole_view(instance: Instance, name: str) -> ViewInput:
 
 
 def _followed(method: PoseMethod, jobs: Sequence[Job[Any]], name: str) -> Iterator[Prediction]:
-    """Follow an object; a frame that cannot be read is passed by."""
+    """Follow an object; a frame that cannot be read is skipped."""
     lost: dict[str, PoseEstimate] = {}
 
     def readable() -> Iterator[Any]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose.cli.thesis.depth_tables import claim_figure
 from depthpose.cli.thesis.views import Views
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_depth_png, read_image, write_image
+from depthpose.core.files import write_image
 from depthpose.core.run import environment
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
@@ -19,7 +19,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.voting import vote_ransac
 from depthpose.report.choose import spread_evenly
-from depthpose.report.overlay import grey_depth
+from depthpose.report.overlay import picture_of
 from depthpose.report.pose import close_up, draw_boxes
 from depthpose.report.tables import Picture, Section, write_page
 from depthpose.thesis.pose_figures import arrange_grid, draw_features, draw_field, seen_points
@@ -163,10 +163,7 @@ def picture_sections(
 
 def _picture_of(instance: Instance) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"]]:
     """Read the picture, or the depth in grey, and the annotated mask."""
-    mask = read_instance_mask(instance)
-    if instance.rgb is not None:
-        return read_image(instance.rgb), mask
-    return grey_depth(read_depth_png(instance.depth, instance.depth_unit_m)), mask
+    return picture_of(instance), read_instance_mask(instance)
 
 
 def _true_keypoints(case: VotingCase) -> Float[Tensor, "k 3"]:

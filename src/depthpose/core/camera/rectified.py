@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 
 REACH_X, REACH_Y = 192, 6
@@ -148,7 +149,6 @@ _MAX_OFFSET_PX = 1.0  # street pairs have up to 0.3
 _MAX_SPREAD_PX = 0.75  # street pairs have 0.1 to 0.4; a turn by 0.3 degrees makes 1.2 to 2.5
 _MAX_SHARE_SWAPPED = 0.2
 _MAD_TO_DEVIATION = 1.4826  # of a normal distribution
-_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,8 +271,7 @@ def _message(
 
 
 def _grey(image: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h2 w2"]:
-    weights = image.new_tensor(_LUMA)[:, None, None]
-    grey = (image * weights).sum(0).float()
+    grey = grey_of(image).float()
     if scale < 1:
         height, width = (max(1, round(size * scale)) for size in grey.shape)
         grey = functional.interpolate(grey[None, None], (height, width), mode="area")[0, 0]

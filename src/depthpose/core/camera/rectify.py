@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from depthpose.core.arrays import grey_of
 from depthpose.core.camera.facts import Size, camera_from_facts, facts_from_projections
 from depthpose.core.camera.pinhole import StereoRig
 from depthpose.core.camera.raw_pair import RawCamera, RawPair
@@ -20,7 +21,6 @@ _RATIO = 0.75  # Lowe 2004, section 7.1, says 0.8
 _RANSAC_PX = 1.0
 _MIN_MATCHES = 25
 _MAX_SWAPPED_SHARE = 0.2
-_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 Maps = tuple[np.ndarray, np.ndarray]
 
@@ -197,5 +197,4 @@ def _numbers(camera: RawCamera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _grey(image: Float32[Tensor, "3 h w"]) -> np.ndarray:
-    grey = (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
-    return np.ascontiguousarray((255 * grey).round().clamp(0, 255).byte().numpy())
+    return np.ascontiguousarray((255 * grey_of(image)).round().clamp(0, 255).byte().numpy())

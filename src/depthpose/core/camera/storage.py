@@ -34,7 +34,7 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
     if text.lstrip().startswith("<"):
         return _read_xml(path, text)
     body = _YAML_HEAD.sub("", text)
-    with refused_as(path, "camera file", f"mend it there; known are {KNOWN_FILES}"):
+    with refused_as(path, "camera file", f"correct it there; known are {KNOWN_FILES}"):
         refuse_yaml_bomb(path, body)
         loader = _Loader(body)
         content = loader.get_data() if loader.check_data() else None
@@ -97,7 +97,7 @@ def _read_xml(path: AnyPath, text: str) -> Names | None:
         raise InputError(
             f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
         )
-    with refused_as(path, "camera file", "mend it there"):
+    with refused_as(path, "camera file", "correct it there"):
         root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
     if root.tag != "opencv_storage":
         return None

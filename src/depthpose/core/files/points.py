@@ -117,7 +117,7 @@ def _as_type(path: AnyPath, column: np.ndarray, field: Field) -> np.ndarray:
             return column.astype(dtype)
     limits = np.iinfo(dtype)
     if not ((column >= limits.min) & (column <= limits.max)).all():
-        raise InputError(f"{path}: {field.name!r} holds a value outside {dtype.name}; mend it")
+        raise InputError(f"{path}: {field.name!r} holds a value outside {dtype.name}; correct it")
     # As floats, 64-bit limits round up to what does not fit: those columns stay floats.
     return column if dtype.itemsize == 8 else column.astype(dtype)
 
@@ -196,7 +196,7 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 elements[-1].fields.append(Field(name=name, code=_CODES[kind]))
             case _:
                 raise InputError(
-                    f"{path}: PLY header line {line[:60]!r} is not understood; mend it"
+                    f"{path}: PLY header line {line[:60]!r} is not understood; correct it"
                 )
     if order is None:
         raise InputError(f"{path}: the PLY header names no format; use {', '.join(_ORDERS)} 1.0")

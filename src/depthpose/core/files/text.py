@@ -62,7 +62,7 @@ def read_json(path: AnyPath) -> object:
     data = read_bytes(path)
     refuse_heavy(path, data, _OF_JSON)
     text = _decoded(path, data)
-    with refused_as(path, "JSON file", "mend it there"):
+    with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
             text,
             parse_constant=_refuse_number,
@@ -103,7 +103,7 @@ def parse_yaml(path: AnyPath, text: str) -> object:
             fill the memory once its references are followed.
     """
     refuse_yaml_bomb(path, text)
-    with refused_as(path, "YAML file", "mend it there"):
+    with refused_as(path, "YAML file", "correct it there"):
         return yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
 
 
@@ -122,7 +122,7 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
             if isinstance(event, yaml.CollectionStartEvent):
                 unfinished.append((event.anchor, 1))
                 if len(unfinished) > _MOST_DEPTH:
-                    raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; mend it")
+                    raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; correct it")
                 continue
             if isinstance(event, yaml.AliasEvent) and event.anchor not in sizes:
                 raise InputError(f"{path}: refers to itself (*{event.anchor}); write it out")

@@ -75,7 +75,7 @@ class Arithmetic:
 def leave_process_group(_: int) -> None:
     """Take a worker out of the job's process group: a signal to the group is for the loop.
 
-    A worker that dies takes the loop with it before its state is saved.
+    If a worker is killed, the loop ends before it saves its state.
     """
     os.setsid()
 

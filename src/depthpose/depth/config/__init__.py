@@ -12,6 +12,5 @@ from depthpose.depth.config.matching import PSMNetConfig as PSMNetConfig
 from depthpose.depth.config.matching import SGBMConfig as SGBMConfig
 from depthpose.depth.config.matching import Speed as Speed
 from depthpose.depth.config.synthesis import Answer as Answer
-from depthpose.depth.config.synthesis import EncoderKind as EncoderKind
 from depthpose.depth.config.synthesis import GeneratorConfig as GeneratorConfig
 from depthpose.depth.config.synthesis import SelectionConfig as SelectionConfig

@@ -14,7 +14,7 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.synthetic.clutter import make_clutter
 from depthpose.depth.synthetic.materials import NUMBER
 from depthpose.depth.synthetic.scene import StreetScene, make_scene, street_rig
-from depthpose.depth.synthetic.sensor import draw_sensors, expose, scan, sparse_depth
+from depthpose.depth.synthetic.sensor import draw_sensors, expose, scan
 from depthpose.depth.synthetic.stage import Stage, prepare
 from depthpose.depth.synthetic.view import Sight, draw_light, look, nearest_at, neighbours
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
@@ -37,7 +37,6 @@ class StreetFrame:
         is_sky: left pixels that see the sky.
         is_road: left pixels that see the carriageway.
         lidar_points: x forward, y left, z up [m], reflectance; None where not asked for.
-        lidar_depth_m: the scan drawn into the left image [m], NaN elsewhere; or None.
         rig: the cameras.
     """
 
@@ -50,7 +49,6 @@ class StreetFrame:
     is_sky: Bool[Tensor, "h w"]
     is_road: Bool[Tensor, "h w"]
     lidar_points: Float[Tensor, "n 4"] | None
-    lidar_depth_m: Float[Tensor, "h w"] | None
     rig: StereoRig
 
 
@@ -112,7 +110,6 @@ def draw_scene(
         is_sky=primitive < 0,
         is_road=(primitive >= 0) & (stage.material[primitive.clamp(min=0)] == NUMBER["road"]),
         lidar_points=points,
-        lidar_depth_m=None if points is None else sparse_depth(points, rig),
         rig=rig,
     )
 

@@ -12,7 +12,6 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.camera import StereoRig
 from depthpose.depth.augment import through_jpeg
 from depthpose.depth.synthetic.materials import NUMBER
 from depthpose.depth.synthetic.stage import Stage
@@ -184,20 +183,3 @@ def _returned(
     lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
     kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
     return kept.nonzero()[:, 0]
-
-
-def sparse_depth(points: Float[Tensor, "n 4"], rig: StereoRig) -> Float[Tensor, "h w"]:
-    """Draw a scan into the left image: camera z at the nearest pixel [m], the nearest return wins.
-
-    NaN where no return falls. Nothing is moved by a pixel, as KITTI's own protocol does.
-    """
-    homogeneous = torch.cat([points[:, :3], torch.ones(len(points), 1)], 1).double()
-    in_camera = (homogeneous @ torch.from_numpy(camera_from_velodyne()).T)[:, :3]
-    in_camera = in_camera[in_camera[:, 2] > 0.1]
-    pixels = in_camera @ rig.K.T
-    column, row = (pixels[:, :2] / pixels[:, 2:]).round().long().unbind(1)
-    inside = (column >= 0) & (column < rig.width) & (row >= 0) & (row < rig.height)
-    depth_m = torch.full((rig.height * rig.width,), torch.inf)
-    place = (row * rig.width + column)[inside]
-    depth_m.scatter_reduce_(0, place, in_camera[inside, 2].float(), "amin")
-    return torch.where(depth_m.isinf(), torch.nan, depth_m).reshape(rig.height, rig.width)

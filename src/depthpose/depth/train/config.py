@@ -71,8 +71,7 @@ class SelectTraining:
     """The network that is trained."""
 
     encoder: str | None = None
-    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0'; -lite2
-    where it is the generator's ``encoder_kind``)."""
+    """Weights of the encoder to begin with ('depthpose weights import efficientnet-lite0')."""
 
     start: str | None = None
     """Weights of the whole generator to begin with (or a whole set)."""

@@ -95,43 +95,21 @@ class PointNetConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FpfhConfig:
-    """FPFH features, RANSAC and ICP of Open3D. Lengths are in voxels, as its tutorial has them."""
+    """FPFH features, RANSAC and ICP of Open3D."""
 
     voxel_diameters: float = 0.03
     """Side of a voxel in diameters of the object."""
 
-    normal_voxels: float = 2.0
-    """Radius for normals."""
-
-    feature_voxels: float = 5.0
-    """Radius for features (FPFH, Rusu et al. 2009)."""
-
-    distance_voxels: float = 1.5
-    """A correspondence of RANSAC is right where its points lie so near."""
-
-    icp_voxels: float = 0.4
-    """Reach of the point-to-plane ICP that follows; 0: none."""
-
     iterations: int = 100_000
     """Of RANSAC, at most."""
-
-    model_points: int = 20_000
-    """Points of the model's surface."""
 
     seed: int = 0
     """Of RANSAC."""
 
     def __post_init__(self) -> None:
-        """Refuse lengths and counts of nothing."""
-        lengths = (self.voxel_diameters, self.normal_voxels, self.feature_voxels)
-        if min(*lengths, self.distance_voxels) <= 0 or self.icp_voxels < 0:
+        """Refuse voxels without a size, and no iteration."""
+        if self.voxel_diameters <= 0 or self.iterations < 1:
             raise InputError(
-                f"voxel_diameters, normal_voxels, feature_voxels and distance_voxels are "
-                f"{(*lengths, self.distance_voxels)}; all are positive, and icp_voxels "
-                f"({self.icp_voxels}) is not negative"
-            )
-        if self.iterations < 1 or self.model_points < 100:
-            raise InputError(
-                f"iterations is {self.iterations} and model_points {self.model_points}; take 1 "
-                "and 100 at least"
+                f"voxel_diameters is {self.voxel_diameters} and iterations {self.iterations}; take "
+                "more than 0, and 1 at least"
             )

@@ -89,7 +89,6 @@ def _window(
     return torch.where(is_inside, found, EMPTY)
 
 
-KIND = "depth-image"
 _NUMBERS = 9
 
 

@@ -16,6 +16,10 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
+_MODEL_POINTS = 20_000
+_NORMAL, _FEATURE, _CORRESPONDENCE, _ICP = 2.0, 5.0, 1.5, 0.4
+"""Radius for normals and for features (Rusu et al. 2009), reach of RANSAC's correspondences and of
+the point-to-plane ICP that follows, in voxels, as Open3D's tutorial has them."""
 _LEAST = 3
 """Points that a pose takes; Open3D answers fewer with a crash or with the identity."""
 
@@ -34,7 +38,7 @@ class FpfhRegistration:
     def __init__(self, model: ObjectModel, config: FpfhConfig | None = None) -> None:
         self.model, self.config = model, config or FpfhConfig()
         self._open3d = import_open3d("registration by FPFH")
-        points_m, normals = sample_surface(model, self.config.model_points)
+        points_m, normals = sample_surface(model, _MODEL_POINTS)
         cloud = self._cloud(points_m)
         cloud.normals = self._open3d.utility.Vector3dVector(normals.double().numpy())
         self._target, self._target_features = self._prepare(cloud)
@@ -49,7 +53,7 @@ class FpfhRegistration:
             )
         source, features = self._prepare(self._cloud(given.points_m))
         found = self._ransac(source, features)
-        if self.config.icp_voxels and len(found.correspondence_set):
+        if len(found.correspondence_set):
             found = self._icp(source, found.transformation)
         seconds = {"registration": time.perf_counter() - began}
         if not len(found.correspondence_set):
@@ -79,14 +83,14 @@ class FpfhRegistration:
 
     def _prepare(self, cloud: Any) -> tuple[Any, Any]:  # noqa: ANN401
         """Thin a cloud to voxels; normals of a measured one point to the camera."""
-        o3d, voxel_m, config = self._open3d, self._voxel_m, self.config
+        o3d, voxel_m = self._open3d, self._voxel_m
         cloud = cloud.voxel_down_sample(voxel_m)
         near = o3d.geometry.KDTreeSearchParamHybrid
         if not cloud.has_normals():
-            cloud.estimate_normals(near(radius=config.normal_voxels * voxel_m, max_nn=30))
+            cloud.estimate_normals(near(radius=_NORMAL * voxel_m, max_nn=30))
             cloud.orient_normals_towards_camera_location(np.zeros(3))
         features = o3d.pipelines.registration.compute_fpfh_feature(
-            cloud, near(radius=config.feature_voxels * voxel_m, max_nn=100)
+            cloud, near(radius=_FEATURE * voxel_m, max_nn=100)
         )
         return cloud, features
 
@@ -99,7 +103,7 @@ class FpfhRegistration:
 
     def _search(self, source: Any, features: Any) -> Any:  # noqa: ANN401
         r = self._open3d.pipelines.registration
-        limit_m = self.config.distance_voxels * self._voxel_m
+        limit_m = _CORRESPONDENCE * self._voxel_m
         return r.registration_ransac_based_on_feature_matching(
             source, self._target, features, self._target_features, True, limit_m,
             r.TransformationEstimationPointToPoint(False), 3,
@@ -113,7 +117,7 @@ class FpfhRegistration:
     def _icp(self, source: Any, model_from_camera: np.ndarray) -> Any:  # noqa: ANN401
         r = self._open3d.pipelines.registration
         return r.registration_icp(
-            source, self._target, self.config.icp_voxels * self._voxel_m, model_from_camera,
+            source, self._target, _ICP * self._voxel_m, model_from_camera,
             r.TransformationEstimationPointToPlane(),
         )  # fmt: skip
 

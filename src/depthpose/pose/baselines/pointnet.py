@@ -11,7 +11,6 @@ from depthpose.pose.baselines.config import PointNetConfig
 from depthpose.pose.sparse import RowNorm
 from depthpose.pose.types import SeenPoints
 
-KIND = "pointnet"
 _TRANSFORM_POOLED, _TRANSFORM_HEAD = (64, 128, 1024), (512, 256)
 
 

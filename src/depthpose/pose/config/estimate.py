@@ -92,7 +92,7 @@ class EstimateConfig:
 
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk decides: ICP
-    mends rough votes, and the risk finds those that it does not mend. Nothing is refused for it
+    corrects rough votes, and the risk detects those that stay wrong. Nothing is refused for it
     then: where fewer than four keypoints agree all are fitted, and ICP begins at both fits."""
 
     max_cloud_points: int = 100_000

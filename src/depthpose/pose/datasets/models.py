@@ -44,7 +44,7 @@ def read_models_info(home: Path) -> dict[int, dict[str, Any]]:
     wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
     if wrong:
         raise InputError(
-            f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; mend it"
+            f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; correct it"
         )
     return {int(key): entry for key, entry in content.items()}
 

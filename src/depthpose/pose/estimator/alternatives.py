@@ -175,13 +175,11 @@ def _refined(
     ]
 
 
-def is_same_pose(
-    first: Rigid, second: Rigid, copies: PoseAmbiguities, limit: float = _SAME
-) -> bool:
+def is_same_pose(first: Rigid, second: Rigid, copies: PoseAmbiguities) -> bool:
     """Whether two poses, or a copy of one that counts as it, carry the model to one place."""
     every = second @ copies.same
     gap_m = first.apply(copies.points_m) - every.apply(copies.points_m.expand(len(every.R), -1, -1))
-    return float(gap_m.norm(dim=-1).mean(-1).min()) < limit * copies.diameter_m
+    return float(gap_m.norm(dim=-1).mean(-1).min()) < _SAME * copies.diameter_m
 
 
 def evidence_of(

@@ -1,14 +1,84 @@
-"""GeoPoseNet: clouds and depth images of known objects to poses."""
+"""GeoPoseNet: clouds and depth images of known objects to poses.
 
+Several clouds go through the network at once.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.pose.config import EstimateConfig
-from depthpose.pose.estimator.inference import PoseInference
-from depthpose.pose.weights import read_pose_weights
+from depthpose.core.devices import usable_device
+from depthpose.core.errors import InputError
+from depthpose.pose.baselines import DepthImageNet
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.estimator.base import PoseEstimator, refused
+from depthpose.pose.estimator.pose import Voted, pose_from_directions
+from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
+from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints
+from depthpose.pose.weights import DirectionNet, PoseWeights, read_pose_weights
 
 
-class GeoPoseNet(PoseInference):
+def network_directions(
+    network: DirectionNet, clouds: list[Prepared], numbers: list[int], device: str
+) -> list[Float[Tensor, "n k c"]]:
+    """Ask the network for the directions to the keypoints, in the camera frame, cloud by cloud.
+
+    Args:
+        network: of directions, in eval mode.
+        clouds: their points and voxels.
+        numbers: the object's number of each.
+        device: where the network is.
+    """
+    counts = [len(cloud.points_m) for cloud in clouds]
+    cloud_of_point = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor(counts))
+    grids = [cloud.voxels for cloud in clouds]
+    coordinates = torch.cat([grid.coordinates for grid in grids])
+    turned = (c.points_m @ c.voxels.grid_from_camera.mT for c in clouds)
+    seen = SeenPoints(
+        points_m=torch.cat(list(turned)),
+        coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1),
+        features=torch.cat([grid.features for grid in grids]),
+        class_of_point=torch.tensor(numbers)[cloud_of_point],
+    )
+    outputs = network.directions(seen.to(device)).float().cpu()
+    return [
+        _in_camera(some, grid.grid_from_camera)
+        for some, grid in zip(outputs.split(counts), grids, strict=True)
+    ]
+
+
+def batches(
+    ready: list[tuple[int, Prepared, float]], most: int
+) -> Iterator[list[tuple[int, Prepared, float]]]:
+    """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
+    group: list[tuple[int, Prepared, float]] = []
+    total = 0
+    for item in ready:
+        count = len(item[1].points_m)
+        if group and total + count > most:
+            yield group
+            group, total = [], 0
+        group.append(item)
+        total += count
+    if group:
+        yield group
+
+
+def _in_camera(
+    outputs: Float[Tensor, "n k c"], grid_from_camera: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k c"]:
+    """Turn directions back from the network's grid; further components stay."""
+    directions = outputs[..., :3] @ grid_from_camera
+    return torch.cat([directions, outputs[..., 3:]], -1)
+
+
+class GeoPoseNet(PoseEstimator):
     """The 6-DoF pose of a known object from its partial cloud, or the reason why there is none.
 
     Example::
@@ -20,10 +90,23 @@ class GeoPoseNet(PoseInference):
     Args:
         weights: the network and the objects that it knows.
         config: voting, ICP, limits, device.
+
+    Raises:
+        InputError: weights that cast no votes, or a device that is not there.
     """
 
     name = ""
     """What the weights were called; nothing where they came from memory."""
+
+    def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
+        super().__init__(weights.models, config)
+        self.weights = weights
+        if isinstance(weights.network, DepthImageNet):
+            raise InputError(
+                "these weights regress a depth image and cast no votes; load them as "
+                "DepthImageRegressor"
+            )
+        self._network = weights.network.to(usable_device(self.config.device)).eval()
 
     @classmethod
     def load(
@@ -55,3 +138,84 @@ class GeoPoseNet(PoseInference):
     def terms(self) -> str:
         """Terms of the weights, where they bind whoever uses them; else nothing."""
         return self.weights.facts.get("terms", "")
+
+    @property
+    def models(self) -> Sequence[ObjectModel]:
+        """The objects that the weights know."""
+        return self.weights.models
+
+    @property
+    def refusal(self) -> RefusalConfig:
+        """When an answer is withheld: calibrated with the weights."""
+        return self.weights.refusal
+
+    @torch.no_grad()
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate many at once, of any objects: the network is called for all of them together.
+
+        The answer for an input does not depend on those beside it, but for the rounding of the
+        network's sums.
+
+        Raises:
+            InputError: an unknown object, or a mask that does not fit its depth image.
+        """
+        estimates = {k: found for k, found, _ in self._each(inputs)}
+        return [estimates[k] for k in range(len(inputs))]
+
+    @torch.no_grad()
+    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
+        """Estimate one pose, and give what the network said of each keypoint at each point.
+
+        Returns:
+            The estimate, and the cloud with the outputs in the camera frame; None for them where
+            the network was not run, as there is too little to pose.
+
+        Raises:
+            InputError: as for :meth:`estimate_many`.
+        """
+        ((_, found, voted),) = self._each([given])
+        return found, voted
+
+    def _each(self, inputs: Sequence[AnyInput]) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
+        """Give each input's number, estimate and votes: first what is refused, then by batches."""
+        ready: list[tuple[int, Prepared, float]] = []
+        for k, given in enumerate(inputs):
+            start = time.perf_counter()
+            model = self.weights.models[self._number(given.object)]
+            prepared = prepare_cloud(given, model, self.weights.cloud, self.config)
+            spent_s = time.perf_counter() - start
+            if isinstance(prepared, Refusal):
+                yield k, refused(given, prepared, {"cloud": spent_s}), None
+            else:
+                ready.append((k, prepared, spent_s))
+        for some in batches(ready, self.config.batch_voxels):
+            numbers = [self._number(inputs[k].object) for k, _, _ in some]
+            directions, network_s = self._directions([p for _, p, _ in some], numbers)
+            total = sum(map(len, directions))
+            for (k, prepared, spent_s), outputs, number in zip(
+                some, directions, numbers, strict=True
+            ):
+                share_s = network_s * len(outputs) / total
+                seconds = {"cloud": spent_s, "network": share_s}
+                voted = Voted(prepared, outputs)
+                yield k, self._pose(inputs[k], number, voted, seconds), voted
+
+    def _directions(
+        self, clouds: list[Prepared], numbers: list[int]
+    ) -> tuple[list[Float[Tensor, "n k c"]], float]:
+        start = time.perf_counter()
+        found = network_directions(self._network, clouds, numbers, self.config.device)
+        return found, time.perf_counter() - start
+
+    def _pose(
+        self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
+    ) -> PoseEstimate:
+        found = pose_from_directions(
+            voted,
+            self.weights.models[number],
+            self._surface(number),
+            self._copies_of(number),
+            self.weights.refusal,
+            self.config,
+        )
+        return replace(found, name=given.name, seconds={**seconds, **found.seconds})

@@ -37,7 +37,7 @@ class Prepared:
     """A cloud that can be posed.
 
     Attributes:
-        cloud_m: all usable points, what flies about left out.
+        cloud_m: all usable points, without flying pixels.
         points_m: those that the network sees and that vote, one a voxel.
         voxels: of the network's grid.
         view: the depth image that shows the cloud; None where the cloud alone is known.

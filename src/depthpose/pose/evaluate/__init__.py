@@ -1,4 +1,4 @@
-"""Predictions and truth to rows: metrics read files, and nothing leaves the denominator."""
+"""Predictions and truth to rows: metrics read files, and missing answers count as failures."""
 
 from depthpose.pose.evaluate.errors import METRICS as METRICS
 from depthpose.pose.evaluate.errors import Metric as Metric

@@ -86,7 +86,7 @@ def _values(accessor: Mapping[str, Any]) -> int:
 
 
 _COARSE = 1000
-"""A mesh of fewer points (a CAD box has eight) lends keypoints from inside its faces too."""
+"""A mesh of fewer points (a CAD box has eight) also takes keypoints from inside its faces."""
 _NO_AREA = 1e-12
 """Of the square of the extent: a face of no more is a line or a point."""
 _LEAST_AREA = 1e-6

@@ -138,13 +138,13 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 
 
 def symmetries_from_proposals(
-    proposals: list[SymmetryProposal], min_certainty: float = SURE
+    proposals: list[SymmetryProposal],
 ) -> Symmetries:
     """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
 
     Without an axis the turns are completed to a group: two symmetries one after the other are one.
     """
-    sure = [p for p in proposals if p.certainty >= min_certainty]
+    sure = [p for p in proposals if p.certainty >= SURE]
     axes = tuple(p.axis for p in sure if p.kind == "continuous")
     kept: list[Rigid] = []
     for proposal in sure:

@@ -14,7 +14,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import Checkpoint, build_network, read_checkpoint, save_checkpoint
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    build_network,
+    half_state,
+    read_checkpoint,
+    save_checkpoint,
+)
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.pose.resnet import ResNet18
@@ -142,9 +148,8 @@ def write_segmentation(
         "objects": list(weights.objects),
         "numbers": list(weights.numbers),
     }
-    state = weights.network.state_dict()
-    if with_half:
-        state = {k: t.to(torch.float16) if t.is_floating_point() else t for k, t in state.items()}
+    network = weights.network
+    state = half_state(network) if with_half else network.state_dict()
     save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=weights.facts))
 
 

@@ -1,7 +1,6 @@
 """Features on voxels, and sparse convolutions of them as modules."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -12,8 +11,6 @@ from depthpose.core.errors import InputError
 from depthpose.pose.sparse.conv import conv
 from depthpose.pose.sparse.kernel_map import CoordinateCache
 from depthpose.pose.sparse.keys import Keys, pack, unpack
-
-Duplicates = Literal["refuse", "mean"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,29 +37,22 @@ class Voxels:
         cls,
         coordinates: Int[Tensor, "points 4"],
         features: Float[Tensor, "points c"] | None = None,
-        *,
-        duplicates: Duplicates = "refuse",
     ) -> "Voxels":
         """Make voxels from rows of (cloud, x, y, z).
 
         Args:
             coordinates: integers; clouds are numbered from 0, x, y, z may be negative.
             features: of each point; None: the number 1.
-            duplicates: what becomes of points in one voxel: an error, or the mean of their
-                features (each point then gets its voxel's answer).
 
         Raises:
-            InputError: coordinates out of range, or duplicates that are not wanted.
+            InputError: coordinates out of range, or two points in one voxel.
         """
         if features is None:
             features = torch.ones(len(coordinates), 1, device=coordinates.device)
         given = pack(coordinates)
         keys, row_of_point, counts = torch.unique(given, return_inverse=True, return_counts=True)
-        if duplicates == "refuse":
-            _refuse_duplicates(keys, counts)
-            features = features[torch.argsort(given)]
-        else:
-            features = _means(features, row_of_point, counts)
+        _refuse_duplicates(keys, counts)
+        features = features[torch.argsort(given)]
         return cls(features=features, cache=CoordinateCache(keys), row_of_point=row_of_point)
 
     @property
@@ -90,16 +80,8 @@ def _refuse_duplicates(keys: Keys, counts: Int64[Tensor, " n"]) -> None:
         cloud, *xyz = unpack(keys[repeated][:1])[0].tolist()
         raise InputError(
             f"{int((counts - 1).sum())} points share a voxel with another, the first at {xyz} of "
-            f"cloud {cloud}; keep one point a voxel, or say duplicates='mean'."
+            f"cloud {cloud}; keep one point a voxel."
         )
-
-
-def _means(features: Tensor, rows: Tensor, counts: Tensor) -> Tensor:
-    """Average the rows of each voxel, in the order given so that the sum has the same bits."""
-    order = torch.argsort(rows, stable=True)
-    starts = counts.cumsum(0) - counts
-    sums = torch.nn.functional.embedding_bag(order, features, starts, mode="sum")
-    return sums / counts[:, None].to(features.dtype)
 
 
 class RowNorm(nn.BatchNorm1d):

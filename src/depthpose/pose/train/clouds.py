@@ -75,14 +75,14 @@ class TrainingClouds:
 
     Args:
         models: the objects; class k is ``models[k]``.
-        synthetic: how synthetic views look; None: frames alone.
+        synthetic: how synthetic views look.
         frames: real frames, and their share.
         cloud: points and voxels.
         seed: of the order of frames and of the choice of points.
         first_alone: so many synthetic views at the start show the first object.
 
     Raises:
-        InputError: neither views nor frames, or frames of other objects.
+        InputError: frames of other objects.
     """
 
     def __init__(
@@ -98,13 +98,11 @@ class TrainingClouds:
         self._first_alone = first_alone
         self.synthetic = Objects(models, synthetic, cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
-        self._real = None if frames is None else _open_frames(frames, models, cloud)
+        self._real = None if frames is None else open_frames(frames, models, cloud)
 
     def __len__(self) -> int:
         """Samples of an epoch: each frame once, or as many as there are synthetic views."""
-        if self._real is None or self.frames is None:
-            return len(self.synthetic)
-        return max(1, round(len(self._real) / self.frames.share))
+        return epoch_samples(self.frames, self._real, len(self.synthetic))
 
     def __getitem__(self, index: int) -> Cloud:
         """Make the sample of an index; one with too few points is replaced by another.
@@ -133,11 +131,10 @@ class TrainingClouds:
     def _sample(self, index: int, generator: torch.Generator) -> CloudSample:
         # Sample i shows object i modulo their number.
         index = index * len(self._class_of) if index < self._first_alone else index
-        if self._real is None or self.frames is None:
+        place = frame_place(self.frames, self._real, index, self.seed, generator)
+        if self._real is None or self.frames is None or place is None:
             return self.synthetic.sample(index)
-        if float(torch.rand((), generator=generator)) >= self.frames.share:
-            return self.synthetic.sample(index)
-        sample = self._real[shuffled_index(index, len(self._real), self.seed)]
+        sample = self._real[place]
         angle = 2 * math.pi * float(torch.rand((), generator=generator))
         return _rolled(sample, angle) if self.frames.with_roll else sample
 
@@ -180,9 +177,34 @@ def collate_clouds(clouds: Sequence[Cloud]) -> CloudBatch:
     )
 
 
-def _open_frames(
+def epoch_samples(frames: FramesConfig | None, real: BopDataset | None, synthetic: int) -> int:
+    """Samples of an epoch: each frame once, or as many as there are synthetic views."""
+    if frames is None or real is None:
+        return synthetic
+    return max(1, round(len(real) / frames.share))
+
+
+def frame_place(
+    frames: FramesConfig | None,
+    real: BopDataset | None,
+    index: int,
+    seed: int,
+    generator: torch.Generator,
+) -> int | None:
+    """Choose which instance of the frames a sample shows; None: it is a synthetic view."""
+    if frames is None or real is None or float(torch.rand((), generator=generator)) >= frames.share:
+        return None
+    return shuffled_index(index, len(real), seed)
+
+
+def open_frames(
     frames: FramesConfig, models: Sequence[ObjectModel], cloud: CloudConfig
 ) -> BopDataset:
+    """Open the real frames of a training, of its objects alone.
+
+    Raises:
+        InputError: an object has another name there.
+    """
     dataset = open_bop(frames.folder, frames.split, cloud=cloud)
     dataset = dataset.of_objects(*(model.number for model in models))
     known = {model.number: model.name for model in models}

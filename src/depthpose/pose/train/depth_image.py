@@ -19,23 +19,28 @@ from depthpose.core.loop import (
     make_adam,
     releases_folder,
     sample_generator,
-    shuffled_index,
     write_card,
 )
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.datasets import open_bop
 from depthpose.pose.estimator import DepthImageRegressor
 from depthpose.pose.losses import model_point_loss
-from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import is_within_diameter
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.train.clouds import read_models
+from depthpose.pose.train.clouds import epoch_samples, frame_place, open_frames, read_models
 from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.train.other_configs import DepthImageTraining
-from depthpose.pose.train.task import card_facts, claim_run, packed, train_words, with_classes
+from depthpose.pose.train.task import (
+    card_facts,
+    claim_run,
+    packed,
+    symmetric_copies,
+    train_words,
+    with_classes,
+)
 from depthpose.pose.types import ObjectModel, ViewSample
 from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
 
@@ -75,16 +80,12 @@ class TrainingCrops:
         self.models = models
         self.synthetic = Objects(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
-        self._real = None
-        if config.frames is not None:
-            frames = open_bop(config.frames.folder, config.frames.split, cloud=config.cloud)
-            self._real = frames.of_objects(*self._class_of)
+        frames = config.frames
+        self._real = None if frames is None else open_frames(frames, models, config.cloud)
 
     def __len__(self) -> int:
         """Samples of an epoch: each frame once, or as many as there are synthetic views."""
-        if self._real is None or self.config.frames is None:
-            return len(self.synthetic)
-        return max(1, round(len(self._real) / self.config.frames.share))
+        return epoch_samples(self.config.frames, self._real, len(self.synthetic))
 
     def __getitem__(self, index: int) -> CropSample:
         """Make the sample of an index; one with too few pixels is replaced by another.
@@ -106,12 +107,10 @@ class TrainingCrops:
         )
 
     def _view(self, index: int) -> ViewSample:
-        if self._real is None or self.config.frames is None:
-            return self.synthetic.view(index)
         generator = sample_generator(index, self.seed)
-        if float(torch.rand((), generator=generator)) >= self.config.frames.share:
+        place = frame_place(self.config.frames, self._real, index, self.seed, generator)
+        if self._real is None or place is None:
             return self.synthetic.view(index)
-        place = shuffled_index(index, len(self._real), self.seed)
         return self._real.view(self._real.instances[place])
 
 
@@ -129,7 +128,7 @@ class DepthImageTask:
         self.modules: dict[str, nn.Module] = {"network": network}
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._points_m = surface_points(models, config.surface_points)
-        self._copies = symmetric_copies(models)
+        self._copies = symmetric_copies(models, _SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
         self._views: dict[float, list[ViewSample]] = {}
 
@@ -205,14 +204,3 @@ def surface_points(models: Sequence[ObjectModel], count: int) -> Float[Tensor, "
     """Points of each object's surface; those of a sparse model of points come again."""
     every = [sample_surface(model, count)[0] for model in models]
     return torch.stack([points[torch.arange(count) % len(points)] for points in every])
-
-
-def symmetric_copies(models: Sequence[ObjectModel]) -> Rigid:
-    """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
-    every = [symmetry_transforms(model.symmetries, _SYMMETRY_STEP) for model in models]
-    most = max(len(copies.R) for copies in every)
-    R = torch.eye(3).repeat(len(models), most, 1, 1)
-    t_m = torch.zeros(len(models), most, 3)
-    for k, copies in enumerate(every):
-        R[k, : len(copies.R)], t_m[k, : len(copies.R)] = copies.R.float(), copies.t_m.float()
-    return Rigid(R, t_m)

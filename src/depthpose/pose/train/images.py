@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import sample_generator, shuffled_index
@@ -19,8 +20,6 @@ from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.datasets.models import models_folder, object_name, read_models_info
 from depthpose.pose.segmentation import SegmentationConfig
 from depthpose.pose.train.other_configs import ImageAugmentConfig, ImagesConfig
-
-_LUMA = (0.299, 0.587, 0.114)
 
 
 class LabelledImage(NamedTuple):
@@ -175,7 +174,7 @@ def jitter_colors(
     balance = 1 + (changes[3:, None, None] - 1) / 3
     bright = image * brightness * balance
     bright = (bright - bright.mean()) * contrast + bright.mean()
-    grey = (bright * bright.new_tensor(_LUMA)[:, None, None]).sum(0)
+    grey = grey_of(bright)
     return (grey + (bright - grey) * saturation).clamp(0, 1)
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
 from depthpose.core.loop import Run, Update, ValidationResult, make_adam
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
@@ -81,14 +82,20 @@ class PoseTask:
 
 def keypoint_copies(models: Sequence[ObjectModel]) -> Float[Tensor, "classes copies k 3"]:
     """Keypoints of each object under each of its symmetries; the first is repeated to the most."""
-    every = []
-    for model in models:
-        turns = symmetry_transforms(model.symmetries, _SYMMETRY_STEP)
-        keypoints = model.keypoints_m.double()
-        every.append(keypoints @ turns.R.double().mT + turns.t_m.double()[:, None])
-    most = max(map(len, every))
-    rows = [torch.cat([c, c[:1].expand(most - len(c), -1, -1)]) for c in every]
-    return torch.stack(rows).float()
+    turns = symmetric_copies(models, _SYMMETRY_STEP)
+    keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
+    return (keypoints_m[:, None] @ turns.R.mT + turns.t_m[:, :, None]).float()
+
+
+def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
+    """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
+    every = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
+    most = max(len(copies.R) for copies in every)
+    R = torch.eye(3).double().repeat(len(models), most, 1, 1)
+    t_m = torch.zeros(len(models), most, 3).double()
+    for k, copies in enumerate(every):
+        R[k, : len(copies.R)], t_m[k, : len(copies.R)] = copies.R, copies.t_m
+    return Rigid(R, t_m)
 
 
 _SAID = 3
