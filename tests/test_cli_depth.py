@@ -32,7 +32,9 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.loop import Progress, read_metrics
+from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import PSMNet, SGBMMatcher
+from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import write_depth_weights
 
 CAMERA = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]]}
@@ -255,6 +257,74 @@ def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
         assert float((picture - wanted).abs().mean()) < 0.05, file
 
 
+def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
+    write_video(tmp_path / "drive.avi", frames, 5.0)
+    refused = InputError("drive_000001: a black frame")
+    estimate_alone = FakestereoNet._estimate_alone
+
+    def estimate(net: FakestereoNet, images: list[StereoInput]) -> list[DepthEstimate]:
+        if any(image.name == "drive_000001" for image in images):
+            raise refused
+        return estimate_alone(net, images)
+
+    out = tmp_path / "out"
+    with patch.object(FakestereoNet, "_estimate_alone", estimate):
+        assert predict(home, out, str(tmp_path / "drive.avi"), "--focal-px", "70") == 1
+    assert "failed: drive_000001: a black frame" in capsys.readouterr().err
+    assert len(list(out.glob("*.depth_m.npy"))) == 3
+    assert len(list(read_video(out / "drive.color.mp4"))) == 4, "a grey frame in its place"
+    assert "black frame" in " ".join(read_page(out / "report.html").texts["td"])
+
+
+def test_sides_of_other_names_are_not_paired_by_order(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = read_image(home / "images/0.png")
+    for name in ("left/a.png", "left/b.png", "right/a.png", "right/c.png"):
+        write_image(tmp_path / name, image)
+    sides = [str(tmp_path / side) for side in ("left", "right")]
+    (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
+    words = ["--camera", str(tmp_path / "rig.json"), "--out", str(tmp_path / "out")]
+    assert main(["depth", "match", *sides, *words]) == 2
+    assert "'b' is on one side alone" in capsys.readouterr().err
+
+
+def test_another_right_image_needs_another_folder(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, other = (str(home / f"images/{k}.png") for k in (0, 1))
+    (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
+    words = [
+        "--camera",
+        str(tmp_path / "rig.json"),
+        "--no-check",
+        "--weights",
+        str(home / "m.safetensors"),
+    ]
+    words += ["--out", str(tmp_path / "out")]
+    assert main(["depth", "match", one, one, *words]) == 0
+    assert main(["depth", "match", one, one, *words]) == 0
+    write_image(tmp_path / "right.png", read_image(Path(other)))
+    assert main(["depth", "match", one, str(tmp_path / "right.png"), *words]) == 2
+    assert "has changed since its result '0'" in capsys.readouterr().err
+
+
+def test_sizes_that_differ_are_no_matter_of_the_check(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "right.png", torch.rand(3, 40, 64))
+    (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
+    pair = [str(home / "images/0.png"), str(tmp_path / "right.png")]
+    words = ["--camera", str(tmp_path / "rig.json"), "--out", str(tmp_path / "out")]
+    assert main(["depth", "match", *pair, *words]) == 2
+    error = capsys.readouterr().err
+    assert "a rectified pair has one size" in error
+    assert "--no-check" not in error
+
+
 def test_the_page_shows_some_of_many_and_the_numbers_of_their_files(
     home: Path, tmp_path: Path
 ) -> None:
@@ -340,6 +410,9 @@ def test_a_baseline_is_said_to_be_left_alone(
     image = str(home / "images" / "0.png")
     assert predict(home, tmp_path / "out", image, "--camera", str(tmp_path / "rig.json")) == 0
     assert "baseline is ignored" in capsys.readouterr().err
+    assert predict(home, tmp_path / "mono", image, "--camera", str(home / "cam.json")) == 0
+    one, other = (read_map(tmp_path / name / "0.disparity_px.npy") for name in ("out", "mono"))
+    assert torch.equal(one, other)
 
 
 def test_packing_writes_the_card_and_halves_the_file(
@@ -547,3 +620,43 @@ def test_words_of_another_stage_are_refused(
     words = ["depth", "train", "stereo", "--data", str(pairs), "--out", str(tmp_path / "run")]
     assert main([*words, "--generator", "default"]) == 2
     assert "--generator has no meaning for 'stereo'" in capsys.readouterr().err
+
+
+def test_an_evaluation_after_a_change_of_its_inputs_is_refused(
+    home: Path, pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(pairs, data)
+    words = [
+        "depth",
+        "evaluate",
+        "--data",
+        str(data),
+        "--protocol",
+        "kitti-2015",
+        "--out",
+        str(out),
+    ]
+    measure = [*words, "--weights", str(home / "m.safetensors")]
+    assert main(measure) == 0
+    assert main(measure) == 0
+    calibration = data / "calib.txt"
+    before = calibration.read_text()
+    calibration.write_text(f"{before}\n")
+    assert main(measure) == 2
+    assert f"{calibration}: has changed since its result" in capsys.readouterr().err
+
+
+def test_confidence_of_an_earlier_method_does_not_stay(
+    home: Path, pairs: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = ["depth", "evaluate", "--data", str(pairs), "--protocol", "kitti-2015"]
+    assert main([*words, "--weights", str(home / "m.safetensors"), "--out", str(out)]) == 0
+    assert (out / "confidence.csv").is_file()
+    others = tmp_path / "others"
+    others.mkdir()
+    (disparity,) = out.rglob("a.disparity_px.npy")
+    shutil.copy(disparity, others)
+    assert main([*words, "--predictions", str(others), "--out", str(out)]) == 0
+    assert not list(out.glob("confidence.*"))

@@ -49,6 +49,11 @@ MISTAKES = {
         "pose.estimate(depth=depth_m, mask=mask, camera={'focal': 50}, object='flange')",
         "unknown key 'focal'; ",
     ),
+    "a function as a matcher": (
+        "FakestereoNet(lambda left, right: left.mean(0))",
+        "matcher is a function, which has no method 'match'; make a matcher of a function by "
+        "CallableMatcher(function)",
+    ),
     "camera and focal length": (
         "depth.estimate(torch.rand(3, 48, 64), camera, focal_px=50)",
         "camera and focal_px are both given; omit one of the two",
@@ -56,6 +61,18 @@ MISTAKES = {
     "a mapping as a cloud": (
         "pose.estimate(cloud={'points': points}, object='flange')",
         "a dict where numbers belong; give a tensor or array of numbers, or a file's path",
+    ),
+    "complex numbers as depth": (
+        "pose.estimate(depth=depth_m * 1j, mask=mask, camera=camera, object='flange')",
+        "complex numbers where real numbers belong; give a tensor or array of numbers",
+    ),
+    "a number as an object": (
+        "pose.estimate(cloud=points, object=2)",
+        "object 2 is no text; give the name of one: 'bracket', 'flange'",
+    ),
+    "a folder as frames": (
+        "pose.track('seq/depth', camera, object='flange')",
+        "frames is 'seq/depth', one path; give a list of files or arrays in their order",
     ),
     "a float image of 0 to 255": (
         "depth.estimate(np.full((48, 64, 3), 127.0), camera)",
@@ -110,6 +127,7 @@ TAKEN = {
     "K of float32": "depth.estimate(np.zeros((48, 64), np.uint8), torch.tensor(K))",
     "a focal length": "pose.estimate(depth=depth_m, mask=mask, focal_px=50, object='flange')",
     "one of Pillow's": "depth.estimate(Image.new('RGBA', (64, 48)), K)",
+    "one name to find": "pose.find(depth_m, K, objects='flange')",
     "Pillow's mask": "pose.estimate(depth=depth_m, mask=Image.new('L', (64, 48), 255), "
     "camera=K, object='flange')",
 }

@@ -289,3 +289,16 @@ def test_the_two_files_of_opencvs_calibration_are_a_folder(
     stored(tmp_path / "intrinsics.yml", {**inner, "D2": np.array([[0.1, 0, 0, 0, 0]])})
     with pytest.raises(InputError, match=r"lens distortion .*cv2\.initUndistortRectifyMap"):
         read_rig(tmp_path, SIZE)
+
+
+@pytest.mark.parametrize("key", ["K", "camera_matrix"])
+def test_yaml_takes_the_keys_of_our_json_too(tmp_path: Path, key: str) -> None:
+    K = "[300, 0, 320, 0, 300, 240, 0, 0, 1]"
+    text = f"width: 640\nheight: 480\n{key}: {K}\nbaseline_m: 0.12\n"
+    path = tmp_path / "rig.yaml"
+    path.write_text(f"{text}cx_right_minus_left_px: 4.5\ndepth_unit_m: 0.001\n")
+    rig = read_rig(path)
+    assert (rig.baseline_m, rig.cx_right_minus_left_px, rig.depth_unit_m) == (0.12, 4.5, 0.001)
+    path.write_text(text.replace("0.12", "wide"))
+    with pytest.raises(InputError, match=r"baseline_m is 'wide'; write a number"):
+        read_rig(path)

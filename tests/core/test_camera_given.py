@@ -68,3 +68,10 @@ def test_a_focal_length_stands_alone() -> None:
     assert choose_lens(None, 60.0) == 60.0
     with pytest.raises(InputError, match="camera and focal_px are both given"):
         choose_lens(ROWS, 60.0)
+
+
+@pytest.mark.parametrize("focal_px", [np.float32(707), np.int64(707), torch.tensor(707.0)])
+def test_a_focal_length_may_be_a_number_of_numpy_or_torch(focal_px: object) -> None:
+    camera = camera_of(focal_px, (64, 48))  # pyright: ignore[reportArgumentType]
+    assert camera is not None
+    assert float(camera.K[0, 0]) == 707

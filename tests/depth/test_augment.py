@@ -273,3 +273,13 @@ def test_views_are_degraded_each_on_its_own() -> None:
     assert not torch.allclose(found.left, found.right, atol=0.02)
     assert torch.equal(found.left_px.nan_to_num(-1.0), pair.left_px.nan_to_num(-1.0))
     assert set_apart(pair, AugmentConfig(), generator(3)) == pair
+
+
+def test_no_scale_is_drawn_at_which_half_of_the_crop_would_be_black() -> None:
+    """A pair of 112 rows at 0.5 has 56, less than half of a crop of 128."""
+    images, px = torch.rand(3, 112, 373), torch.full((112, 373), 5.0)
+    pair = TrainingPair(images, images, px, px)
+    config = AugmentConfig(crop_px=(128, 128), scale=(0.5, 1.2))
+    for seed in range(40):
+        cropped = augment(pair, config, torch.Generator().manual_seed(seed))
+        assert cropped.left.shape == (3, 128, 128)

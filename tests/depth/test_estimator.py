@@ -133,3 +133,22 @@ def test_the_rig_decides_the_metres() -> None:
     estimate = net.estimate(image, rig, right=image, with_check=False)
     assert estimate.depth_m is not None
     assert estimate.depth_m[0, 0].item() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("shift_px", [20.0, -12.5])
+def test_far_points_of_a_rig_with_principal_points_apart_are_matched(shift_px: float) -> None:
+    """A wall at a disparity of 6 px: less the difference of the principal points in the images."""
+    generator = torch.Generator().manual_seed(1)
+    wide = torch.nn.functional.interpolate(
+        torch.rand(1, 3, 60, 160, generator=generator), (120, 320), mode="bilinear"
+    )[0]
+    disparity = 6 - round(shift_px)
+    left, right = wide[..., 40:280], wide[..., 40 + disparity : 280 + disparity]
+    K = torch.tensor([[300.0, 0, 120], [0, 300, 60], [0, 0, 1]], dtype=torch.float64)
+    rig = StereoRig(
+        width=240, height=120, K=K, baseline_m=0.2, cx_right_minus_left_px=float(round(shift_px))
+    )
+    found = FakestereoNet.load(matcher="sgbm").estimate(left, rig, right=right)
+    assert found.depth_m is not None
+    assert float(found.disparity_px.nanmedian()) == pytest.approx(disparity, abs=0.1)
+    assert float(found.depth_m.nanmedian()) == pytest.approx(300 * 0.2 / 6, rel=0.02)

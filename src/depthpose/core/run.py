@@ -159,7 +159,7 @@ def run_record(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def claim_names(
     folder: Path,
-    sources: Mapping[str, Path],
+    sources: Mapping[str, Path | Sequence[Path]],
     endings: Sequence[str] = (),
     videos: Collection[str] = (),
     is_finished: Callable[[str], bool] | None = None,
@@ -168,7 +168,7 @@ def claim_names(
 
     Args:
         folder: where the results go, claimed before (:func:`claim_folder`).
-        sources: the file behind each name.
+        sources: the file behind each name; of several, the first gives it, and all decide it.
         endings: what follows a name in the names of its results.
         videos: those of the names whose results bear the number of a frame too.
         is_finished: whether a name has a result; None: whether there is a file of the name and one
@@ -184,7 +184,7 @@ def claim_names(
     there = read_json(record) if record.exists() else {}
     known = there if isinstance(there, dict) else {}
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: [str(path.resolve()), _stamp(path)] for name, path in sources.items()}
+    wanted = {name: _entry(files) for name, files in sources.items()}
     for name, (path, stamp) in wanted.items():
         earlier, before = _source(known.get(name, [path, stamp]))
         if earlier != path:
@@ -195,8 +195,8 @@ def claim_names(
         is_other = before and stamp and before != stamp
         if is_other and (name in made if is_finished is None else is_finished(name)):
             raise InputError(
-                f"{path}: has changed since its result {name!r} in {folder} was made; choose "
-                "another folder, or delete this one"
+                f"{_said(sources[name])}: has changed since its result {name!r} in {folder} was "
+                "made; choose another folder, or delete this one"
             )
     new = wanted.keys() - known.keys()
     for stem, file in results.items():
@@ -205,6 +205,16 @@ def claim_names(
             raise not_ours(file)
     if any(known.get(name) != entry for name, entry in wanted.items()):
         write_json(record, known | wanted)
+
+
+def _entry(files: Path | Sequence[Path]) -> list[str]:
+    """Give the first of some files, and the stamps of all."""
+    every = [files] if isinstance(files, Path) else list(files)
+    return [str(every[0].resolve()), ", ".join(filter(None, map(_stamp, every)))]
+
+
+def _said(files: Path | Sequence[Path]) -> str:
+    return str(files) if isinstance(files, Path) else " or ".join(map(str, files))
 
 
 def read_sources(folder: Path) -> dict[str, Path]:

@@ -4,6 +4,7 @@ Degradations are what a camera, weather and files do to a picture; truth never c
 """
 
 import math
+from collections.abc import Sequence
 from io import BytesIO
 from typing import NamedTuple
 
@@ -139,7 +140,7 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
     Raises:
         InputError: the pair is smaller than half of the crop.
     """
-    scaled = scale_pair(pair, _draw_scale(config, generator))
+    scaled = scale_pair(pair, _draw_scale(config, generator, pair.left.shape[-2:]))
     cropped = crop_pair(scaled, _common_size(scaled, config.crop_px), generator)
     if float(torch.rand((), generator=generator)) < config.flip_share:
         cropped = flip_and_swap(cropped)
@@ -292,6 +293,9 @@ def _saturate(image: Float[Tensor, "3 h w"], factor: float) -> Float[Tensor, "3 
     return grey + (image - grey) * factor
 
 
-def _draw_scale(config: AugmentConfig, generator: torch.Generator) -> float:
+def _draw_scale(config: AugmentConfig, generator: torch.Generator, size: Sequence[int]) -> float:
+    """Draw a scale; none at which half of the crop would be black, if a larger one is allowed."""
     low, high = config.scale
-    return low + (high - low) * float(torch.rand((), generator=generator))
+    drawn = low + (high - low) * float(torch.rand((), generator=generator))
+    half = max((crop + 1) / 2 / side for crop, side in zip(config.crop_px, size, strict=True))
+    return max(drawn, min(half, high))

@@ -1,5 +1,7 @@
 """Disparity to depth and back, warping, the left-right check, and maps at other sizes."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -43,6 +45,22 @@ def disparity_advice(
         if factor / _ABOUT < farther < factor * _ABOUT:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
     return None
+
+
+def infinity_shift_px(camera: Camera | None) -> int:
+    """Columns by which the right view is moved to the left before a match.
+
+    Where the right principal point lies farther right than the left one, far points have negative
+    disparities, which no matcher searches. Moved so, points at infinity have at least 0, as with
+    equal principal points; the matched disparity is so many pixels larger.
+    """
+    return math.ceil(camera.cx_right_minus_left_px) if isinstance(camera, StereoRig) else 0
+
+
+def moved_left(image: Float[Tensor, "*c h w"], columns: int) -> Float[Tensor, "*c h w"]:
+    """Move an image by whole columns to the left (negative: right); its border is repeated."""
+    width = image.shape[-1]
+    return image[..., (torch.arange(width) + columns).clamp(0, width - 1)]
 
 
 def depth_from_disparity(

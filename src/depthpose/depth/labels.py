@@ -77,7 +77,7 @@ def label_pairs(
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
-    sources = {frames[n].name: frames[n].left for n in usable}
+    sources = {frames[n].name: frames[n].seen_files() for n in usable}
     truth = folder / "disp_occ"
     claim_names(folder, sources, is_finished=lambda name: (truth / f"{name}.png").is_file())
     _write_calibration(folder / "calib.txt", dataset, usable)

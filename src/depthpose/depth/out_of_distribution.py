@@ -1,5 +1,6 @@
 """Images out of distribution for a generator, by its own mean confidence."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +56,7 @@ def calibrate(weights: Path, image_confidence: list[float], alarm_share: float, 
     if not 0 < alarm_share < 1 or len(image_confidence) * alarm_share < 1:
         raise InputError(
             f"{len(image_confidence)} images cannot say what refuses {alarm_share:g} of them; "
-            f"give {1 / max(alarm_share, 1e-6):.0f} images or more, or a larger share"
+            f"give {math.ceil(1 / max(alarm_share, 1e-6))} images or more, or a larger share"
         )
     least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
     found = read_checkpoint(weights)

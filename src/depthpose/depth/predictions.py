@@ -1,6 +1,6 @@
 """Estimates as files: what they are called, writing them all or nothing, reading them back."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -190,7 +190,7 @@ def predict(
     inputs: Mapping[str, Callable[[], StereoInput]],
     folder: Path,
     settings: dict[str, Any],
-    sources: Mapping[str, Path],
+    sources: Mapping[str, Path | Sequence[Path]],
 ) -> Iterable[str]:
     """Estimate what is not finished yet, one frame at a time, and yield each name.
 
@@ -199,7 +199,8 @@ def predict(
         inputs: readers of the inputs by name, called only for unfinished frames.
         folder: where the files go; refused if other settings or images made what it holds.
         settings: what decides the results.
-        sources: the image behind each name, of all processes that write to the folder.
+        sources: the files behind each name, the image first, of all processes that write to the
+            folder.
     """
     claim_folder(folder, settings, (f"{name}.{end}" for name in inputs for end in ENDINGS))
     claim_names(folder, sources, is_finished=partial(is_finished, folder))

@@ -99,9 +99,9 @@ class ObjectsOptions:
 def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
     """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
-    Existing frames are skipped, so an interrupted run can be resumed, and several
-    runs with different --first share the work. Each rig of KITTI's five recording days gets a
-    date of its own, 2100_01_01 to 2100_01_05, which no real drive has.
+    Existing frames are skipped, so an interrupted run can be resumed, and a later run with another
+    --first adds to it; runs at the same time need a folder each. Each rig of KITTI's five recording
+    days gets a date of its own, 2100_01_01 to 2100_01_05, which no real drive has.
 
     Args:
         out: folder to write to.

@@ -80,7 +80,7 @@ def rectify(
     pairs = list(zip(lefts, rights, strict=True))
     _say_residual(_measure(rectifier, pairs), rectifier, is_refused=rectifying.check)
     claim_folder(out, _settings(calibration, rectifying.keep), [*_SIDES, "camera.json"])
-    claim_names(out, {path.stem: path for path in lefts})
+    claim_names(out, {first.stem: (first, second) for first, second in pairs})
     _write_rectified(rectifier, pairs, out)
     print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
     return 0

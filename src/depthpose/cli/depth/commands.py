@@ -86,7 +86,8 @@ def _predict_on_ray(
     if networks.matcher not in (None, "sgbm"):
         raise InputError(
             f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
-            "file of both by 'depthpose weights pack G --matcher S --out W'"
+            "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence L "
+            "--out W'"
         )
     spec = engine.NetSpec(
         weights=Weights.read(networks.weights),

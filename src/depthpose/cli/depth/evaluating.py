@@ -67,7 +67,8 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
     process = find_rank()
     mine = [usable[k] for k in process.share(len(usable))]
     readers = {dataset.frames[i].name: partial(_read, dataset, i, method.with_right) for i in mine}
-    sources = {dataset.frames[i].name: dataset.frames[i].left for i in usable}
+    chosen = [dataset.frames[i] for i in usable]
+    sources = {f.name: f.seen_files(with_right=method.with_right) for f in chosen}
     home = folder / method.name
     written = predict(method.net, readers, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(readers), disable=None, unit=" frames"):
@@ -185,6 +186,9 @@ def write_details(measured: Evaluation, out: Path) -> None:
     write_table(out, columns(measured.per_frame), name="frames")
     if measured.deciles:
         write_table(out, columns(measured.deciles), name="confidence")
+        return
+    for ending in ("csv", "json", "md"):  # of another method that was measured here before
+        (out / f"confidence.{ending}").unlink(missing_ok=True)
 
 
 def detail_sections(measured: Evaluation) -> list[Section]:

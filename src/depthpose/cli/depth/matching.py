@@ -14,7 +14,7 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.run import claim_folder, claim_names, find_rank
-from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
+from depthpose.depth.estimator import FakestereoNet, refuse_unrectified, usable_right
 from depthpose.depth.predictions import (
     ENDINGS,
     has_cloud,
@@ -51,7 +51,7 @@ class Pairs:
 
 
 def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
-    """List the images of both sides, which are paired in the order of their names.
+    """List the images of both sides, which are paired by their names, else in order.
 
     Raises:
         InputError: a side has none, the sides cannot be paired, or two results had one name.
@@ -61,6 +61,12 @@ def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
         raise InputError(
             f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
             "needs one right image. Remove the ones without a partner."
+        )
+    names, others = ({path.stem for path in side} for side in (lefts, rights))
+    if names & others and names != others:
+        raise InputError(
+            f"{left} and {right}: {min(names ^ others)!r} is on one side alone, and others have a "
+            "partner of their name; remove it, or add its partner"
         )
     stems = [path.stem for path in lefts]
     if len(set(stems)) != len(stems):
@@ -76,6 +82,7 @@ def refuse_unusable_first(pairs: Pairs) -> None:
 
 def refuse_unrectified_pair(pair: StereoInput) -> None:
     """Refuse a pair that is swapped or not rectified, and name the option that takes it."""
+    usable_right(pair)
     try:
         refuse_unrectified(pair)
     except InputError as error:
@@ -102,7 +109,8 @@ def rig_facts(rig: StereoRig) -> dict[str, object]:
 def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
     claim_folder(out, {**method.settings, "camera": rig_facts(pairs.rig)}, [PAGE])
-    claim_names(out, {path.stem: path for path in pairs.left}, [f".{end}" for end in ENDINGS])
+    both = {left.stem: (left, right) for left, right in zip(pairs.left, pairs.right, strict=True)}
+    claim_names(out, both, [f".{end}" for end in ENDINGS])
     failures: list[str] = []
     mine = find_rank().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):

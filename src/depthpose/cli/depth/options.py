@@ -79,7 +79,7 @@ class PairNetworks:
     """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
     matcher, by name or file. Left out: that of the weights."""
     cloud: bool = False
-    """write a coloured point cloud, NAME.cloud.ply."""
+    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     check: bool = True
     """look at the first pair for swapped or unrectified images before any work."""
 
@@ -144,7 +144,7 @@ class PredictOutput:
     """images of one size that go through the networks together: for a GPU; a processor is busy
     with one."""
     cloud: bool = False
-    """write a coloured point cloud, NAME.cloud.ply."""
+    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     view: str | None = None
     """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 

@@ -2,13 +2,14 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 from tqdm import tqdm
 
@@ -77,6 +78,7 @@ def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
     read = None if camera is None else read_camera(camera, _size_of(first))
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
+        read = Camera(width=read.width, height=read.height, K=read.K)
     return Lens(camera=read, focal_px=focal_px)
 
 
@@ -123,7 +125,7 @@ def predict_all(
         for path in filter(_is_video, mine):
             done += predictor.predict_video(path)
     failures = list(predictor.failures.values())
-    if failures and len(sources) == 1:
+    if failures and not done and len(sources) == 1:
         raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
@@ -171,8 +173,10 @@ class Predictor:
         """Predict a video's frames, and make a video of them; give how many are done."""
         try:
             video = read_video(source)
-            names = self._predict(iter(video), video.frames or None, source.name)
-            colors = _colors(names, self.out, self.look)
+            frames: list[str] = []
+            seen = _noted(iter(video), frames)
+            names = self._predict(seen, video.frames or None, source.name)
+            colors = _colors(frames, set(names), self.out, self.look)
             write_video(self.out / f"{source.stem}{_VIDEO}", colors, video.fps)
         except InputError as error:
             self.failures[source.name] = error
@@ -256,6 +260,19 @@ def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tenso
                 return
 
 
-def _colors(names: list[str], out: Path, look: PredictOutput) -> Iterator[Tensor]:
-    for name in names:
-        yield draw_depth(read_map(out / f"{name}.depth_m.npy"), *look.color_range)
+def _noted(frames: Iterator[tuple[str, Tensor]], names: list[str]) -> Iterator[tuple[str, Tensor]]:
+    for name, image in frames:
+        names.append(name)
+        yield name, image
+
+
+def _colors(
+    frames: list[str], done: Collection[str], out: Path, look: PredictOutput
+) -> Iterator[Tensor]:
+    """Draw the depth of a video's frames, in grey where there is none, so that none is missing."""
+    if not done:
+        return
+    unknown = torch.full_like(read_map(out / f"{min(done)}.depth_m.npy"), torch.nan)
+    for name in frames:
+        depth_m = read_map(out / f"{name}.depth_m.npy") if name in done else unknown
+        yield draw_depth(depth_m, *look.color_range)

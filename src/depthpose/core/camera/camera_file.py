@@ -22,7 +22,7 @@ from depthpose.core.camera.facts import (
     camera_keys,
 )
 from depthpose.core.camera.pinhole import Camera, StereoRig, check_intrinsics
-from depthpose.core.camera.storage import named, read_storage
+from depthpose.core.camera.storage import Names, named, read_storage, scalar
 from depthpose.core.camera.stored_camera import facts_from_names, read_folder
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_text, write_json
@@ -109,11 +109,28 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     facts = facts_from_text(path, text)
     if facts is None:
         names = read_storage(path, text)
-        facts = None if names is None else facts_from_names(names)
+        facts = None if names is None else _with_own_keys(facts_from_names(names), names)
     if facts is None:
         shown = " ".join(text[:200].split())[:40]
         raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
     return facts
+
+
+def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | None:
+    """Take what files of ROS and OpenCV lack from the keys of our JSON, where they were added."""
+    if facts is None:
+        return None
+    known = {"baseline_m": facts.baseline_m, "depth_unit_m": facts.depth_unit_m}
+    added: dict[str, float] = {}
+    for key in ("baseline_m", "cx_right_minus_left_px", "depth_unit_m"):
+        value = names.get(key.replace("_", ""))
+        if value is None or known.get(key) is not None:
+            continue
+        number = scalar(names, key.replace("_", ""))
+        if number is None:
+            raise InputError(f"{key} is {value!r}; write a number")
+        added[key] = number
+    return replace(facts, **added)
 
 
 def _storage_facts(content: object) -> CameraFacts | None:
@@ -128,7 +145,7 @@ AnyCamera = (
     str | Path | Camera | Mapping[str, Any] | Sequence[Sequence[float]] | np.ndarray | Tensor
 )
 """A camera, its file, what our JSON or BOP's holds as a dict, or its 3x3 matrix K alone."""
-AnyLens = AnyCamera | float
+AnyLens = AnyCamera | float | np.number[Any]
 """The same, or the focal length alone [px]: the principal point is then the image's centre."""
 
 
@@ -149,6 +166,8 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         return read_camera(Path(camera), size)
     if isinstance(camera, int | float):
         return centred_camera(size, camera)
+    if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
+        return centred_camera(size, float(camera))
     facts = _from_mapping(camera, size) if isinstance(camera, Mapping) else _from_matrix(camera)
     return camera_from_facts(facts, size)
 

@@ -63,6 +63,17 @@ class Frame:
     disparity_noc: Path | None = None
     sky: Path | None = None
 
+    def seen_files(self, *, with_right: bool = True) -> list[Path]:
+        """List what an estimate depends on: left image, right image, files of the calibration."""
+        files = [self.left]
+        if with_right and self.right is not None:
+            files.append(self.right)
+        if self.calibration is not None and self.calibration.is_dir():
+            files += sorted(self.calibration.glob("calib_*.txt"))
+        elif self.calibration is not None:
+            files.append(self.calibration)
+        return files
+
 
 def frame_input(frame: Frame) -> StereoInput:
     """Read images and calibration of a frame.

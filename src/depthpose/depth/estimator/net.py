@@ -21,7 +21,13 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import depth_from_disparity, focal_size, resize_image
+from depthpose.depth.disparity import (
+    depth_from_disparity,
+    focal_size,
+    infinity_shift_px,
+    moved_left,
+    resize_image,
+)
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
@@ -86,6 +92,11 @@ class FakestereoNet:
             raise InputError(
                 "matcher is None, and without one only a synthesiser whose answer is 'own' gives "
                 "depth. Give a matcher: SGBMMatcher(), or that of weights."
+            )
+        if matcher is not None and not callable(getattr(matcher, "match", None)):
+            raise InputError(
+                f"matcher is a {type(matcher).__name__}, which has no method 'match'; make a "
+                "matcher of a function by CallableMatcher(function)"
             )
         self.matcher = matcher
         self.synthesiser = synthesiser
@@ -183,8 +194,8 @@ class FakestereoNet:
                 ``image[..., ::-1]``).
             camera: camera or rig, its file of any format that is read, a dict of what such a file
                 holds, or the 3x3 matrix K. One image needs its focal length, for the image is
-                brought to the rig that the generator imitates; a baseline is ignored. A pair
-                without camera gives disparity only.
+                brought to the rig that the generator imitates; of a rig, its disparity is that of
+                the baseline. A pair without camera gives disparity only.
             focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
             name: what to call the input in errors; the file's name by default.
@@ -211,11 +222,15 @@ class FakestereoNet:
             raise InputError(
                 f"{pair.name}: there is a right image, and these weights answer one image alone: "
                 "a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; 'depthpose "
-                "weights pack G --matcher S --out W' makes one file of both."
+                "weights pack G --matcher S --trained-on DATA --licence L --out W' makes one file "
+                "of both."
             )
         if with_check:
             refuse_unrectified(pair)
-        match = self._match_many(pair.left[None], right[None], pair.camera)[0]
+        shift_px = infinity_shift_px(pair.camera)
+        moved = moved_left(right, shift_px)
+        match = self._match_many(pair.left[None], moved[None], pair.camera)[0]
+        match = replace(match, disparity_px=match.disparity_px - shift_px)
         depth_m = None
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)

@@ -148,5 +148,6 @@ def choose_matcher(
         f"weights is {None if weights is None else str(weights)!r} and matcher is "
         f"{None if matcher is None else str(matcher)!r}: there is no matcher in that. Give "
         "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and a "
-        "matcher become one file by 'depthpose weights pack G --matcher S --out W'."
+        "matcher become one file by 'depthpose weights pack G --matcher S --trained-on DATA "
+        "--licence L --out W'."
     )
