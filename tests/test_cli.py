@@ -309,6 +309,26 @@ def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
     assert said in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("pose predict --cloud . --out", "--out"),
+        ("depth predict . --focal-px 9 --out=", "--out"),
+        ("pose predict --out out --cloud", "--cloud"),
+        ("pose train --out out --held-out", "--held-out"),
+    ],
+)
+def test_an_option_without_a_path_is_not_the_current_folder(
+    words: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    given = words.split() if words.endswith("=") else [*words.split(), ""]
+    assert main(given) == 2
+    assert f"{option} is empty; name a file or folder" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
     refuse_missing({"images": ["left/*.png", "s3://bucket/left"], "weights": ["hf://me/mine"]})
     refuse_missing({"weights": ("sgbm:default", "open3d"), "start": "nothing", "bop": None})

@@ -168,6 +168,14 @@ def test_registration_is_a_row_beside_weights(
         assert float((cloud.points_m - truth.t_m).norm(dim=1).max()) < diameter_m
 
 
+def test_registration_without_training_is_a_word_in_place_of_weights(
+    synthetic: BopDataset, tmp_path: Path
+) -> None:
+    words = ["--bop", str(synthetic.folder), "--weights", "register", "--objects", "7", "--no-vsd"]
+    assert main(["pose", "evaluate", *words, "--out", str(tmp_path / "out")]) == 0
+    assert {row["method"] for row in rows_of(tmp_path / "out")} == {"register"}
+
+
 def test_registration_wants_a_data_set_and_open3d(
     synthetic: BopDataset,
     tmp_path: Path,
@@ -195,7 +203,10 @@ def test_what_cannot_be_measured_is_refused(
         (["--weights", str(few)], "object 10 (bottle) is none of those the weights know"),
         (["--weights", str(weights), "--masks", "predicted"], "came without predicted masks"),
         (["--weights", str(weights), "--masks", str(nobody)], "none of the 0 detections is of an"),
-        (["--weights", str(weights), "--objects", "duck"], "no instance of ('duck',)"),
+        (
+            ["--weights", str(weights), "--objects", "duck"],
+            "no instance of 'duck'; objects here: 7",
+        ),
     ):
         assert main(["pose", "evaluate", *here, *words]) == 2
         assert said in capsys.readouterr().err

@@ -27,6 +27,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.cli import main
 from depthpose.cli.pose import methods as pose_methods
+from depthpose.cli.pose.inputs import chosen_objects
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,
@@ -43,6 +44,7 @@ from depthpose.pose.datasets import BopDataset
 from depthpose.pose.datasets.results import read_results
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
+from depthpose.pose.types import ObjectModel
 from depthpose.pose.weights import write_pose_weights
 
 TRUTH = pose_at(seed=1)
@@ -64,6 +66,12 @@ def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle
     write_pose_weights(path, oracle.weights)
     monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
     return path
+
+
+def make_method(models: list[ObjectModel]) -> pose_methods.PoseMethod:
+    return pose_methods.PoseMethod(
+        name="m", estimate_many=lambda _: [], takes_clouds=True, models=models, settings={}
+    )
 
 
 def poses_of(out: Path) -> dict[str, dict]:
@@ -354,6 +362,29 @@ def test_a_data_set_gives_the_csv_and_pictures(
     assert any(picture["alt"].startswith("picture; ") for picture in page.pictures)
 
 
+@pytest.mark.parametrize("word", ["bracket", "7"])
+def test_of_a_data_set_one_object_is_posed_by_name_or_number(
+    synthetic: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    truths = [instance.camera_from_model for instance in synthetic.instances]
+    models = [synthetic.objects[number] for number in sorted(synthetic.objects)]
+    path = oracle_weights(tmp_path, monkeypatch, Oracle(tiny_weights(*models), truths))
+    words = ["--bop", str(synthetic.folder), "--weights", str(path)]
+    words = ["pose", "predict", *words, "--out", str(tmp_path / "out")]
+    assert main([*words, "--object", word]) == 0
+    assert {p.place and p.place.object_id for p in read_predictions(tmp_path / "out")} == {7}
+    assert main(words) == 2, "all objects are another run"
+    assert main([*words, "--object", "cup"]) == 2
+    assert "no instance of 'cup'; objects here: 7 (bracket), 10 (bottle)" in capsys.readouterr().err
+
+
+def test_the_name_of_the_weights_serves_where_the_data_set_has_none(synthetic: BopDataset) -> None:
+    method = make_method([replace(bracket("part"), number=7)])
+    chosen = chosen_objects(synthetic, method, "part")
+    assert {instance.object_id for instance in chosen.instances} == {7}
+
+
 def test_two_processes_share_the_work(
     synthetic: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -386,6 +417,8 @@ def test_two_processes_share_the_work(
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera beside it"),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
         (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),
+        (["--cloud", ".", "--mask", ".", "--camera", "."], "leave --mask and --camera out"),
+        (["--bop", ".", "--mask", ".", "--unit", "m"], "--mask and --unit beside --bop: a data"),
     ],
 )
 def test_what_cannot_be_predicted_is_refused(

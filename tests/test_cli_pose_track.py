@@ -1,6 +1,7 @@
 """``pose track`` from the words to the files, with an oracle in place of the network."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,11 +12,14 @@ from tests.pose.test_track import moving
 
 from depthpose.cli import main
 from depthpose.cli.pose import methods as pose_methods
+from depthpose.cli.pose.inputs import cloud_jobs
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose.datasets.results import read_results
+from depthpose.pose.estimator import track as tracking_module
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
+from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import write_pose_weights
 
 POSES = moving(4)
@@ -59,11 +63,54 @@ def test_a_folder_of_depth_images_is_followed(
     assert "tracked" in read_page(tmp_path / "out/report.html").texts["td"]
 
 
-def test_the_objects_of_a_scene_are_followed(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_interrupted_sequence_keeps_its_poses_in_the_order_of_the_numbers(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for k, pose in enumerate(POSES, start=8):
+        seen, _ = view_of(bracket(), pose)
+        write_depth_png(tmp_path / f"depth/{k}.png", seen.float().nan_to_num(1.2), 0.001)
+    (tmp_path / "depth/9.png").write_bytes(b"no picture")
+    write_camera(tmp_path / "c.json", Camera(width=320, height=240, K=K, depth_unit_m=0.001))
+    words = ["--depth", str(tmp_path / "depth"), "--camera", str(tmp_path / "c.json")]
+    words += ["--object", "bracket", "--weights", str(weights), "--out", str(tmp_path / "out")]
+
+    def names() -> list[str]:
+        return [p.estimate.name for p in read_predictions(tmp_path / "out")]
+
+    with monkeypatch.context() as patch:
+        interrupt_after(2, patch)
+        assert main(["pose", "track", *words]) == 130
+    assert names() == ["8", "9", "10"]
+    assert main(["pose", "track", *words]) == 1
+    assert names() == ["8", "9", "10", "11"]
+    interrupt_after(1, monkeypatch)
+    assert main(["pose", "track", *words]) == 130
+    assert names() == ["8", "9", "10", "11"], "what an earlier run found stays"
+
+
+def interrupt_after(count: int, patch: pytest.MonkeyPatch) -> None:
+    """Interrupt the work in the frame after so many."""
+    real, done = tracking_module._next, iter(range(count))
+
+    def until(*given: Any) -> PoseEstimate:  # noqa: ANN401
+        if next(done, None) is None:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    patch.setattr(tracking_module, "_next", until)
+
+
+def test_clouds_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for k in (1, 10, 2):
+        (tmp_path / f"{k}.ply").touch()
+    jobs = cloud_jobs(tmp_path, "m", "bracket", tmp_path / "out")
+    assert [job.name for job in jobs] == ["1", "2", "10"]
+
+
+@pytest.mark.parametrize("word", ["bracket", "7"])
+def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word: str) -> None:
     synthetic = make_dataset(tmp_path / "made", frames=2)
-    words = ["--bop", str(synthetic.folder), "--object", "bracket", "--weights", str(weights)]
+    words = ["--bop", str(synthetic.folder), "--object", word, "--weights", str(weights)]
     assert main(["pose", "track", *words, "--out", str(tmp_path / "out")]) == 0
     found = read_predictions(tmp_path / "out")
     assert [p.place for p in found] == [(1, 0, 7), (1, 1, 7)]
@@ -78,6 +125,8 @@ def test_the_objects_of_a_scene_are_followed(
         ([], "give one of --depth with --camera, --cloud and --bop"),
         (["--depth", ".", "--cloud", "."], "give one of --depth with --camera"),
         (["--depth", "."], "--depth needs --camera beside it"),
+        (["--bop", ".", "--camera", ".", "--unit", "m"], "leave --camera and --unit out"),
+        (["--cloud", ".", "--camera", "."], "--camera beside --cloud: a cloud is of"),
     ],
 )
 def test_wrong_words_are_refused(

@@ -69,6 +69,7 @@ def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
         ([own, "--out", str(own)], "is there already; delete it, or give another name"),
         ([own, "--out", str(tmp_path / "bold")], "ending in .safetensors"),
         ([own, "--out", other, "--number", "0"], "there is nothing to choose by; take 600"),
+        ([own, "--out", other, "--number", "4"], "take 600 (a training may take 0: no refusal)"),
         ([blind, "--out", other], "answered not one synthetic view"),
     ):
         assert main(["pose", "calibrate", *map(str, words), "--config", str(config)]) == 2

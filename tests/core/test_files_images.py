@@ -139,6 +139,16 @@ def test_listing_a_file_a_folder_and_a_pattern(
     assert list_images("sub/*") == [Path("sub/d.png")]
 
 
+def test_numbers_in_names_are_in_the_order_of_their_values(tmp_path: Path) -> None:
+    names = ["1.png", "2.png", "02.png", "10.png", "a1b9.png", "a1b10.png", "a.png"]
+    for name in (*names, "sub9/1.png", "sub10/0.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    listed = [p.name for p in list_images(tmp_path)]
+    assert listed == ["1.png", "02.png", "2.png", "10.png", "a.png", "a1b9.png", "a1b10.png"]
+    assert [p.name for p in list_images(tmp_path / "sub*" / "*.png")] == ["1.png", "0.png"]
+
+
 @pytest.mark.parametrize("wanted", ["", "nothing", "*.bmp", "empty"])
 def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> None:
     (tmp_path / "empty").mkdir()

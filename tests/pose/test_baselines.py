@@ -291,8 +291,8 @@ def test_registration_finds_a_seen_pose_and_refuses_two_points() -> None:
         (lambda: DepthImageConfig(margin=0.5), "margin is 0.5"),
         (lambda: PointNetConfig(keypoints=0), "keypoints 0"),
         (lambda: PointNetConfig(unit_m=0.0), "unit_m is 0.0"),
-        (lambda: FpfhConfig(voxel_diameters=0.0), "all are positive"),
-        (lambda: FpfhConfig(iterations=0), "iterations is 0"),
+        (lambda: FpfhConfig(voxel_diameters=0.0), "voxel_diameters is 0.0"),
+        (lambda: FpfhConfig(iterations=0), "iterations 0; take"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(config: Any, said: str) -> None:  # noqa: ANN401

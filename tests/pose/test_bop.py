@@ -123,7 +123,8 @@ def test_objects_are_chosen_by_number_or_name(synthetic: Path) -> None:
     data = open_bop(synthetic)
     assert {i.object_id for i in data.of_objects(2).instances} == {2}
     assert {i.object_id for i in data.of_objects("block 1").instances} == {1}
-    with pytest.raises(InputError, match=r"objects here: \[1, 2\]"):
+    assert {i.object_id for i in data.of_objects("2").instances} == {2}
+    with pytest.raises(InputError, match=r"no instance of 'cat'; objects here: 1 \(block 1\), 2 "):
         data.of_objects("cat")
 
 
@@ -163,6 +164,8 @@ def test_the_check_names_what_is_wrong(synthetic: Path) -> None:
     mask.write_bytes(whole)
     change(synthetic / "models/models_info.json", lambda c: c["1"].update(diameter=70.0))
     assert "is 82.5 mm across, but models_info says 70.0 mm" in said()
+    change(synthetic / "models/models_info.json", lambda c: c["2"].update(name="block 1"))
+    assert "mismatch: calls objects 1 and 2 'block 1'; rename all but one" in said()
     (synthetic / "models/obj_000002.ply").write_bytes(
         b"version https://git-lfs.github.com/spec/v1\n"
     )
@@ -178,6 +181,8 @@ def test_a_model_in_metres_is_reported(synthetic: Path) -> None:
     mesh.export(synthetic / "models/obj_000001.ply")
     problems = check_bop(synthetic).problems
     assert any("is it in metres? Then say unit m" in p.message for p in problems)
+    with pytest.raises(InputError, match="of BOP, whose models are in mm, multiply it by 1000"):
+        read_bop_models(synthetic, [1])
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,14 @@ from depthpose.core.rigid import turn_axis_to
 from depthpose.pose.cloud import (
     cloud_from_depth,
     is_flying,
+    is_reading,
+    object_points,
     refusal_of,
     sample_points,
     voxelise,
 )
 from depthpose.pose.config import CloudConfig
+from depthpose.pose.types import CloudInput
 
 K = torch.tensor([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]]).double()
 
@@ -88,6 +91,25 @@ def test_voxels_of_nothing_and_of_millimetres_are_refused() -> None:
         voxelise(torch.empty(0, 3), CloudConfig())
     with pytest.raises(InputError, match="are its points in mm"):
         voxelise(torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]), plain(0.001))
+
+
+def test_voxels_are_those_of_the_network_whatever_the_default_of_torch_is() -> None:
+    points = torch.rand(50, 3)
+    want = voxelise(points, CloudConfig())
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = voxelise(points, CloudConfig())
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.features.dtype == want.features.dtype == torch.float32
+    assert torch.equal(found.coordinates, want.coordinates)
+
+
+def test_a_point_in_the_camera_is_no_reading() -> None:
+    points = torch.tensor([[0, 0, 0], [0, 0, 1], [torch.nan, 0, 1], [0, 0.1, 0], [0, 0, torch.inf]])
+    assert is_reading(points).tolist() == [False, True, False, True, False]
+    given = CloudInput(name="a", points_m=points, object="b")
+    assert torch.equal(object_points(given, 1.0), points[[1, 3]])
 
 
 def test_samples_are_a_subset_in_order_and_reproducible() -> None:

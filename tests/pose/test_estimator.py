@@ -30,7 +30,12 @@ from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
-from depthpose.pose.mesh import make_model, propose_symmetries, symmetries_from_proposals
+from depthpose.pose.mesh import (
+    make_model,
+    propose_symmetries,
+    sample_surface,
+    symmetries_from_proposals,
+)
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
@@ -407,6 +412,9 @@ def plane() -> torch.Tensor:
         ("metres for mm", "unusable input", "times larger than the cloud: is it in mm?"),
         ("scene", "unusable input", "times larger than the model: is this the right object"),
         ("backward", "unusable input", "100% of the points lie behind the camera"),
+        ("model's frame", "unusable input", "the cloud lies about the origin"),
+        ("centred", "unusable input", "the cloud lies about the origin"),
+        ("no return", "too few points", "is (0, 0, 0), no reading, in every point"),
     ],
 )
 def test_bad_clouds_are_refused_with_a_reason(
@@ -424,6 +432,9 @@ def test_bad_clouds_are_refused_with_a_reason(
         "metres for mm": 0.001 * cloud,
         "scene": (cloud - cloud.mean(0)) * 4.5 + torch.tensor([0.0, 0, 2]),
         "backward": -cloud,
+        "model's frame": sample_surface(part, 2000)[0],
+        "centred": sample_surface(part, 2000)[0] - sample_surface(part, 2000)[0].mean(0),
+        "no return": 0 * cloud,
     }
     found = Oracle(tiny_weights(part), [pose_at()]).estimate(cloud=clouds[name])
     assert found.status == status
@@ -467,6 +478,13 @@ def test_some_nan_and_flying_pixels_do_no_harm(part: ObjectModel) -> None:
     cloud[::10] = torch.nan
     cloud[5::10, 2] += 1.5
     assert_close(Oracle(tiny_weights(part), [truth]).estimate(cloud=cloud), truth)
+
+
+def test_zeros_of_a_driver_are_no_points(part: ObjectModel) -> None:
+    truth = pose_at()
+    cloud = cloud_of(part, truth)
+    organised = torch.cat([cloud, cloud.new_zeros(3 * len(cloud), 3)])
+    assert_close(Oracle(tiny_weights(part), [truth]).estimate(cloud=organised), truth)
 
 
 def test_a_mesh_with_holes_and_bad_faces_serves_as_well(part: ObjectModel) -> None:

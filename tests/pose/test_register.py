@@ -103,8 +103,10 @@ def test_cad_files_are_read_and_their_symmetries_found(tmp_path: Path) -> None:
 def test_models_that_cannot_be_looked_for_are_named() -> None:
     with pytest.raises(InputError, match=r"none is given; name one: STL"):
         Registration([])
-    with pytest.raises(InputError, match=r"two models are called 'connector'.*rename one"):
-        Registration([part(), part()])
+    with pytest.raises(
+        InputError, match=r"two models are called 'connector' \(numbers 1 and 2: .*rename one"
+    ):
+        Registration([replace(part(), number=number) for number in (1, 2)])
     corners = make_model(part().vertices_m[:60], torch.zeros(0, 3).long(), name="dots")
     with pytest.raises(InputError, match=r"dots: 60 points without faces.*triangles, such as STL"):
         Registration([corners])

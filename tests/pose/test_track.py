@@ -176,6 +176,24 @@ def test_frames_are_taken_as_they_come() -> None:
     assert asked == [0]
 
 
+def test_the_first_pose_may_be_a_matrix() -> None:
+    poses = moving(2)
+    first = poses[0].matrix()
+    frames = [frame(pose) for pose in poses]
+    given = (first, first.numpy(), first.float(), poses[0])
+    found = [list(oracle(poses).track(frames, K, first=one))[1] for one in given]
+    assert {one.tracking for one in found} == {"tracked"}
+    assert max(error_of(one, poses[1]) for one in found) < 0.004
+    for wrong, said in (
+        (first.T, "first is no rigid transform"),
+        (2 * first, "first is no rigid transform"),
+        (first[:3], r"of shape \(3, 4\); give a Rigid"),
+        ("pose.json", r"first is a str of shape \(0,\); give a Rigid"),
+    ):
+        with pytest.raises(InputError, match=said):
+            oracle(poses).track(frames, K, first=wrong)
+
+
 def test_an_unknown_object_is_an_error() -> None:
     with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
         oracle(moving(1)).track([], CAMERA, "spoon")

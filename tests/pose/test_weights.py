@@ -14,7 +14,12 @@ from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.datasets import write_bop_models
 from depthpose.pose.synthetic import make_part, write_part
 from depthpose.pose.types import ObjectModel, Symmetries
-from depthpose.pose.weights import PoseWeights, read_pose_weights, write_pose_weights
+from depthpose.pose.weights import (
+    PoseWeights,
+    complete_weights,
+    read_pose_weights,
+    write_pose_weights,
+)
 
 
 def assert_same_model(one: ObjectModel, other: ObjectModel) -> None:
@@ -59,7 +64,7 @@ def test_meshes_that_were_kept_back_are_put_in_again(
     write_pose_weights(bare, weights, with_meshes=False)
     kept = [name for name in read_checkpoint(bare).state if name.startswith("models.")]
     assert kept == ["models.0.keypoints_m"]
-    with pytest.raises(InputError, match="depthpose weights complete bare --models FOLDER"):
+    with pytest.raises(InputError, match=f"depthpose weights complete {bare} --models FOLDER"):
         read_pose_weights(bare)
     write_bop_models(tmp_path / "data", weights.models)
     words = ["weights", "complete", str(bare), "--models", str(tmp_path / "data")]
@@ -79,6 +84,33 @@ def test_meshes_that_were_kept_back_are_put_in_again(
     assert "another object, frame or unit" in capsys.readouterr().err
     write_bop_models(tmp_path / "few", [bottle()])
     assert main([*words[:-1], str(tmp_path / "few"), "--out", str(whole)]) == 2
+
+
+def test_coarse_meshes_are_put_in_again_too(tmp_path: Path) -> None:
+    """Keypoints of a mesh of few points lie inside its faces."""
+    weights = tiny_weights(bracket())
+    (model,) = weights.models
+    assert float(torch.cdist(model.keypoints_m, model.vertices_m).amin(1).max()) > 0.01
+    write_pose_weights(tmp_path / "bare.safetensors", weights, with_meshes=False)
+    complete_weights(tmp_path / "bare.safetensors", {7: model}, tmp_path / "whole.safetensors")
+    assert_same_model(read_pose_weights(tmp_path / "whole.safetensors").models[0], model)
+    longer = {"vertices_m": 1.1 * model.vertices_m, "diameter_m": 1.1 * model.diameter_m}
+    for change in (longer, {"vertices_m": model.vertices_m + 0.01}):
+        other = {7: dataclasses.replace(model, **change)}
+        with pytest.raises(InputError, match="another object, frame or unit"):
+            complete_weights(tmp_path / "bare.safetensors", other, tmp_path / "no.safetensors")
+
+
+def test_one_file_completes_no_weights_of_several_objects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare, file = tmp_path / "bare.safetensors", write_part("bracket", tmp_path)
+    write_pose_weights(bare, tiny_weights(bracket(), bottle()), with_meshes=False)
+    words = ["weights", "complete", str(bare), "--models", str(file)]
+    assert main([*words, "--out", str(tmp_path / "whole.safetensors")]) == 2
+    assert f"one file serves weights of one object, and {bare} knows 2; give the folder" in (
+        capsys.readouterr().err
+    )
 
 
 def test_half_precision_halves_the_network_and_keeps_models_exact(tmp_path: Path) -> None:

@@ -231,13 +231,14 @@ def _run(name: str, rest: list[str]) -> int:
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
 
-    from depthpose.cli.help import in_words_of, refuse_missing
+    from depthpose.cli.help import in_words_of, refuse_empty, refuse_missing
 
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:
         refuse_missing(signature(command).bind(*words, **options).arguments)
         return command(*words, **options)
 
+    refuse_empty(rest)
     try:
         return tyro.cli(
             checked,

@@ -3,10 +3,11 @@
 Types become words (``{None}|PATH`` is PATH), and a default that is nothing is not shown.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from difflib import get_close_matches
 from inspect import signature, unwrap
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -34,10 +35,32 @@ PATHS = frozenset({
 """Arguments of commands that name files or folders that are read."""
 WEIGHTS = frozenset({"weights", "pose_weights", "matcher", "generator", "start", "encoder"})
 """Arguments that name weights, by name or file."""
-_WORDS = ("sgbm", "nothing", "open3d")
+_WORDS = ("sgbm", "nothing", "open3d", "register")
 """What they may say in place of weights."""
 _PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
 """Before the name of weights: how they are used."""
+
+
+def refuse_empty(words: Sequence[str]) -> None:
+    """Refuse an option that names a file or folder by nothing, which would be the current folder.
+
+    A script whose variable is unset gives such a word.
+
+    Args:
+        words: what follows the name of a command.
+
+    Raises:
+        InputError: the option that is empty.
+    """
+    for word, after in pairwise([*words, "end"]):
+        option, sign, value = word.partition("=")
+        name = option.removeprefix("--").replace("-", "_")
+        is_path = option.startswith("--") and name in {"out", *PATHS, *WEIGHTS}
+        if is_path and (value if sign else after) == "":
+            raise InputError(
+                f"{option} is empty; name a file or folder (the current folder is '.'), or check "
+                "the variable that should hold it"
+            )
 
 
 def refuse_missing(given: Mapping[str, object]) -> None:

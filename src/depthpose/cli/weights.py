@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -186,18 +186,29 @@ def complete_weights(
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.datasets.models import read_bop_models
-    from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
-    from depthpose.pose.weights import known_numbers
 
     refuse_to_replace(out)
     path = find_weights(weights)
-    numbers = known_numbers(path)
-    is_one = models.is_file() and len(numbers) == 1
-    one = {number: read_model(models, unit, number=number) for number in numbers if is_one}
-    complete(path, one or read_bop_models(models, numbers), out)
+    complete(path, _meshes_of(path, models, unit), out)
     return show_weights(str(out))
+
+
+def _meshes_of(path: Path, models: Path, unit: Literal["m", "mm"]) -> Mapping[int, Any]:
+    """Read the meshes of the objects that weights know, by number."""
+    from depthpose.pose.datasets.models import read_bop_models
+    from depthpose.pose.mesh import read_model
+    from depthpose.pose.weights import known_numbers
+
+    numbers = known_numbers(path)
+    if not models.is_file():
+        return read_bop_models(models, numbers)
+    if len(numbers) != 1:
+        raise InputError(
+            f"--models {models}: one file serves weights of one object, and {path} knows "
+            f"{len(numbers)}; give the folder of the data set that it was trained on"
+        )
+    return {numbers[0]: read_model(models, unit, number=numbers[0])}
 
 
 def push_weights(

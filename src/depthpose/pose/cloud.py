@@ -71,10 +71,10 @@ def cloud_from_depth(
 
 
 def object_points(given: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the finite points of an input, those of a depth image without flying pixels."""
+    """Give the points of an input that are readings, of a depth image without flying pixels."""
     if isinstance(given, ViewInput):
         return cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m).float()
-    return given.points_m[given.points_m.isfinite().all(-1)].float()
+    return given.points_m[is_reading(given.points_m)].float()
 
 
 def _lifted(
@@ -104,6 +104,14 @@ def refuse_other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor
 def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " n"]:
     """Mark points farther than ``limit_m`` from the median: background at the mask's border."""
     return (points_m - points_m.median(0).values).norm(dim=-1) > limit_m
+
+
+def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Mark the points of a cloud that were measured.
+
+    Drivers write NaN, infinity or (0, 0, 0) where there is no return.
+    """
+    return points_m.isfinite().all(-1) & (points_m != 0).any(-1)
 
 
 def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
@@ -187,7 +195,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
     kept, rank = first.scatter_reduce_(0, cell, order, "amin").sort()
     row_of_point = rank.argsort()[cell]
-    features = torch.ones(len(kept), 1).to(kept.device)
+    features = torch.ones(len(kept), 1, dtype=torch.float32, device=kept.device)
     if config.with_shape:
         parts = (_means(places - cells, row_of_point), _planes(points_m, kept, turn))
         features = torch.cat([features, *parts], 1)

@@ -2,8 +2,10 @@
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
@@ -12,6 +14,7 @@ from torch import Tensor
 from depthpose.core.checkpoint import (
     Checkpoint,
     build_network,
+    find_weights,
     half_state,
     read_checkpoint,
     save_checkpoint,
@@ -21,7 +24,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_as
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
-from depthpose.pose.mesh import symmetries_from_bop, symmetries_to_bop
+from depthpose.pose.mesh import (
+    gap_to_surface_m,
+    refuse_one_name,
+    symmetries_from_bop,
+    symmetries_to_bop,
+)
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel
 
@@ -36,7 +44,9 @@ _NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
 _OFF = 0.02
-"""Keypoints were vertices; so many diameters off the mesh, it is another one."""
+"""Keypoints lie on the surface; so many diameters off the mesh, it is another one."""
+_OTHER_SIZE = 0.05
+"""So much longer or shorter, a mesh is another one; declared diameters are off by less."""
 _SURFACE = ("vertices_m", "faces", "normals")
 _TENSORS = (*_SURFACE, "keypoints_m")
 
@@ -78,12 +88,7 @@ class PoseWeights:
                     f"the network points at {wanted} keypoints, but object {model.name!r} has "
                     f"{len(model.keypoints_m)}. Make the model with as many."
                 )
-        names = [model.name for model in self.models]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError(
-                f"two models are called {twice[0]!r}; an object is found by its name. Rename one."
-            )
+        refuse_one_name(self.models)
 
 
 def write_pose_weights(
@@ -138,15 +143,22 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"among {sorted(meshes)}. Give the data set that it was trained on."
             )
         model = meshes[number]
-        off_m = float(torch.cdist(keypoints_m, model.vertices_m).amin(1).max())
-        if off_m > _OFF * record["diameter_m"]:
-            raise InputError(
-                f"{path}: a keypoint of object {number} ({record['name']}) lies {off_m:.3g} m off "
-                f"the model {model.name}: another object, frame or unit. Give the models that it "
-                "was trained on."
-            )
+        _refuse_another(model, keypoints_m, record, path)
         state |= {f"models.{k}.{name}": _small(getattr(model, name)) for name in _SURFACE}
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
+
+
+def _refuse_another(
+    model: ObjectModel, keypoints_m: Tensor, record: Mapping[str, Any], path: Path
+) -> None:
+    """Refuse a mesh of another size, or that the keypoints do not lie on."""
+    off_m, own_m = gap_to_surface_m(keypoints_m, model), record["diameter_m"]
+    if off_m > _OFF * own_m or abs(model.diameter_m / own_m - 1) > _OTHER_SIZE:
+        raise InputError(
+            f"{path}: a keypoint of object {record['number']} ({record['name']}, {own_m:.3g} m "
+            f"long) lies {off_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
+            "another object, frame or unit. Give the models that it was trained on."
+        )
 
 
 def known_numbers(path: Path) -> tuple[int, ...]:
@@ -168,8 +180,8 @@ def read_pose_weights(path: Path) -> PoseWeights:
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         raise InputError(
             f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
-            f"in once: depthpose weights complete {path.stem} --models FOLDER --out "
-            f"{path.stem}-complete.safetensors, with the data set's folder."
+            f"in once: depthpose weights complete {_word_for(path)} --models FOLDER --out "
+            f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
         )
     parts = {name: _part(checkpoint, name, source) for name in ("cloud", "refusal")}
     records = checkpoint.config.get("models")
@@ -185,6 +197,14 @@ def read_pose_weights(path: Path) -> PoseWeights:
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
         facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
     )
+
+
+def _word_for(path: Path) -> str:
+    """Give the word that names weights on the command line: a name where it leads there."""
+    with suppress(InputError):
+        if find_weights(path.stem) == path:
+            return path.stem
+    return quote(str(path))
 
 
 def read_pose_network(path: Path) -> AnyNetwork:

@@ -61,7 +61,8 @@ def predict(
         return _predict_on_ray(inputs, dataset, source, estimates.batch, out, engine)
     method = source.build()
     if dataset.bop is not None:
-        return _predict_bop(method, dataset, Path(out), estimates.batch, config.device, view)
+        run = (estimates.batch, config.device, view)
+        return _predict_bop(method, dataset, inputs.object, Path(out), *run)
     if inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
@@ -175,6 +176,7 @@ def evaluate(
 def _predict_bop(
     method: Any,  # noqa: ANN401  a type of this would load torch for --help
     given: DataSetOptions,
+    object: str | None,
     out: Path,
     batch: int,
     device: str,
@@ -187,12 +189,12 @@ def _predict_bop(
 
     assert given.bop is not None
     split = given.split
-    dataset = open_bop(given.bop, split)
-    dataset = dataset.of_objects(*inputs.known_objects(dataset, method))
+    dataset = inputs.chosen_objects(open_bop(given.bop, split), method, object)
     (masks,) = find_masks([given.masks], dataset, out, device)
     settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = inputs.bop_jobs(dataset, masks, method)
-    settings = {**method.settings, **settings, **masks.settings}
+    chosen = inputs.object_facts(dataset, object)
+    settings = {**method.settings, **settings, **chosen, **masks.settings}
     predicting.claim_bop(out, settings, dataset)
     predictions = predicting.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:
@@ -213,7 +215,7 @@ def _predict_on_ray(
     from depthpose.cli.pose import engine
 
     if dataset.bop is not None:
-        asked = (dataset.bop, dataset.split, dataset.masks)
+        asked = (dataset.bop, dataset.split, dataset.masks, given.object)
         return engine.predict_bop(asked, source.packed(), batch, out, on)
     if given.depth is not None and given.camera is None:
         raise InputError("--depth needs --camera beside it")

@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.engine import EngineOptions, Inputs, run, say
-from depthpose.cli.pose.inputs import bop_jobs, input_job, known_objects, object_named
+from depthpose.cli.pose.inputs import (
+    bop_jobs,
+    chosen_objects,
+    input_job,
+    object_facts,
+    object_named,
+)
 from depthpose.cli.pose.masks import find_masks
 from depthpose.cli.pose.methods import MethodSource, PoseMethod
 from depthpose.cli.pose.page import write_pose_page
@@ -181,7 +187,7 @@ class BopWork:
 
 
 def predict_bop(
-    given: tuple[Path, str, str],
+    given: tuple[Path, str, str, str | None],
     source: MethodSource,
     batch: int,
     out: str,
@@ -190,7 +196,7 @@ def predict_bop(
     """Pose the objects of a data set by an engine.
 
     Args:
-        given: folder, split and masks of the data set.
+        given: folder, split and masks of the data set, and which of its objects; None: all.
         source: of the estimator, packed.
         batch: inputs in one call of the network.
         out: folder of the results.
@@ -199,20 +205,22 @@ def predict_bop(
     Raises:
         InputError: ``out`` is in a store, or the masks are yet to be found by a segmentation.
     """
-    folder, split, masks = given
+    folder, split, masks, object = given
     _refuse_what_is_not_shared(masks, out)
     method = source.build("cpu")
+    chosen = chosen_objects(open_bop(folder, split), method, object)
     work = BopWork(
         source=source,
         folder=str(folder.resolve()),
         split=split,
         masks=masks if masks in ("truth", "predicted") else str(Path(masks).resolve()),
-        objects=tuple(known_objects(open_bop(folder, split), method)),
+        objects=tuple(sorted({instance.object_id for instance in chosen.instances})),
         batch=batch,
     )
     dataset, shown = work.open()
     jobs = bop_jobs(dataset, shown, method)
     facts = {"dataset": folder.resolve().name, "split": split, "masks": shown.name}
+    facts |= object_facts(chosen, object)
     settings = {**method.settings, "estimate": config_to_dict(source.config), **facts}
     settings = {**settings, **shown.settings, "shards": options.shards}
     claim_bop(Path(out), settings, dataset)

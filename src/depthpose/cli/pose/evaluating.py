@@ -47,7 +47,7 @@ def open_instances(
     if targets is not None:
         dataset = of_targets(dataset, read_targets(targets))
     if objects:
-        dataset = dataset.of_objects(*(int(o) if o.isdecimal() else o for o in objects))
+        dataset = dataset.of_objects(*objects)
     names = ", ".join(model.name for model in dataset.objects.values())
     print(f"{bop} {split}: {len(dataset)} instances, layout {dataset.layout}; objects: {names}")
     return dataset

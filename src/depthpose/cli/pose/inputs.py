@@ -12,9 +12,10 @@ from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import cloud_suffixes, list_images
+from depthpose.core.files.images import natural_order
 from depthpose.core.run import refuse_among_inputs
 from depthpose.pose.config import Unit
-from depthpose.pose.datasets import BopDataset
+from depthpose.pose.datasets import BopDataset, object_names
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Place
@@ -51,7 +52,8 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     Raises:
         InputError: there is none, two of one name, or the folder is ``out`` too.
     """
-    files = sorted(p for p in cloud.iterdir() if _is_cloud(p)) if cloud.is_dir() else [cloud]
+    files = [p for p in cloud.iterdir() if _is_cloud(p)] if cloud.is_dir() else [cloud]
+    files.sort(key=natural_order)
     if not files:
         known = ", ".join(cloud_suffixes())
         raise InputError(f"{cloud}: no {known} file there; give a cloud, or a folder")
@@ -136,6 +138,29 @@ def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
     if left:
         print(f"left out, as the {method.holder} do not know them: objects {left}", file=sys.stderr)
     return known
+
+
+def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) -> BopDataset:
+    """Keep the objects of a data set that the weights know, or the one that is named.
+
+    Args:
+        dataset: what there is.
+        method: what poses it.
+        object: what the data set or the weights call it, or its number.
+
+    Raises:
+        InputError: the weights know none, or there is no instance of the one.
+    """
+    if object is None:
+        return dataset.of_objects(*known_objects(dataset, method))
+    own = {model.name: model.number for model in method.models}
+    is_theirs = object in object_names(dataset.folder).values()
+    return dataset.of_objects(object if is_theirs else own.get(object, object))
+
+
+def object_facts(dataset: BopDataset, object: str | None) -> dict[str, list[int]]:
+    """Give the number of the one object that was chosen, for the record of a run."""
+    return {} if object is None else {"objects": sorted({i.object_id for i in dataset.instances})}
 
 
 def bop_jobs(dataset: BopDataset, masks: Masks, method: PoseMethod) -> list[Job[Any]]:

@@ -1,5 +1,6 @@
 """Options that several pose commands take: each is declared, and described, once."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +27,7 @@ class OneObjectOptions:
     """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
     BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
     object: str | None = None
-    """which of the objects that are known."""
+    """which of the objects that are known; of a data set its name or number, all by default."""
     unit: Unit | None = None
     """unit of clouds (default m), and of depth images whose camera file gives none."""
 
@@ -93,7 +94,7 @@ class RegisterOptions:
 
 
 def refuse_mixture(given: OneObjectOptions, bop: Path | None) -> None:
-    """Refuse none of the three kinds of input, or several.
+    """Refuse none of the three kinds of input, or several, and options of another kind.
 
     Raises:
         InputError: which, and the rule.
@@ -104,3 +105,30 @@ def refuse_mixture(given: OneObjectOptions, bop: Path | None) -> None:
             f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
             "with --mask and --camera, or a data set"
         )
+    beside = {"mask": given.mask, "camera": given.camera}
+    if bop is not None:
+        refuse_beside("--bop", {**beside, "unit": given.unit})
+    elif given.cloud is not None:
+        refuse_beside("--cloud", beside)
+
+
+_WHY = {
+    "--bop": "a data set says its cameras and units itself, and its masks are chosen by --masks",
+    "--cloud": "a cloud is of the object alone, in the camera's frame",
+}
+"""What makes other options meaningless beside an input."""
+
+
+def refuse_beside(option: str, others: Mapping[str, object]) -> None:
+    """Refuse options that would be ignored beside an input.
+
+    Args:
+        option: of the input, a key of ``_WHY``.
+        others: the values of such options by name.
+
+    Raises:
+        InputError: the names of those that are given.
+    """
+    named = " and ".join(f"--{name}" for name, value in others.items() if value is not None)
+    if named:
+        raise InputError(f"{named} beside {option}: {_WHY[option]}; leave {named} out")

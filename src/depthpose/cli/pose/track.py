@@ -4,7 +4,7 @@ from pathlib import Path
 
 from depthpose.cli.help import group
 from depthpose.cli.options import Device
-from depthpose.cli.pose.options import RegisterOptions
+from depthpose.cli.pose.options import RegisterOptions, refuse_beside
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, Unit
 
@@ -26,13 +26,13 @@ class SequenceOptions:
     split: str = "test"
     """of the data set."""
     object: str | None = None
-    """which of the known objects."""
+    """which of the known objects; of a data set its name or number."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
     device: Device = "cpu"
 
     def refuse_unusable(self) -> None:
-        """Refuse none of the three kinds of input, or several, and several processes.
+        """Refuse none of the three kinds of input, or several, options of others, and processes.
 
         Raises:
             InputError: which, and the rule.
@@ -43,6 +43,10 @@ class SequenceOptions:
             raise InputError("give one of --depth with --camera, --cloud and --bop")
         if self.depth is not None and self.camera is None:
             raise InputError("--depth needs --camera beside it")
+        if self.bop is not None:
+            refuse_beside("--bop", {"camera": self.camera, "unit": self.unit})
+        if self.cloud is not None:
+            refuse_beside("--cloud", {"camera": self.camera})
         if find_rank().world > 1:
             raise InputError("a sequence is followed by one process; start one")
 
@@ -64,7 +68,8 @@ def track(
     contradicts the pose, the object is detected again in that frame; where that fails too,
     the frame is lost, and the next is searched. poses.json says of each frame which of the three it
     was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
-    their names, and a rerun begins anew.
+    their names, numbers in them by value (2 before 10). A rerun begins anew; what an interrupted
+    one has found is in poses.json.
 
         depthpose pose track --depth frames --camera cam.json --object mug --out out
         depthpose pose track --bop lm --split test --weights linemod.safetensors --out out

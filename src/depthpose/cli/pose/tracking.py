@@ -1,7 +1,7 @@
 """The work behind ``depthpose pose track``: one object through the frames of a sequence."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,14 @@ from depthpose.cli.pose.page import write_pose_page
 from depthpose.core.files import read_depth_png
 from depthpose.pose.config import Unit
 from depthpose.pose.datasets import BopDataset, Instance, open_bop
-from depthpose.pose.predictions import Job, Prediction, place_of, write_predictions
+from depthpose.pose.predictions import (
+    Job,
+    Prediction,
+    is_started,
+    place_of,
+    read_predictions,
+    write_predictions,
+)
 from depthpose.pose.types import PoseEstimate, ViewInput
 
 
@@ -40,8 +47,7 @@ def track_folder(
         jobs = inputs.frame_jobs(depth, camera, name, unit, out)
         settings |= inputs.camera_facts(camera)
     predicting.claim(out, settings, jobs, cloud or depth or out)
-    predictions = list(_followed(method, jobs, name))
-    write_predictions(out, predictions)
+    predictions = _kept(_followed(method, jobs, name), out)
     shown = _shown(predictions, jobs, method)
     predicting.write_files(predictions, shown, out, method)
     write_pose_page(out, predictions, shown, method)
@@ -51,19 +57,15 @@ def track_folder(
 def track_bop(method: PoseMethod, given: tuple[Path, str, str | None], out: Path) -> int:
     """Follow each known object of each scene, or one; give the exit code."""
     folder, split, object = given
-    dataset = open_bop(folder, split)
-    wanted = inputs.known_objects(dataset, method) if object is None else [object]
-    dataset = dataset.of_objects(*wanted)
+    dataset = inputs.chosen_objects(open_bop(folder, split), method, object)
     names = match_names(dataset, method.models)
     about = {"dataset": dataset.folder.resolve().name, "split": split}
     settings = {**method.settings, **about, "track": sorted(names.values())}
     predicting.claim_bop(out, settings, dataset)
-    predictions: list[Prediction] = []
-    jobs: list[Job[Any]] = []
-    for name, own in _sequences(dataset, names):
-        predictions += _followed(method, own, name)
-        jobs += own
-    write_predictions(out, predictions)
+    sequences = list(_sequences(dataset, names))
+    jobs = [job for _, own in sequences for job in own]
+    coming = (one for name, own in sequences for one in _followed(method, own, name))
+    predictions = _kept(coming, out)
     predicting.write_bop_files(predictions, dataset, out, method)
     write_pose_page(out, predictions, _shown(predictions, jobs, method), method, dataset)
     return _say(predictions, out)
@@ -95,23 +97,45 @@ def _whole_view(instance: Instance, name: str) -> ViewInput:
     )
 
 
+def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
+    """Take predictions as they come; they are written where the work is interrupted, too.
+
+    What an earlier run found of frames that this one did not reach stays in the file.
+    """
+    earlier = read_predictions(out) if is_started(out) else []
+    found: list[Prediction] = []
+    try:
+        for one in coming:
+            found.append(one)  # noqa: PERF402  those before an interruption must be there
+    finally:
+        names = {one.estimate.name for one in found}
+        left = [one for one in earlier if one.estimate.name not in names]
+        if found:
+            write_predictions(out, [*found, *left])
+    return found
+
+
 def _followed(method: PoseMethod, jobs: Sequence[Job[Any]], name: str) -> Iterator[Prediction]:
-    """Follow an object; a frame that cannot be read is skipped."""
-    lost: dict[str, PoseEstimate] = {}
+    """Follow an object, frame by frame; one that cannot be read is skipped."""
+    places = {job.name: job.place for job in jobs}
+    unread: list[PoseEstimate] = []
 
     def readable() -> Iterator[Any]:
         for job in tqdm(jobs, disable=None, unit=" frames"):
             given = job.read()
             if isinstance(given, Unreadable):
-                lost[job.name] = predicting.unread(given)
+                unread.append(predicting.unread(given))
             else:
                 yield given
 
     assert method.track is not None
-    found = {estimate.name: estimate for estimate in method.track(readable(), name)}
-    for job in jobs:
-        estimate = found.get(job.name) or lost[job.name]
-        yield Prediction(estimate=estimate, place=job.place)
+    for found in method.track(readable(), name):
+        # What could not be read was passed on the way to this frame.
+        for estimate in [*unread, found]:
+            yield Prediction(estimate=estimate, place=places[estimate.name])
+        unread.clear()
+    for estimate in unread:
+        yield Prediction(estimate=estimate, place=places[estimate.name])
 
 
 def _shown(

@@ -1,5 +1,6 @@
 """Pictures: 8-bit files to RGB tensors and back, and the listing of them."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -127,7 +128,7 @@ def list_images(path: AnyPath) -> list[Path]:
         path: a file, a folder or a pattern with ``*``, ``?``, ``[...]`` or ``**``.
 
     Returns:
-        Paths in the order of their names; hidden files are left out.
+        Paths in the order of :func:`natural_order`; hidden files are left out.
 
     Raises:
         InputError: nothing was found.
@@ -139,13 +140,20 @@ def list_images(path: AnyPath) -> list[Path]:
         found = list(wanted.iterdir()) if wanted.is_dir() else _glob(wanted)
     except (OSError, ValueError, NotImplementedError) as error:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
-    pictures = sorted(p for p in found if _is_listed(p))
+    pictures = sorted((p for p in found if _is_listed(p)), key=natural_order)
     if not pictures:
         raise InputError(
             f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; "
             "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
         )
     return pictures
+
+
+def natural_order(path: Path) -> tuple[list[list[str | int]], Path]:
+    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10."""
+    pieces = [re.split(r"(\d+)", part) for part in (*path.parent.parts, path.stem)]
+    # Every second piece is a run of digits, so that like is compared with like.
+    return [[int(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
 
 
 @contextmanager

@@ -16,7 +16,12 @@ from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.datasets.dataset import open_bop, read_instance_mask
 from depthpose.pose.datasets.frames import Instance
 from depthpose.pose.datasets.layouts import layout_of
-from depthpose.pose.datasets.models import model_path, models_folder, read_models_info
+from depthpose.pose.datasets.models import (
+    model_path,
+    models_folder,
+    object_name,
+    read_models_info,
+)
 from depthpose.pose.mesh import (
     exact_diameter,
     read_model,
@@ -107,7 +112,18 @@ def _check_models(folder: Path, numbers: set[int]) -> tuple[Models, list[Problem
             found.append(unreadable(path, error))
             continue
         found += _check_diameter(path, models[number], infos.get(number, {}).get("diameter"))
+    found += _check_names(home, {n: object_name(n, infos.get(n, {})) for n in numbers})
     return models, found
+
+
+def _check_names(home: Path, names: dict[int, str]) -> Iterator[Problem]:
+    """Report annotated objects of one name: estimators, which know them by name, refuse them."""
+    for name in sorted(set(names.values())):
+        own = sorted(number for number, one in names.items() if one == name)
+        if len(own) > 1:
+            numbers = " and ".join(map(str, own))
+            message = f"calls objects {numbers} {name!r}; rename all but one in models_info"
+            yield Problem(path=home, kind="mismatch", message=message)
 
 
 def _check_diameter(path: Path, model: ObjectModel, declared_mm: object) -> Iterator[Problem]:

@@ -122,21 +122,22 @@ class BopDataset:
         )
 
     def of_objects(self, *objects: int | str) -> "BopDataset":
-        """Keep the instances of some objects, by number or name.
+        """Keep the instances of some objects, by number or name; digits are a number too.
 
         Raises:
             InputError: none is left.
         """
         infos = read_models_info(models_folder(self.folder))
-        kept = [
-            instance
-            for instance in self.instances
-            if instance.object_id in objects
-            or object_name(instance.object_id, infos.get(instance.object_id, {})) in objects
-        ]
+        there = sorted({instance.object_id for instance in self.instances})
+        names = {number: object_name(number, infos.get(number, {})) for number in there}
+        wanted = {*objects, *(int(o) for o in objects if isinstance(o, str) and o.isdecimal())}
+        kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
         if not kept:
-            known = sorted({instance.object_id for instance in self.instances})
-            raise InputError(f"{self.folder}: no instance of {objects}; objects here: {known}")
+            asked = ", ".join(map(repr, objects))
+            known = ", ".join(f"{number} ({name})" for number, name in names.items())
+            raise InputError(
+                f"{self.folder}: no instance of {asked}; objects here: {known}; name one of them"
+            )
         return replace(self, instances=kept)
 
 

@@ -4,6 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.errors import InputError, nearest_name
@@ -15,6 +16,7 @@ from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
     cloud_input,
+    rigid_input,
     split_instances,
     view_input,
 )
@@ -145,7 +147,7 @@ class PoseEstimator(ABC):
         self,
         depth: AnyArray,
         camera: AnyCamera,
-        objects: Sequence[str] | None = None,
+        objects: Sequence[str] | str | None = None,
         unit: Unit | None = None,
     ) -> list[PoseEstimate]:
         """Find and pose known objects in a depth image without masks, the best answer first.
@@ -156,7 +158,7 @@ class PoseEstimator(ABC):
         Args:
             depth: as for :meth:`estimate`.
             camera: of the depth image.
-            objects: which may be there; None: all that are known.
+            objects: which may be there, or which one; None: all that are known.
             unit: of the depth, where its camera says none.
 
         Returns:
@@ -165,7 +167,8 @@ class PoseEstimator(ABC):
         Raises:
             InputError: as for :meth:`estimate`.
         """
-        names = self.objects if objects is None else [self._object(name) for name in objects]
+        asked = [objects] if isinstance(objects, str) else objects
+        names = self.objects if asked is None else [self._object(name) for name in asked]
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -186,7 +189,7 @@ class PoseEstimator(ABC):
         frames: Iterable[AnyArray],
         camera: AnyCamera | None = None,
         object: str | None = None,
-        first: Rigid | None = None,
+        first: Rigid | AnyArray | None = None,
         unit: Unit | None = None,
     ) -> Iterator[PoseEstimate]:
         """Follow one object through a sequence, each frame from the pose of the one before by ICP.
@@ -202,7 +205,8 @@ class PoseEstimator(ABC):
                 by one, as their estimates are taken.
             camera: of the depth images.
             object: which one; None where one alone is known.
-            first: the pose in the first frame, as far as it is known; None: it is looked for.
+            first: the pose in the first frame, as far as it is known, or its 4x4 matrix in metres;
+                None: it is looked for.
             unit: as for :meth:`estimate`.
 
         Yields:
@@ -212,6 +216,12 @@ class PoseEstimator(ABC):
             InputError: as for :meth:`estimate`.
         """
         which = self._object(object)
+        if isinstance(frames, str | Path):
+            raise InputError(
+                f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
+                "their order, such as list_images of depthpose.core.files gives of a folder"
+            )
+        start = None if first is None else rigid_input(first)
 
         def given(frame: AnyArray, number: int) -> AnyInput:
             name = f"{_NAME}_{number}"
@@ -220,7 +230,7 @@ class PoseEstimator(ABC):
             return view_input(frame, None, camera, which, name, unit)
 
         inputs = (given(frame, number) for number, frame in enumerate(frames))
-        return self.track_in(inputs, which, first)
+        return self.track_in(inputs, which, start)
 
     def track_in(
         self, frames: Iterable[AnyInput], object: str, first: Rigid | None = None
@@ -269,6 +279,9 @@ class PoseEstimator(ABC):
         return self._copies[number]
 
     def _number(self, name: str) -> int:
+        if not isinstance(name, str):
+            known = ", ".join(map(repr, self.objects))
+            raise InputError(f"object {name!r} is no text; give the name of one: {known}")
         if name not in self._numbers:
             nearest = nearest_name(name, self.objects)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")

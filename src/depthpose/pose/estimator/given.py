@@ -21,6 +21,7 @@ from depthpose.core.camera import (
 from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_depth_png, read_map
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import Unit, metres_of
 from depthpose.pose.datasets import mask_from_rle, read_mask
 from depthpose.pose.segmentation import label_parts
@@ -87,6 +88,30 @@ def view_input(
         )
     K = _intrinsics(known, width, height, name)
     return ViewInput(name=name, depth_m=depth_m, mask=pixels, K=K, object=object)
+
+
+def rigid_input(pose: Rigid | AnyArray) -> Rigid:
+    """Take a transform, or its 4x4 matrix in metres.
+
+    Raises:
+        InputError: another shape, or no rotation.
+    """
+    if isinstance(pose, Rigid):
+        return pose
+    matrix = torch.zeros(0) if isinstance(pose, str | Path) else _tensor(pose).double()
+    if tuple(matrix.shape) != (4, 4):
+        raise InputError(
+            f"first is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
+            "the 4x4 matrix camera_from_model in metres"
+        )
+    R, last = matrix[:3, :3], matrix.new_tensor([0, 0, 0, 1])
+    is_rotation = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4) and torch.det(R) > 0
+    if not is_rotation or not torch.equal(matrix[3], last):
+        raise InputError(
+            "first is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
+            "transposed matrix has t in its last row)"
+        )
+    return Rigid(R.contiguous(), matrix[:3, 3].contiguous())
 
 
 def split_instances(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
@@ -161,14 +186,16 @@ def _refuse_no_picture(values: Tensor, name: str) -> Shaped[Tensor, "h w"]:
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
-    if isinstance(values, Tensor):
+    if isinstance(values, Tensor) and not values.is_complex():
         # Of unsigned numbers torch computes little but with bytes.
         is_odd = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
         return (values.long() if is_odd else values).detach().cpu()
     array = np.asarray(values)
-    if array.dtype.kind not in "biufc":
+    if array.dtype.kind not in "biuf":
+        is_complex = array.dtype.kind == "c"
+        what = "complex numbers where real" if is_complex else f"a {type(values).__name__} where"
         raise InputError(
-            f"a {type(values).__name__} where numbers belong; give a tensor or array of numbers, "
+            f"{what} numbers belong; give a tensor or array of numbers, "
             "or a file's path (of a camera: a Camera, its file or its matrix K)"
         )
     if array.dtype.kind == "u" and array.dtype.itemsize > 1:

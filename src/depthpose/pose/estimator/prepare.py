@@ -13,6 +13,7 @@ from depthpose.pose.cloud import (
     cloud_from_depth,
     frame_advice,
     is_flying,
+    is_reading,
     refusal_of,
     sample_points,
     voxelise,
@@ -77,11 +78,11 @@ def prepare_cloud(
         return points_m
     if (few := refusal_of(points_m, cloud)) is not None:
         return Refusal(status="too few points", reason=few)
-    if (turned := frame_advice(points_m)) is not None:
-        return Refusal(status="unusable input", reason=turned)
     kept_m = points_m[~is_flying(points_m, cloud.max_offset_diameters * model.diameter_m)]
-    refusal = _size_refusal(given, points_m, kept_m, model) or _shape_refusal(
-        given, kept_m, model, cloud
+    refusal = (
+        _place_refusal(given, points_m, kept_m, model)
+        or _size_refusal(given, points_m, kept_m, model)
+        or _shape_refusal(given, kept_m, model, cloud)
     )
     if refusal is not None:
         return refusal
@@ -100,11 +101,14 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
     else:
         points_m = given.points_m.float()
     # Some sensors write the largest float where they have no reading; NaN is not below either.
-    finite_m = take_evenly(points_m[(points_m.abs() < _FARTHEST_M).all(-1)], most)
-    if len(finite_m) == 0:
-        what = "is empty" if len(points_m) == 0 else "has no point with finite coordinates"
+    finite_m = points_m[(points_m.abs() < _FARTHEST_M).all(-1)]
+    read_m = take_evenly(finite_m[is_reading(finite_m)], most)
+    if len(read_m) == 0:
+        finite = "is (0, 0, 0), no reading, in every point"
+        what = "has no point with finite coordinates" if len(finite_m) == 0 else finite
+        what = "is empty" if len(points_m) == 0 else what
         return Refusal(status="too few points", reason=f"the cloud {what}")
-    return finite_m
+    return read_m
 
 
 def _nothing_seen(view: ViewInput) -> str:
@@ -116,6 +120,29 @@ def _nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
+def _place_refusal(
+    given: AnyInput,
+    points_m: Float[Tensor, "n 3"],
+    kept_m: Float[Tensor, "m 3"],
+    model: ObjectModel,
+) -> Refusal | None:
+    """Refuse what is not before the camera; a cloud about the origin is in no other axes."""
+    fits = unit_advice(model.diameter_m, _sized(points_m, kept_m)) is None
+    if fits and isinstance(given, CloudInput) and _is_centred(points_m, model):
+        return Refusal(
+            status="unusable input",
+            reason="the cloud lies about the origin, where the camera is: it was centred, or is in "
+            "the frame of the model; give it in the camera's frame, as it was seen",
+        )
+    turned = frame_advice(points_m)
+    return None if turned is None else Refusal(status="unusable input", reason=turned)
+
+
+def _sized(points_m: Float[Tensor, "n 3"], kept_m: Float[Tensor, "m 3"]) -> Float[Tensor, "k 3"]:
+    """Give the points whose size is the object's: without flying pixels, if those are few."""
+    return kept_m if len(kept_m) > _MOST * len(points_m) else points_m
+
+
 def _size_refusal(
     given: AnyInput,
     points_m: Float[Tensor, "n 3"],
@@ -123,14 +150,8 @@ def _size_refusal(
     model: ObjectModel,
 ) -> Refusal | None:
     """Refuse what is not of this object's size; some background in the mask is none of that."""
-    some_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
+    some_m = _sized(points_m, kept_m)
     advice = unit_advice(model.diameter_m, some_m)
-    if advice is None and isinstance(given, CloudInput) and _is_centred(points_m, model):
-        return Refusal(
-            status="unusable input",
-            reason="the cloud lies about the origin, where the camera is: it was centred, or is in "
-            "the frame of the model; give it in the camera's frame, as it was seen",
-        )
     if advice is None or (some_m is kept_m and "larger than the model" in advice):
         return None
     hint = _view_hint(given) if isinstance(given, ViewInput) else ""

@@ -32,7 +32,7 @@ from depthpose.pose.estimator.evidence import (
     tilt_of,
 )
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
-from depthpose.pose.mesh import read_model, with_found_symmetries
+from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.refine import refine_best
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -217,16 +217,11 @@ def _evidence_of(
 
 
 def _refuse_no_surface(models: Sequence[ObjectModel]) -> None:
-    names = [model.name for model in models]
-    if not names:
+    if not models:
         raise InputError(
             "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
         )
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(
-            f"two models are called {twice[0]!r}, and an object is known by its name; rename one"
-        )
+    refuse_one_name(models)
     for model in models:
         if len(model.faces) == 0 and len(model.vertices_m) < _LEAST:
             raise InputError(

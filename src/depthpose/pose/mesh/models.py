@@ -6,7 +6,7 @@ What a file declares, or may grow to, is checked before it is read in full.
 import json
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -167,6 +167,22 @@ def make_model(
     return _with_keypoints(model, config.keypoints)
 
 
+def refuse_one_name(models: Sequence[ObjectModel]) -> None:
+    """Refuse models of one name: an object is known by its name.
+
+    Raises:
+        InputError: the name, and the numbers of the models that have it.
+    """
+    names = [model.name for model in models]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        numbers = " and ".join(str(model.number) for model in models if model.name == twice[0])
+        raise InputError(
+            f"two models are called {twice[0]!r} (numbers {numbers}: obj_id of a data set, the "
+            "place among CAD files), and an object is known by its name; rename one"
+        )
+
+
 _HULL = 8000
 """Corners of a hull of which all pairs are compared; more take seconds."""
 _DIRECTIONS = 4096
@@ -315,5 +331,5 @@ def _refuse_unit(path: AnyPath, vertices_m: Tensor, unit: Unit) -> None:
     if 0 < extent_m < _SMALLEST_M and unit == "mm":
         raise InputError(
             f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
-            "it in metres? Then say unit m."
+            "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
         )

@@ -13,6 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.pose.types import ObjectModel
 
 _NEIGHBOURS = 16
+_DENSE = 20_000
 _PLASTIC = 1.32471795724474602596
 
 
@@ -72,6 +73,16 @@ def sample_surface(
     points = (corners[face] * share[..., None]).sum(-2)
     normals = doubled[face] / area[face, None].clamp(min=1e-300)
     return points.to(model.vertices_m), normals.to(model.vertices_m)
+
+
+def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
+    """Say how far off a model's surface the farthest of some points lies [m].
+
+    The surface is its vertices and 20,000 points between them, a hundredth of the diameter apart:
+    the vertices of a coarse mesh alone are far from most of it.
+    """
+    surface_m = torch.cat([model.vertices_m, sample_surface(model, _DENSE)[0]])
+    return float(torch.cdist(points_m, surface_m).amin(1).max())
 
 
 def estimate_normals(points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -126,7 +126,7 @@ class CalibrationConfig:
         """Refuse too few views to choose by, and shares that are none."""
         if self.number and self.number < 20:
             raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
-                             "views: take 600, or 0 for no refusal")  # fmt: skip
+                             "views: take 600 (a training may take 0: no refusal)")  # fmt: skip
         if self.negatives < 0:
             raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
         for name in self.without:
