@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,7 +14,12 @@ from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
-from depthpose.pose.mesh import read_model, sample_surface, with_found_symmetries
+from depthpose.pose.mesh import (
+    gap_to_surface_m,
+    read_model,
+    sample_surface,
+    with_found_symmetries,
+)
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
@@ -27,7 +31,6 @@ OWN_CAD = "cad"
 """The value of the field ``object`` that means the CAD file."""
 _SAME = 0.02
 """In diameters: a CAD file whose size and surface differ by less is the object of the weights."""
-_SURFACE = 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,10 +126,9 @@ def _is_same(own: ObjectModel, model: ObjectModel) -> bool:
     """Whether a CAD file is the object that the weights know, in the same frame."""
     if abs(model.diameter_m / own.diameter_m - 1) > _SAME:
         return False
-    surface_m = torch.cat([model.vertices_m, sample_surface(model, _SURFACE)[0]])
-    off_m = torch.cdist(own.keypoints_m, surface_m).amin(1).max()
-    back_m = torch.cdist(sample_surface(model, 500)[0], sample_surface(own, _SURFACE)[0])
-    return max(float(off_m), float(back_m.amin(1).max())) < _SAME * own.diameter_m
+    off_m = gap_to_surface_m(own.keypoints_m, model)
+    back_m = gap_to_surface_m(sample_surface(model, 500)[0], own)
+    return max(off_m, back_m) < _SAME * own.diameter_m
 
 
 def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:

@@ -25,6 +25,7 @@ from depthpose.core.run import (
     claim_folder,
     claim_names,
     find_rank,
+    read_settings,
     wait_for,
 )
 from depthpose.pose.cloud import object_points
@@ -65,9 +66,12 @@ def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Pat
         InputError: it is another run's, or holds a file of somebody else that would be written
             over.
     """
+    if read_settings(out) is not None and not _finished(out):
+        for name in (POSES, PAGE):  # they say why nothing could be read, and block other settings
+            (out / name).unlink(missing_ok=True)
     claim_folder(out, settings, [POSES, PAGE])
     endings = [f".{end}" for end in (PICTURE, CLOUD)]
-    done = [name for name, prediction in _known(out).items() if is_finished(prediction)]
+    done = _finished(out)
     sources = {job.name: job.source or source for job in jobs}
     claim_names(
         out, sources, endings, is_finished=lambda name: any(is_result_of(n, name) for n in done)
@@ -96,7 +100,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     """
     process = find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
-    done = {name for name, prediction in _known(out).items() if is_finished(prediction)}
+    done = _finished(out)
     left = [jobs[k] for k in process.share(len(jobs)) if jobs[k].name not in done]
     if left:
         with open_viewer(None if process.rank else view) as viewer:
@@ -200,6 +204,10 @@ def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: Pose
         model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture
+
+
+def _finished(out: Path) -> set[str]:
+    return {name for name, prediction in _known(out).items() if is_finished(prediction)}
 
 
 def _known(out: Path) -> dict[str, Prediction]:
