@@ -135,20 +135,40 @@ def test_the_rig_decides_the_metres() -> None:
     assert estimate.depth_m[0, 0].item() == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("shift_px", [20.0, -12.5])
-def test_far_points_of_a_rig_with_principal_points_apart_are_matched(shift_px: float) -> None:
-    """A wall at a disparity of 6 px: less the difference of the principal points in the images."""
+def apart_rig(columns: int) -> StereoRig:
+    K = torch.tensor([[300.0, 0, 120], [0, 300, 60], [0, 0, 1]], dtype=torch.float64)
+    apart = float(columns)
+    return StereoRig(width=240, height=120, K=K, baseline_m=0.2, cx_right_minus_left_px=apart)
+
+
+@pytest.mark.parametrize("columns", [20, -12])
+def test_far_points_of_a_rig_with_principal_points_apart_are_matched(columns: int) -> None:
+    """A wall at a disparity of 6 px, less the difference of the principal points."""
     generator = torch.Generator().manual_seed(1)
     wide = torch.nn.functional.interpolate(
         torch.rand(1, 3, 60, 160, generator=generator), (120, 320), mode="bilinear"
     )[0]
-    disparity = 6 - round(shift_px)
+    disparity = 6 - columns
     left, right = wide[..., 40:280], wide[..., 40 + disparity : 280 + disparity]
-    K = torch.tensor([[300.0, 0, 120], [0, 300, 60], [0, 0, 1]], dtype=torch.float64)
-    rig = StereoRig(
-        width=240, height=120, K=K, baseline_m=0.2, cx_right_minus_left_px=float(round(shift_px))
-    )
-    found = FakestereoNet.load(matcher="sgbm").estimate(left, rig, right=right)
+    found = FakestereoNet.load(matcher="sgbm").estimate(left, apart_rig(columns), right=right)
     assert found.depth_m is not None
     assert float(found.disparity_px.nanmedian()) == pytest.approx(disparity, abs=0.1)
     assert float(found.depth_m.nanmedian()) == pytest.approx(300 * 0.2 / 6, rel=0.02)
+
+
+@pytest.mark.parametrize(("matched_px", "widths"), [(8.0, [240]), (1.0, [240, 260])])
+def test_views_are_widened_where_the_scene_reaches_so_far(
+    matched_px: float, widths: list[int]
+) -> None:
+    seen: list[int] = []
+
+    def match(left: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        seen.append(left.shape[-1])
+        return left.mean(0) * 0 + matched_px + (left.shape[-1] - 240)
+
+    image = torch.rand(3, 120, 240)
+    net = FakestereoNet(CallableMatcher(match))
+    found = net.estimate(image, apart_rig(20), right=image, with_check=False)
+    assert seen == widths
+    assert found.disparity_px.shape == (120, 240)
+    assert float(found.disparity_px.median()) == pytest.approx(matched_px)

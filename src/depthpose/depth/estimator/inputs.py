@@ -19,7 +19,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import picture_tensor, read_image, refused_as
-from depthpose.depth.disparity import infinity_shift_px, moved_left
+from depthpose.depth.disparity import infinity_shift_px, moved_apart
 from depthpose.depth.types import StereoInput
 
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
@@ -123,7 +123,7 @@ def refuse_unrectified(pair: StereoInput) -> None:
         raise InputError(
             f"{pair.name}: left and right are the same picture; give the view of each camera"
         )
-    report = check_rectified(pair.left, moved_left(right, infinity_shift_px(pair.camera)))
+    report = check_rectified(*moved_apart(pair.left, right, infinity_shift_px(pair.camera)))
     if report.is_swapped or report.is_rectified is False:
         raise InputError(f"{pair.name}: {report.message}")
 

@@ -25,7 +25,9 @@ from depthpose.depth.disparity import (
     depth_from_disparity,
     focal_size,
     infinity_shift_px,
-    moved_left,
+    is_cut_off,
+    moved_apart,
+    moved_back,
     resize_image,
 )
 from depthpose.depth.estimator.inputs import (
@@ -227,10 +229,7 @@ class FakestereoNet:
             )
         if with_check:
             refuse_unrectified(pair)
-        shift_px = infinity_shift_px(pair.camera)
-        moved = moved_left(right, shift_px)
-        match = self._match_many(pair.left[None], moved[None], pair.camera)[0]
-        match = replace(match, disparity_px=match.disparity_px - shift_px)
+        match = self._match_pair(pair.left, right, pair.camera)
         depth_m = None
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)
@@ -330,6 +329,19 @@ class FakestereoNet:
         if answer == "own":
             return own
         return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
+
+    def _match_pair(
+        self, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], camera: Camera | None
+    ) -> Match:
+        """Match a pair; again, from infinity, where the rig cuts off what is far."""
+        match = self._match_many(left[None], right[None], camera)[0]
+        columns = infinity_shift_px(camera)
+        if camera is None or columns <= 0 or not is_cut_off(match):
+            return match
+        wide = moved_apart(left, right, columns)
+        wider = replace(camera, width=wide[0].shape[-1])
+        match = self._match_many(wide[0][None], wide[1][None], wider)[0]
+        return moved_back(match, columns, left.shape[-1])
 
     def _match_many(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
