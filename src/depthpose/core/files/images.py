@@ -128,7 +128,7 @@ def list_images(path: AnyPath) -> list[Path]:
         path: a file, a folder or a pattern with ``*``, ``?``, ``[...]`` or ``**``.
 
     Returns:
-        Paths in the order of :func:`natural_order`; hidden files are left out.
+        Paths in the order of their names, numbers in them by value; hidden files are left out.
 
     Raises:
         InputError: nothing was found.
