@@ -19,6 +19,7 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
+from depthpose.cli.depth.matching import list_pairs
 from depthpose.cli.training import Lines
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
@@ -660,3 +661,10 @@ def test_confidence_of_an_earlier_method_does_not_stay(
     shutil.copy(disparity, others)
     assert main([*words, "--predictions", str(others), "--out", str(out)]) == 0
     assert not list(out.glob("confidence.*"))
+
+
+def test_pairs_in_folders_go_by_name(tmp_path: Path) -> None:
+    for name in ("left/x/1.png", "left/y/0.png", "right/0.png", "right/1.png"):
+        write_image(tmp_path / name, torch.rand(3, 20, 30))
+    lefts, rights = list_pairs(str(tmp_path / "left/*/*.png"), str(tmp_path / "right"))
+    assert [path.stem for path in lefts] == [path.stem for path in rights] == ["1", "0"]

@@ -249,18 +249,6 @@ def frames(folder: Path) -> list[str]:
     return [*words, "--camera", str(folder / "camera.json"), "--object", "bracket"]
 
 
-def test_a_folder_in_which_nothing_could_be_read_takes_other_settings(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--out", str(out)]
-    write_camera(tmp_path / "camera.json", Camera(width=320, height=240, K=K))
-    assert main(words) == 1
-    assert "unit" in capsys.readouterr().err
-    assert main([*words, "--unit", "mm"]) == 0
-    assert poses_of(out)["seen"]["status"] == "ok"
-
-
 def test_a_folder_of_depth_images_is_done_once(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

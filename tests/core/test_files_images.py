@@ -18,6 +18,7 @@ from depthpose.core.files import (
     write_disparity_png,
     write_image,
 )
+from depthpose.core.files.names import refuse_unpaired
 
 
 def bytes_image(height: int = 5, width: int = 7) -> np.ndarray:
@@ -154,3 +155,10 @@ def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> N
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"no \.png, \.jpg, \.jpeg file there; give a picture"):
         list_images(tmp_path / wanted)
+
+
+def test_names_on_one_side_alone_are_refused_where_others_have_partners() -> None:
+    refuse_unpaired(["a_left", "b_left"], ["a_right", "b_right"], "sides of other names")
+    refuse_unpaired(["a", "b"], ["b", "a"], "equal names")
+    with pytest.raises(InputError, match=r"l and r: 'a' is on one side alone"):
+        refuse_unpaired(["a", "b", "c"], ["b", "c", "d"], "l and r")

@@ -192,7 +192,8 @@ def claim_names(
                 f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
                 "one name need two folders: choose another"
             )
-        is_other = before and stamp and before != stamp
+        # Records of before have the stamp of the first file alone.
+        is_other = before and stamp and not f"{stamp}, ".startswith(f"{before}, ")
         if is_other and (name in made if is_finished is None else is_finished(name)):
             raise InputError(
                 f"{_said(sources[name])}: has changed since its result {name!r} in {folder} was "

@@ -134,5 +134,7 @@ def _write_calibration(path: Path, dataset: Dataset, usable: list[int]) -> None:
         values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)
         lines[name] = f"{name} {rig.width} {rig.height} {numbers}"
+    if list(lines.values()) == there:
+        return  # a file that is written again counts as changed
     with atomic_write(path) as part:
         part.write_text("\n".join(lines.values()) + "\n")

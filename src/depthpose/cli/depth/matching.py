@@ -13,6 +13,7 @@ from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
+from depthpose.core.files.names import refuse_unpaired
 from depthpose.core.run import claim_folder, claim_names, find_rank
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified, usable_right
 from depthpose.depth.predictions import (
@@ -62,16 +63,13 @@ def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
             f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
             "needs one right image. Remove the ones without a partner."
         )
-    names, others = ({path.stem for path in side} for side in (lefts, rights))
-    if names & others and names != others:
-        raise InputError(
-            f"{left} and {right}: {min(names ^ others)!r} is on one side alone, and others have a "
-            "partner of their name; remove it, or add its partner"
-        )
-    stems = [path.stem for path in lefts]
+    stems, partners = ([path.stem for path in side] for side in (lefts, rights))
+    refuse_unpaired(stems, partners, f"{left} and {right}")
     if len(set(stems)) != len(stems):
         twice = next(stem for stem in stems if stems.count(stem) > 1)
         raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
+    if set(stems) == set(partners):
+        rights = [rights[partners.index(stem)] for stem in stems]
     return lefts, rights
 
 

@@ -25,7 +25,6 @@ from depthpose.core.run import (
     claim_folder,
     claim_names,
     find_rank,
-    read_settings,
     wait_for,
 )
 from depthpose.pose.cloud import object_points
@@ -66,9 +65,6 @@ def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Pat
         InputError: it is another run's, or holds a file of somebody else that would be written
             over.
     """
-    if read_settings(out) is not None and not _finished(out):
-        for name in (POSES, PAGE):  # they say why nothing could be read, and block other settings
-            (out / name).unlink(missing_ok=True)
     claim_folder(out, settings, [POSES, PAGE])
     endings = [f".{end}" for end in (PICTURE, CLOUD)]
     done = _finished(out)

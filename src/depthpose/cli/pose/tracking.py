@@ -102,16 +102,16 @@ def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
 
     What an earlier run found of frames that this one did not reach stays in the file.
     """
-    earlier = read_predictions(out) if is_started(out) else []
+    left = read_predictions(out) if is_started(out) else []
     found: list[Prediction] = []
     try:
         for one in coming:
             found.append(one)  # noqa: PERF402  those before an interruption must be there
+        left = []
     finally:
         names = {one.estimate.name for one in found}
-        left = [one for one in earlier if one.estimate.name not in names]
         if found:
-            write_predictions(out, [*found, *left])
+            write_predictions(out, [*found, *(p for p in left if p.estimate.name not in names)])
     return found
 
 

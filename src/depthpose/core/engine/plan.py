@@ -13,6 +13,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.files.names import refuse_unpaired
 from depthpose.core.files.store import (
     absolute,
     exists,
@@ -136,6 +137,8 @@ def _pair(words: Sequence[str], files: Files) -> list[Item]:
     if len(set(counts)) > 1:
         said = ", ".join(f"{word} holds {n}" for word, n in zip(words, counts, strict=True))
         raise InputError(f"{said}: each input needs one file of each. Remove those without.")
+    for word, side in zip(words[1:], sides[1:], strict=True):
+        refuse_unpaired(map(stem, sides[0]), map(stem, side), f"{words[0]} and {word}")
     return [Item(stem(some[0]), some) for some in zip(*sides, strict=True)]
 
 

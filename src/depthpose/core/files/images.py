@@ -1,6 +1,5 @@
 """Pictures: 8-bit files to RGB tensors and back, and the listing of them."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -19,6 +18,7 @@ from depthpose.core.files.disk import (
     refused_suffix,
     write_bytes,
 )
+from depthpose.core.files.names import natural_order
 from depthpose.core.files.shards import read_bytes
 
 LISTED_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -147,13 +147,6 @@ def list_images(path: AnyPath) -> list[Path]:
             "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
         )
     return pictures
-
-
-def natural_order(path: Path) -> tuple[list[list[str | int]], Path]:
-    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10."""
-    pieces = [re.split(r"(\d+)", part) for part in (*path.parent.parts, path.stem)]
-    # Every second piece is a run of digits, so that like is compared with like.
-    return [[int(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from fsspec.core import url_to_fs
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import atomic_write, read_file
+from depthpose.core.files.names import natural_order
 
 _DISK = "file"
 _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
@@ -202,7 +203,8 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
             found = fs.glob(inner)
         else:
             found = [inner] if fs.isfile(inner) else _entries(fs, inner)
-    kept = sorted(p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p))
+    kept = [p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
+    kept.sort(key=lambda p: natural_order(Path(p)))
     if not kept:
         raise InputError(
             f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"

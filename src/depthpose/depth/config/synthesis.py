@@ -9,8 +9,6 @@ Answer = Literal["own", "matched", "joined"]
 """Where depth of one image comes from: the generator's own disparity, that of the matcher on left
 and drawn right view, or both, weighed by their confidence."""
 
-"""Encoders with published ImageNet weights that can be imported."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratorConfig:

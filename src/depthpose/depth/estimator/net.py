@@ -26,8 +26,8 @@ from depthpose.depth.disparity import (
     focal_size,
     infinity_shift_px,
     is_cut_off,
+    join_far,
     moved_apart,
-    moved_back,
     resize_image,
 )
 from depthpose.depth.estimator.inputs import (
@@ -339,9 +339,11 @@ class FakestereoNet:
         if camera is None or columns <= 0 or not is_cut_off(match):
             return match
         wide = moved_apart(left, right, columns)
-        wider = replace(camera, width=wide[0].shape[-1])
-        match = self._match_many(wide[0][None], wide[1][None], wider)[0]
-        return moved_back(match, columns, left.shape[-1])
+        try:
+            widened = self._match_many(wide[0][None], wide[1][None], _widened(camera, columns))[0]
+        except InputError:  # nothing lies so far
+            return match
+        return join_far(match, widened, columns)
 
     def _match_many(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
@@ -367,3 +369,14 @@ class FakestereoNet:
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
         return self.synthesiser, image.camera
+
+
+def _widened(camera: Camera, columns: int) -> Camera:
+    """Give the camera of a left view with so many more columns on its left."""
+    K = camera.K.clone()
+    K[0, 2] += columns
+    wider = replace(camera, width=camera.width + columns, K=K)
+    if isinstance(wider, StereoRig):
+        apart_px = wider.cx_right_minus_left_px - columns
+        wider = replace(wider, cx_right_minus_left_px=apart_px)
+    return wider

@@ -130,7 +130,8 @@ class BopDataset:
         infos = read_models_info(models_folder(self.folder))
         there = sorted({instance.object_id for instance in self.instances})
         names = {number: object_name(number, infos.get(number, {})) for number in there}
-        wanted = {*objects, *(int(o) for o in objects if isinstance(o, str) and o.isdecimal())}
+        digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
+        wanted = {*objects, *(int(o) for o in digits if o not in names.values())}
         kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
         if not kept:
             asked = ", ".join(map(repr, objects))

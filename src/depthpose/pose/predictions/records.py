@@ -58,7 +58,7 @@ def is_started(folder: Path) -> bool:
 
 
 def is_finished(prediction: Prediction) -> bool:
-    """Whether a rerun need not estimate it: an input that was unreadable may be mended."""
+    """Whether a rerun need not estimate it: an input that was unreadable may be repaired."""
     return prediction.estimate.status != "unreadable"
 
 

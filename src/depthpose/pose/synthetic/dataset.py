@@ -263,5 +263,5 @@ def _refuse_near(model: ObjectModel, config: ObjectsConfig) -> None:
         raise InputError(
             f"distance_m begins at {nearest:g} m, but object {model.name!r} is "
             f"{model.diameter_m:.3g} m wide: the camera would stand in it. Begin at "
-            f"{1.5 * model.diameter_m:.2g} or farther, or mend the unit of the model."
+            f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
         )
