@@ -195,8 +195,10 @@ def claim_names(
         # Records of before have the stamp of the first file alone.
         is_other = before and stamp and not f"{stamp}, ".startswith(f"{before}, ")
         if is_other and (name in made if is_finished is None else is_finished(name)):
+            files = sources[name]
+            said = path if isinstance(files, Path) else " or ".join(map(str, files))
             raise InputError(
-                f"{_said(sources[name])}: has changed since its result {name!r} in {folder} was "
+                f"{said}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
     new = wanted.keys() - known.keys()
@@ -212,10 +214,6 @@ def _entry(files: Path | Sequence[Path]) -> list[str]:
     """Give the first of some files, and the stamps of all."""
     every = [files] if isinstance(files, Path) else list(files)
     return [str(every[0].resolve()), ", ".join(filter(None, map(_stamp, every)))]
-
-
-def _said(files: Path | Sequence[Path]) -> str:
-    return str(files) if isinstance(files, Path) else " or ".join(map(str, files))
 
 
 def read_sources(folder: Path) -> dict[str, Path]:

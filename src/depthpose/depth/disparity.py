@@ -1,7 +1,5 @@
 """Disparity to depth and back, warping, the left-right check, and maps at other sizes."""
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,10 +19,6 @@ _MISTAKES = {
 _ABOUT = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
 _NEARLY_ALL = 0.9
-_MOST_APART_PX = 64
-_LEAST_PX, _CUT_OFF = 2.0, 0.01
-"""Of Middlebury's Motorcycle 0.3 % of the pixels are matched below 2 px; of a street cut so that
-points beyond 19 m have negative disparities 1.6 % by SGBM, and 4.5 % by a network."""
 MOST_ENLARGED_PIXELS = 8_000_000
 """An image is not enlarged beyond this to reach the focal length of a network."""
 
@@ -49,48 +43,6 @@ def disparity_advice(
         if factor / _ABOUT < farther < factor * _ABOUT:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
     return None
-
-
-def infinity_shift_px(camera: Camera | None) -> int:
-    """Columns by which two views are moved apart so that points at infinity lie at 0 px or more.
-
-    Where the right principal point lies farther right than the left one, far points have negative
-    disparities, which no matcher searches. No more than 64 px: beyond, near points would leave the
-    matcher's range.
-    """
-    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
-    return math.ceil(apart_px) if 0 < apart_px <= _MOST_APART_PX else 0
-
-
-def is_cut_off(match: Match) -> bool:
-    """Whether points seem to lie beyond the least disparity: many pixels at it, or few matched."""
-    is_known = match.disparity_px.isfinite()
-    is_least = match.disparity_px < _LEAST_PX
-    count = int(is_known.sum())
-    return 2 * count < is_known.numel() or int(is_least.sum()) > _CUT_OFF * count
-
-
-def moved_apart(
-    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], columns: int
-) -> tuple[Float[Tensor, "3 h w2"], Float[Tensor, "3 h w2"]]:
-    """Widen both views by repeating their borders, so that every disparity grows by ``columns``.
-
-    Columns are added on the left of the left view and on the right of the right one. Nothing of
-    either is lost.
-    """
-    wide = F.pad(left[None], (columns, 0, 0, 0), mode="replicate")[0]
-    return wide, F.pad(right[None], (0, columns, 0, 0), mode="replicate")[0]
-
-
-def join_far(near: Match, widened: Match, columns: int) -> Match:
-    """Take the match of the views that were moved apart, and where it has none the one before."""
-    far_px = widened.disparity_px[:, columns:] - columns
-    is_far = far_px.isfinite()
-    sure = near.confidence
-    if sure is not None and widened.confidence is not None:
-        sure = torch.where(is_far, widened.confidence[:, columns:], sure)
-    disparity_px = torch.where(is_far, far_px, near.disparity_px)
-    return Match(disparity_px=disparity_px, confidence=sure)
 
 
 def depth_from_disparity(

@@ -19,7 +19,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import picture_tensor, read_image, refused_as
-from depthpose.depth.disparity import infinity_shift_px, moved_apart
+from depthpose.depth.estimator.far import infinity_shift_px, moved_apart
 from depthpose.depth.types import StereoInput
 
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]

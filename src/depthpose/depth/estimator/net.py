@@ -21,15 +21,8 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import (
-    depth_from_disparity,
-    focal_size,
-    infinity_shift_px,
-    is_cut_off,
-    join_far,
-    moved_apart,
-    resize_image,
-)
+from depthpose.depth.disparity import depth_from_disparity, focal_size, resize_image
+from depthpose.depth.estimator.far import match_to_infinity
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
@@ -229,16 +222,12 @@ class FakestereoNet:
             )
         if with_check:
             refuse_unrectified(pair)
-        match = self._match_pair(pair.left, right, pair.camera)
+        match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
         depth_m = None
         if isinstance(pair.camera, StereoRig):
             depth_m = depth_from_disparity(match.disparity_px, pair.camera)
-        return DepthEstimate(
-            depth_m=depth_m,
-            disparity_px=match.disparity_px,
-            confidence=match.confidence,
-            seen=pair,
-        )
+        px, sure = match.disparity_px, match.confidence
+        return DepthEstimate(depth_m=depth_m, disparity_px=px, confidence=sure, seen=pair)
 
     @torch.no_grad()
     def estimate_many(
@@ -330,20 +319,8 @@ class FakestereoNet:
             return own
         return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
 
-    def _match_pair(
-        self, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], camera: Camera | None
-    ) -> Match:
-        """Match a pair; again, from infinity, where the rig cuts off what is far."""
-        match = self._match_many(left[None], right[None], camera)[0]
-        columns = infinity_shift_px(camera)
-        if camera is None or columns <= 0 or not is_cut_off(match):
-            return match
-        wide = moved_apart(left, right, columns)
-        try:
-            widened = self._match_many(wide[0][None], wide[1][None], _widened(camera, columns))[0]
-        except InputError:  # nothing lies so far
-            return match
-        return join_far(match, widened, columns)
+    def _match_one(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
+        return self._match_many(left[None], right[None], camera)[0]
 
     def _match_many(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
@@ -369,14 +346,3 @@ class FakestereoNet:
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
         return self.synthesiser, image.camera
-
-
-def _widened(camera: Camera, columns: int) -> Camera:
-    """Give the camera of a left view with so many more columns on its left."""
-    K = camera.K.clone()
-    K[0, 2] += columns
-    wider = replace(camera, width=camera.width + columns, K=K)
-    if isinstance(wider, StereoRig):
-        apart_px = wider.cx_right_minus_left_px - columns
-        wider = replace(wider, cx_right_minus_left_px=apart_px)
-    return wider
