@@ -31,15 +31,11 @@ from depthpose.depth.stereo.enlargement import (
     agreement_of_neighbours,
     enlarge,
 )
-from depthpose.depth.stereo.light import (
-    confidence_near,
-    correlation_volume,
-    mean_of_all,
-    mean_of_best,
-)
+from depthpose.depth.stereo.light import correlation_volume
 from depthpose.depth.stereo.matcher import CameraMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.stereo.plan import LightFootprint
+from depthpose.depth.stereo.scores import confidence_near, mean_of_all, mean_of_best
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.begin import make_matcher_network
 from depthpose.depth.train.config import StereoTraining
@@ -54,6 +50,7 @@ SMALL = LightConfig(
     encoder_width=0.25,
     with_agreement=True,
     with_refinement=True,
+    with_sky=True,
 )
 
 
@@ -135,7 +132,7 @@ def test_views_agree_under_the_disparity_that_is_right() -> None:
     assert float(found[..., 0].abs().max()) < 1e-6  # beyond the right image
 
 
-@pytest.mark.parametrize("part", ["with_agreement", "with_refinement"])
+@pytest.mark.parametrize("part", ["with_agreement", "with_refinement", "with_sky"])
 def test_weights_without_a_part_are_trained_on_with_it(part: str, tmp_path: Path) -> None:
     plain = dataclasses.replace(SMALL, **{part: False})
     start = tmp_path / "plain.safetensors"

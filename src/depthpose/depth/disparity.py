@@ -156,10 +156,11 @@ def resize_image(
 
 def resized_match(match: Match, height: int, width: int) -> Match:
     """Bring a match to another size of its image."""
-    sure = match.confidence
+    sure, sky = match.confidence, match.is_sky
     return Match(
         disparity_px=resize_disparity(match.disparity_px, height, width),
         confidence=None if sure is None else resized_map(sure, height, width),
+        is_sky=None if sky is None else resized_map(sky.float(), height, width) > 0.5,
     )
 
 

@@ -96,11 +96,13 @@ def label_pairs(
 
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Float[Tensor, "h w"]:
-    """Match a pair both ways; NaN where the two disagree, or the matcher is not sure [px]."""
+    """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
     one, right_px = match_both_ways(net, pair)
     is_known = is_consistent(one.disparity_px, right_px, config)
     if one.confidence is not None:
         is_known &= one.confidence >= config.least_confidence
+    if one.is_sky is not None:
+        is_known &= ~one.is_sky
     return torch.where(is_known, one.disparity_px, torch.nan)
 
 

@@ -81,6 +81,17 @@ def heads_loss(
     return torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum()
 
 
+def sky_loss(
+    probability: Float[Tensor, "b h w"], truth_px: Float[Tensor, "b h w"]
+) -> Float[Tensor, ""]:
+    """Mean cross entropy of the class of the sky, where it is known whether it is (truth 0)."""
+    is_known, is_sky = truth_px >= 0, truth_px == 0
+    of_truth = torch.where(is_sky, probability, 1 - probability)
+    # Gradients stay finite where a probability is 0 in float32.
+    losses = torch.where(is_known, -(of_truth + 1e-4).log(), 0.0)
+    return losses.sum() / is_known.sum().clamp(min=1)
+
+
 def log_disparity_loss(
     found_log_px: Float[Tensor, "b h w"],
     truth_px: Float[Tensor, "b h w"],

@@ -65,10 +65,13 @@ class Match:
         disparity_px: disparity of the left image, dense or NaN where the matcher has no answer.
         confidence: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher
             has no distribution.
+        is_sky: left pixels that show the sky, where disparity is about 0; None where the matcher
+            does not know it.
     """
 
     disparity_px: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None = None
+    is_sky: Bool[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

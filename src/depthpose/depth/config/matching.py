@@ -92,6 +92,10 @@ class LightConfig:
     """Whether both views are compared once more, at half size, around the disparity found, which
     is corrected; weights without it can be trained on with it."""
 
+    with_sky: bool = False
+    """Whether the sky is a class of its own, beside the disparities; weights without it can be
+    trained on with it."""
+
     work_focal_px: float | None = None
     """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
 

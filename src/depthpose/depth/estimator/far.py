@@ -56,9 +56,14 @@ def infinity_shift_px(camera: Camera | None) -> int:
 
 
 def is_cut_off(match: Match) -> bool:
-    """Whether points seem to lie beyond the least disparity: many pixels at it, or few matched."""
+    """Whether points seem to lie beyond the least disparity: many pixels at it, or few matched.
+
+    The sky does not count.
+    """
     is_known = match.disparity_px.isfinite()
     is_least = match.disparity_px < _LEAST_PX
+    if match.is_sky is not None:
+        is_least &= ~match.is_sky
     count = int(is_known.sum())
     return 2 * count < is_known.numel() or int(is_least.sum()) > _CUT_OFF * count
 
@@ -82,8 +87,9 @@ def join_far(near: Match, widened: Match, columns: int) -> Match:
     sure = near.confidence
     if sure is not None and widened.confidence is not None:
         sure = torch.where(is_far, widened.confidence[:, columns:], sure)
+    is_sky = None if widened.is_sky is None else widened.is_sky[:, columns:]
     disparity_px = torch.where(is_far, far_px, near.disparity_px)
-    return Match(disparity_px=disparity_px, confidence=sure)
+    return Match(disparity_px=disparity_px, confidence=sure, is_sky=is_sky)
 
 
 def _widened(camera: Camera, columns: int) -> Camera:

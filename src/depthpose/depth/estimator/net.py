@@ -14,14 +14,13 @@ from depthpose.core.camera import (
     AnyCamera,
     AnyLens,
     Camera,
-    StereoRig,
     check_image_matches_camera,
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import depth_from_disparity, focal_size, resize_image
+from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator.far import match_to_infinity
 from depthpose.depth.estimator.inputs import (
     Picture,
@@ -33,6 +32,7 @@ from depthpose.depth.estimator.inputs import (
 )
 from depthpose.depth.estimator.rig import (
     choose_matcher,
+    from_pair,
     from_virtual,
     join_matches,
     set_answer,
@@ -223,11 +223,7 @@ class FakestereoNet:
         if with_check:
             refuse_unrectified(pair)
         match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
-        depth_m = None
-        if isinstance(pair.camera, StereoRig):
-            depth_m = depth_from_disparity(match.disparity_px, pair.camera)
-        px, sure = match.disparity_px, match.confidence
-        return DepthEstimate(depth_m=depth_m, disparity_px=px, confidence=sure, seen=pair)
+        return from_pair(pair, match)
 
     @torch.no_grad()
     def estimate_many(
@@ -273,7 +269,7 @@ class FakestereoNet:
         left = torch.stack([resize_image(image.left, *size) for image in images])
         drawn = synthesiser.draw(left)
         matches = self._disparities(left, drawn, square_camera(size, rig.virtual_focal_px))
-        skies = [None] * len(images) if drawn.is_sky is None else drawn.is_sky
+        skies = [m.is_sky for m in matches] if drawn.is_sky is None else drawn.is_sky
         parts = zip(images, matches, drawn.right, skies, strict=True)
         found = [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
         if drawn.confidence is None:

@@ -24,6 +24,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
+from depthpose.depth.stereo.enlargement import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
@@ -40,6 +41,27 @@ def square_camera(size: tuple[int, int], focal_px: float) -> Camera:
         dtype=torch.float64,
     )
     return Camera(width=columns, height=rows, K=K)
+
+
+def from_pair(pair: StereoInput, match: Match) -> DepthEstimate:
+    """Give what was found in a rectified pair: metres where its camera has a baseline."""
+    disparity_px, depth_m, is_sky = match.disparity_px, None, match.is_sky
+    rig = pair.camera if isinstance(pair.camera, StereoRig) else None
+    if is_sky is not None:
+        far_px = torch.full_like(disparity_px, LEAST_PX)
+        if rig is not None:
+            far_px = disparity_from_depth(torch.full_like(disparity_px, SKY_M), rig)
+        disparity_px = torch.where(is_sky, far_px, disparity_px)
+    if rig is not None:
+        depth_m = depth_from_disparity(disparity_px, rig)
+        depth_m = depth_m if is_sky is None else torch.where(is_sky, torch.nan, depth_m)
+    return DepthEstimate(
+        depth_m=depth_m,
+        disparity_px=disparity_px,
+        confidence=match.confidence,
+        is_sky=is_sky,
+        seen=pair,
+    )
 
 
 def from_virtual(
@@ -78,11 +100,13 @@ def from_virtual(
 def join_matches(one: Match, other: Match) -> Match:
     """Take the mean of two disparities in the logarithm, weighed by their confidence.
 
-    Where ``other`` has no answer, or no confidence, ``one`` is taken.
+    Where ``other`` has no answer, or no confidence, or sees the sky, ``one`` is taken.
     """
     assert one.confidence is not None
     weight = torch.zeros_like(one.confidence) if other.confidence is None else other.confidence
     weight = torch.where(other.disparity_px > 0, weight, 0.0)
+    if other.is_sky is not None:
+        weight = torch.where(other.is_sky, 0.0, weight)
     share = weight / (weight + one.confidence).clamp(min=1e-6)
     logs = [match.disparity_px.clamp(min=1e-3).log() for match in (one, other)]
     log_px = torch.lerp(logs[0], logs[1].nan_to_num(0.0), share)

@@ -5,7 +5,7 @@ Sizes stay free: the graph computes them from the images that it is given. Netwo
 in operators, because sizes there depend on a focal length, which no exporter follows.
 """
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -29,13 +29,20 @@ from depthpose.depth.export.steps import (
     size_of,
 )
 from depthpose.depth.stereo import StereoNetwork
+from depthpose.depth.stereo.enlargement import LEAST_PX
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, NetworkConfig
 from depthpose.depth.weights import DepthWeights
 
 _IMAGES = ("batch", 3, "height", "width")
 _MAPS = ("batch", "height", "width")
-_Maps = tuple[Value, Value]
-"""Disparity [px] and confidence."""
+
+
+class _Maps(NamedTuple):
+    """Disparity [px], confidence, and 1 in the sky where it is known."""
+
+    disparity_px: Value
+    confidence: Value
+    sky: Value | None = None
 
 
 def image_graph(weights: DepthWeights) -> Graph:
@@ -43,8 +50,8 @@ def image_graph(weights: DepthWeights) -> Graph:
 
     Inputs ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
     images). Outputs ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
-    ``confidence`` (each batch, height, width) and ``right``, the drawn view; of a generator that
-    selects ``is_sky`` too (batch, height, width; bool).
+    ``confidence`` (each batch, height, width) and ``right``, the drawn view; of networks that know
+    the sky ``is_sky`` too (batch, height, width; bool).
 
     Raises:
         InputError: a network is missing, or the generator is stochastic (dropout at test time).
@@ -65,12 +72,12 @@ def image_graph(weights: DepthWeights) -> Graph:
     left = resized_image(image, small)
     seen = drawn(left, generator)
     found = _answered(left, seen, weights.matcher, rig)
-    disparity_px, confidence = (resized_map(values, full) for values in found)
-    disparity_px = disparity_px * ratio(full, small)
+    disparity_px = resized_map(found.disparity_px, full) * ratio(full, small)
+    confidence = resized_map(found.confidence, full)
     focal_m_px = _focal_m_px(K, rig)
     depth_m = _depth(disparity_px, focal_m_px)
-    if seen.is_sky is not None:
-        is_sky = resized_map(seen.is_sky.cast(np.float32), full).op("Greater", np.float32(0.5))
+    if found.sky is not None:
+        is_sky = _is_sky(found.sky, full)
         depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
         disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
         graph.output("is_sky", is_sky, np.bool_, _MAPS)
@@ -84,7 +91,8 @@ def pair_graph(weights: DepthWeights) -> Graph:
 
     Inputs ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
     float64) where the weights were trained at one focal length. Outputs ``disparity_px`` and
-    ``confidence`` (batch, height, width). Depth is ``fx * baseline / disparity``.
+    ``confidence`` (batch, height, width), and of a network that knows the sky ``is_sky`` (the same;
+    bool), where disparity is 0.01 px. Depth is ``fx * baseline / disparity``.
 
     Raises:
         InputError: there is no matcher in the weights.
@@ -99,7 +107,13 @@ def pair_graph(weights: DepthWeights) -> Graph:
     focal_px = None
     if config.work_focal_px is not None:
         focal_px = focal_yx(graph.input("K", np.float64, (3, 3)))
-    _output_maps(graph, None, *_matched(left, right, focal_px, network, config))
+    found = _matched(left, right, focal_px, network, config)
+    disparity_px = found.disparity_px
+    if found.sky is not None:
+        is_sky = _is_sky(found.sky, size_of(left))
+        disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
+        graph.output("is_sky", is_sky, np.bool_, _MAPS)
+    _output_maps(graph, None, disparity_px, found.confidence)
     return graph
 
 
@@ -117,22 +131,31 @@ def _answered(
     focal_px = np.array([rig.virtual_focal_px] * 2)
     config = cast("NetworkConfig", matcher.config)
     matched = _matched(left, seen.right, focal_px, dynamic_shape_network(matcher), config)
-    return matched if answer == "matched" else _both(_own(seen), matched)
+    if answer == "matched":
+        return matched if seen.is_sky is None else matched._replace(sky=_own(seen).sky)
+    return _both(_own(seen), matched)
 
 
 def _own(seen: DrawnValues) -> _Maps:
     assert seen.disparity_px is not None and seen.confidence is not None  # noqa: PT018
-    return seen.disparity_px, seen.confidence
+    sky = None if seen.is_sky is None else seen.is_sky.cast(np.float32)
+    return _Maps(seen.disparity_px, seen.confidence, sky)
+
+
+def _is_sky(sky: Value, size: Value) -> Value:
+    return resized_map(sky, size).op("Greater", np.float32(0.5))
 
 
 def _both(one: _Maps, other: _Maps) -> _Maps:
     """What ``join_matches`` does: the mean of the logarithms, weighed by confidence."""
-    is_known = other[0].op("Greater", np.float32(0))
-    weight = is_known.op("Where", other[1], np.float32(0))
-    share = weight / (weight + one[1]).op("Max", np.float32(1e-6))
-    logs = [maps[0].op("Max", np.float32(1e-3)).op("Log") for maps in (one, other)]
+    is_known = other.disparity_px.op("Greater", np.float32(0))
+    weight = is_known.op("Where", other.confidence, np.float32(0))
+    if other.sky is not None:
+        weight = weight * (other.sky * np.float32(-1) + np.float32(1))
+    share = weight / (weight + one.confidence).op("Max", np.float32(1e-6))
+    logs = [maps.disparity_px.op("Max", np.float32(1e-3)).op("Log") for maps in (one, other)]
     log_px = _between(logs[0], logs[1], share)
-    return log_px.op("Exp"), _between(one[1], weight, share)
+    return _Maps(log_px.op("Exp"), _between(one.confidence, weight, share), one.sky)
 
 
 def _between(start: Value, end: Value, share: Value) -> Value:
@@ -164,8 +187,9 @@ def _matched(
     found = left.graph.call(network_model(network, example, step), *padded)
     whole = 1 << 62
     found = [m.slice(joined(above, 0), joined(whole, columns(work)), [1, 2]) for m in found]
-    disparity_px, confidence = (resized_map(m, size) for m in found)
-    return disparity_px * ratio(size, work), confidence
+    disparity_px, confidence, *sky = (resized_map(m, size) for m in found)
+    is_sky = [values.op("Greater", np.float32(0.5)).cast(np.float32) for values in sky]
+    return _Maps(disparity_px * ratio(size, work), confidence, *is_sky)
 
 
 def _focal_m_px(K: Value, rig: GeneratorConfig | SelectionConfig) -> Value:

@@ -22,7 +22,7 @@ from depthpose.depth.export.steps import (
     size_of,
 )
 from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
+from depthpose.depth.stereo.light import LightStereo
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
@@ -74,14 +74,13 @@ class DynamicLightStereo(nn.Module):
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
-    ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-        """Give disparity [px] and confidence of normalised images."""
-        config = self.network.config
-        scores, seen = self.network.scores(left, right, config.max_disparity_px)
-        quarter_px = mean_of_best(scores, config.candidates)
-        quarters = torch.stack([quarter_px, confidence_near(scores, quarter_px)], 1)
-        found_px, sure = self.network.enlarge(quarters, seen).unbind(1)
-        return self.network.refine(found_px, seen), sure
+    ) -> tuple[Maps, ...]:
+        """Give disparity [px], confidence and, with that class, the sky of normalised images."""
+        scores, seen = self.network.scores(left, right, self.network.config.max_disparity_px)
+        read = self.network.read(scores, seen, with_confidence=True)
+        assert read.confidence is not None
+        sky = () if read.sky is None else ((read.sky > 0.5).float(),)
+        return read.disparity_px, read.confidence, *sky
 
 
 DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {

@@ -33,14 +33,10 @@ _FLIPS = 1e-3
 _FLIPPING_LIMITS = {
     name: limit if limit.of == "mean" else dataclasses.replace(limit, flips=_FLIPS)
     for name, limit in _LIMITS.items()
-}
+} | {"is_sky": Limit(value=_FLIPS, of="mean")}
 """Where two scores tie, the last bit decides between candidates."""
 _FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
 """Matchers that choose between candidates."""
-_SELECTION_LIMITS = {
-    **_FLIPPING_LIMITS,
-    "is_sky": Limit(value=_FLIPS, of="mean"),
-}
 _PAIR_OUTPUTS = ("disparity_px", "confidence")
 _SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
 """Rows, columns, focal length over the one that the weights want, images: a multiple of what the
@@ -90,18 +86,18 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         graph=lambda: pair_graph(weights),
         cases=lambda: _pair_cases(weights),
         limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
-        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], confidence"},
+        facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
     )
 
 
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     rig = {} if weights.generator is None else _rig_facts(weights)
     selects = isinstance(weights.generator, SelectionGenerator)
-    chooses = isinstance(weights.matcher, _FLIPPING)
+    chooses = selects or isinstance(weights.matcher, _FLIPPING)
     return Export(
         graph=lambda: image_graph(weights),
         cases=lambda: _image_cases(weights),
-        limits=_SELECTION_LIMITS if selects else _FLIPPING_LIMITS if chooses else _LIMITS,
+        limits=_FLIPPING_LIMITS if chooses else _LIMITS,
         facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
@@ -125,7 +121,8 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
     # The scenes of the proof need not be like the images that the weights were trained on.
     net = FakestereoNet(matcher, make_synthesiser(weights.generator), allow_ood=True)
-    sky = ("is_sky",) if isinstance(weights.generator, SelectionGenerator) else ()
+    selects = isinstance(weights.generator, SelectionGenerator)
+    sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
     for size in _SIZES:
         scenes, _ = _scenes(*size)
         images = _under_sky(scenes) if sky else scenes
@@ -143,9 +140,12 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
 def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.matcher is not None
     net = FakestereoNet(make_matcher(weights.matcher, _QUICK))
+    sky = ("is_sky",) if _sees_sky(weights.matcher) else ()
     work_px = cast("NetworkConfig", weights.matcher.config).work_focal_px
     for size in _SIZES:
         left, right = _scenes(*size)
+        if sky:
+            left, right = _under_sky(left), _under_sky(right)
         inputs = {"left": left.numpy(), "right": right.numpy()}
         rig = None
         if work_px is not None:
@@ -156,7 +156,11 @@ def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
             net.estimate_pair(StereoInput(name="proof", left=one, right=other, camera=rig))
             for one, other in zip(left, right, strict=True)
         ]
-        yield _case(inputs, found, _PAIR_OUTPUTS)
+        yield _case(inputs, found, (*_PAIR_OUTPUTS, *sky))
+
+
+def _sees_sky(matcher: StereoNetwork | None) -> bool:
+    return matcher is not None and getattr(matcher.config, "with_sky", False)
 
 
 def _case(

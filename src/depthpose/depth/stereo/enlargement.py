@@ -18,8 +18,8 @@ STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
-_LEAST_PX = 0.01
-"""Of a corrected disparity in use: depth stays finite, some tens of kilometres in the sky."""
+LEAST_PX = 0.01
+"""Of a corrected disparity in use, and of the sky: depth stays finite, some tens of kilometres."""
 _REFINED = 32
 """Channels of the refinement at half size."""
 
@@ -148,7 +148,7 @@ class Refinement(nn.Module):
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(found_px), 2)[:, 0]
         corrected = found_px.detach() + correction_px
-        return corrected if self.training else corrected.clamp_min(_LEAST_PX)
+        return corrected if self.training else corrected.clamp_min(LEAST_PX)
 
 
 def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:

@@ -8,6 +8,7 @@
   of nine neighbours (Teed and Deng, RAFT, ECCV 2020), whose disparities are compared at half size.
 - Refinement: both views are compared around that disparity at half size, and a few convolutions
   correct it (Khamis et al., StereoNet, ECCV 2018; Tankovich et al., HITNet, CVPR 2021).
+- Sky: a class of its own, from what the left view shows and how surely it was matched.
 """
 
 from functools import partial
@@ -22,6 +23,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.enlargement import (
+    LEAST_PX,
     STEM,
     ConvexUpsampling,
     Features,
@@ -35,18 +37,19 @@ from depthpose.depth.stereo.enlargement import (
 )
 from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
 from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
-from depthpose.depth.stereo.volume import (
-    WINDOW_PX,
-    by_rows,
-    interpolation_matrix,
-    linear_taps,
+from depthpose.depth.stereo.scores import (
+    STEP_PX,
+    Reading,
+    Scores,
+    SkyHead,
+    confidence_near,
+    mean_of_all,
+    mean_of_best,
 )
+from depthpose.depth.stereo.volume import by_rows
 
 Volume = Float[Tensor, "b _ _ _ _"]
-Scores = Float[Tensor, "b d h4 w4"]
 
-_STEP_PX = 4
-"""Distance of neighbouring disparities that have a score."""
 _DEEP = 96
 """Channels of the decoder at 1/32, twice those at 1/16 and 1/8."""
 
@@ -169,32 +172,6 @@ def _product(volume: Volume, guide: Volume) -> Volume:
     return volume * guide if torch.is_grad_enabled() else volume.mul_(guide)
 
 
-def mean_of_best(scores: Scores, candidates: int) -> Quarter:
-    """Give the expected disparity [px] over the disparities of the highest scores."""
-    best = scores.topk(candidates, 1)
-    return _STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
-
-
-def mean_of_all(scores: Scores) -> Quarter:
-    """Give the expected disparity [px] over all disparities."""
-    bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
-    return _STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
-
-
-def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
-    """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
-
-    As PSMNet's confidence: between the disparities that have a score, scores are interpolated.
-    """
-    bins = scores.shape[1]
-    count = _STEP_PX * (bins - 1) + 1
-    matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
-    probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
-    steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
-    is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
-    return (probability * is_near).sum(1).clamp(0, 1)
-
-
 class LightStereo(StereoNetwork):
     """Rectified pair to disparity at a fraction of PSMNet's operations.
 
@@ -217,6 +194,7 @@ class LightStereo(StereoNetwork):
             self.config.width, with_agreement=self.config.with_agreement
         )
         self.refinement = Refinement() if self.config.with_refinement else None
+        self.sky = SkyHead(self.config.width) if self.config.with_sky else None
 
     @property
     def encoder(self) -> LiteEncoder:
@@ -226,24 +204,57 @@ class LightStereo(StereoNetwork):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Maps, ...]:
+        """Give the disparity maps of :meth:`forward_with_sky`."""
+        return self.forward_with_sky(left, right)[0]
+
+    def forward_with_sky(
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+    ) -> tuple[tuple[Maps, ...], Maps | None]:
         """Match the pair.
 
         Returns:
             Disparity of the left view [px], while training that of all scores, enlarged without
             the image, then that before the refinement, then the answer; in eval mode the answer
-            alone.
+            alone. Then the probability of the sky, or None without that class.
 
         Raises:
             InputError: the images' size does not suit the network.
         """
         scores, seen = self.scores(left, right, self.config.max_disparity_px)
-        quarter_px = mean_of_best(scores, self.config.candidates)
-        found_px = self.enlarge(quarter_px[:, None], seen)[:, 0]
-        heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
+        read = self.read(scores, seen, with_confidence=False)
         if not self.training:
-            return heads[-1:]
+            return (read.disparity_px,), read.sky
         coarse_px = mean_of_all(scores)[:, None]
-        return F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0], *heads
+        coarse_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
+        heads = (read.found_px,) if self.refinement is None else (read.found_px, read.disparity_px)
+        return (coarse_px, *heads), read.sky
+
+    def read(self, scores: Scores, seen: Seen, *, with_confidence: bool) -> Reading:
+        """Read disparity, confidence and sky off the scores, at the images' size."""
+        quarter_px = mean_of_best(scores, self.config.candidates)
+        quarters = [quarter_px]
+        if with_confidence:
+            quarters.append(self._confidence(scores, quarter_px))
+        if self.sky is not None:
+            quarters.append(self.sky(seen.left.levels[0], scores, quarter_px))
+        del scores
+        found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
+        disparity_px = self.refine(found_px, seen)
+        sky = rest.pop() if self.sky is not None else None
+        confidence = rest.pop() if with_confidence else None
+        if sky is not None and not self.training:
+            is_sky = sky > 0.5
+            disparity_px = torch.where(is_sky, LEAST_PX, disparity_px)
+            if confidence is not None:
+                confidence = torch.where(is_sky, sky, confidence * (1 - sky))
+        return Reading(found_px, disparity_px, confidence, sky)
+
+    def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:
+        """By rows: probabilities between the scores are the largest volume."""
+        if self.rows is None:
+            return confidence_near(scores, quarter_px)
+        parts = zip(scores.split(self.rows, 2), quarter_px.split(self.rows, 1), strict=True)
+        return torch.cat([confidence_near(*part) for part in parts], 1)
 
     def enlarge(self, quarters: Float[Tensor, "b k h4 w4"], seen: Seen) -> Float[Tensor, "b k h w"]:
         """Bring maps to the images' size by weights that follow the first, the disparity [px]."""
@@ -290,7 +301,7 @@ class LightStereo(StereoNetwork):
         compares = self.config.with_agreement or self.config.with_refinement
         right_half = far.half if compares else None
         del far
-        bins = max_disparity_px // _STEP_PX
+        bins = max_disparity_px // STEP_PX
         scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), Seen(near, right_half)

@@ -6,7 +6,7 @@ import torch
 
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.stereo.folding import fold_features, fold_volumes
-from depthpose.depth.stereo.light import LightStereo, confidence_near, mean_of_best
+from depthpose.depth.stereo.light import LightStereo
 from depthpose.depth.stereo.network_matcher import NetworkMatcher, Views
 from depthpose.depth.stereo.plan import LightFootprint
 from depthpose.depth.types import Match
@@ -55,15 +55,9 @@ class LightMatcher(NetworkMatcher):
         scores, seen = self._network.scores(
             left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
         )
-        quarters = [mean_of_best(scores, network.candidates)]
-        if self.config.with_confidence:
-            count = LightFootprint.rows  # probabilities between the scores are the largest volume
-            rows = zip(scores.split(count, 2), quarters[0].split(count, 1), strict=True)
-            quarters.append(torch.cat([confidence_near(*some) for some in rows], 1))
-        del scores
-        found_px, *sure = self._network.enlarge(torch.stack(quarters, 1), seen).unbind(1)
-        found_px = self._network.refine(found_px, seen)
-        if not sure:
-            return [Match(disparity_px=one) for one in found_px]
-        parts = zip(found_px, sure[0], strict=True)
-        return [Match(disparity_px=d, confidence=c) for d, c in parts]
+        read = self._network.read(scores, seen, with_confidence=self.config.with_confidence)
+        nothing = [None] * len(left)
+        sure = nothing if read.confidence is None else read.confidence
+        sky = nothing if read.sky is None else read.sky > 0.5
+        parts = zip(read.disparity_px, sure, sky, strict=True)
+        return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]

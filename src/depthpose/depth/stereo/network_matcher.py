@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from itertools import chain
 from typing import Any, ClassVar
@@ -38,6 +38,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 Views = Float[Tensor, "b 3 h w"]
+Maps = Float[Tensor, "b h w"]
 
 NetworkConfig = PSMNetConfig | LightConfig
 
@@ -53,6 +54,10 @@ class StereoNetwork(nn.Module):
     """
 
     config: Any
+
+    def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
+        """Give the disparity maps [px], and P(sky) where the network has that class."""
+        return self(left, right), None
 
     @property
     def encoder(self) -> LiteEncoder | None:
@@ -213,13 +218,18 @@ class NetworkMatcher(ABC):
 
 
 def _cropped(match: Match, height: int, width: int) -> Match:
-    confidence = None if match.confidence is None else match.confidence[-height:, :width]
-    return Match(disparity_px=match.disparity_px[-height:, :width], confidence=confidence)
+    return _changed(match, lambda values: values[-height:, :width])
 
 
 def _moved(match: Match, device: torch.device) -> Match:
-    confidence = None if match.confidence is None else match.confidence.to(device)
-    return Match(disparity_px=match.disparity_px.to(device), confidence=confidence)
+    return _changed(match, lambda values: values.to(device))
+
+
+def _changed(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
+    """Give a match with every map of it changed alike."""
+    maps = {field.name: getattr(match, field.name) for field in fields(match)}
+    known = {name: change(values) for name, values in maps.items() if values is not None}
+    return Match(**known)
 
 
 def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
@@ -255,7 +265,7 @@ def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Mat
     difference_px = left_right_difference_px(found.disparity_px, right_px)
     agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
     confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
-    return Match(disparity_px=found.disparity_px, confidence=confidence)
+    return replace(found, confidence=confidence)
 
 
 def tile_change_px(

@@ -215,8 +215,8 @@ def match_tiles(
 ) -> Match:
     """Match tile by tile and blend the answers linearly where tiles overlap."""
     h, w = left.shape[-2:]
-    total = left.new_zeros(3, h, w)
-    with_confidence = True
+    total = left.new_zeros(4, h, w)
+    with_confidence = with_sky = True
     for y in _spans(h, tiling.rows, tiling.overlap, 0):
         for x in _spans(w, tiling.columns, tiling.overlap, tiling.reach):
             tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
@@ -224,11 +224,17 @@ def match_tiles(
             weight = (y.weight[:, None] * x.weight).to(left)
             total[0, y.counted, x.counted] += weight
             total[1, y.counted, x.counted] += weight * tile.disparity_px[inner]
-            with_confidence = tile.confidence is not None
+            with_confidence, with_sky = tile.confidence is not None, tile.is_sky is not None
             if tile.confidence is not None:
                 total[2, y.counted, x.counted] += weight * tile.confidence[inner]
-    disparity_px, confidence = total[1:] / total[0]
-    return Match(disparity_px=disparity_px, confidence=confidence if with_confidence else None)
+            if tile.is_sky is not None:
+                total[3, y.counted, x.counted] += weight * tile.is_sky[inner]
+    disparity_px, confidence, sky = total[1:] / total[0]
+    return Match(
+        disparity_px=disparity_px,
+        confidence=confidence if with_confidence else None,
+        is_sky=sky > 0.5 if with_sky else None,
+    )
 
 
 def _inside(span: Span) -> slice:

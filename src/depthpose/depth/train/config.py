@@ -168,8 +168,9 @@ class StereoTraining:
     """light: learning rate of the encoder as a share of the rest's."""
 
     sky_weight: float = 0.0
-    """Weight of a pixel of the sky, which is taught a disparity of 0, where another pixel with
-    truth has 1; 0 leaves the sky out."""
+    """Weight of the sky; 0 leaves it out. It is taught a disparity of 0, each pixel with so much
+    weight where another one with truth has 1; networks with a class of the sky (``with_sky``) are
+    taught that class instead, and this is the weight of its cross entropy."""
 
     adam: AdamConfig = field(default_factory=lambda: AdamConfig(schedule="halving"))
     """The optimiser: 1e-4, halved every quarter of the training."""

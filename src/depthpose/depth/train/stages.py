@@ -15,6 +15,7 @@ from depthpose.depth.losses import (
     disparity_loss,
     heads_loss,
     l1_loss,
+    sky_loss,
     valid_disparity,
 )
 from depthpose.depth.stereo import StereoNetwork, normalise
@@ -59,11 +60,18 @@ class StereoTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One update: match and compare."""
-        heads = self.matcher(normalise(batch.left), normalise(batch.right))
-        reach = self.matcher.config.max_disparity_px
+        views = normalise(batch.left), normalise(batch.right)
+        heads, sky = self.matcher.forward_with_sky(*views)
+        reach, sky_weight = self.matcher.config.max_disparity_px, self.config.sky_weight
         heads = tuple(head.float() for head in heads)
-        loss = heads_loss(heads, batch.left_px, reach, sky_weight=self.config.sky_weight)
-        yield Update("matcher", loss, {"epe": mean_error_px(heads[-1], batch.left_px, reach)})
+        facts = {"epe": mean_error_px(heads[-1], batch.left_px, reach)}
+        if sky is None:
+            loss = heads_loss(heads, batch.left_px, reach, sky_weight=sky_weight)
+        else:
+            error = sky_loss(sky.float(), batch.left_px)
+            loss = heads_loss(heads, batch.left_px, reach) + sky_weight * error
+            facts["sky"] = error.detach()
+        yield Update("matcher", loss, facts)
 
     def validate(self) -> ValidationResult:
         """Match held-out pairs: mean error and the share of bad pixels; the first as a picture."""

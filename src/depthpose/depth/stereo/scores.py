@@ -1,0 +1,80 @@
+"""What the scores of the light network say: disparity, confidence, and where the sky is."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.depth.stereo.enlargement import Features, Maps, Quarter
+from depthpose.depth.stereo.psmnet import conv_norm_2d
+from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
+
+Scores = Float[Tensor, "b d h4 w4"]
+
+STEP_PX = 4
+"""Distance of neighbouring disparities that have a score."""
+_USUAL_PX = 64
+"""A disparity of this size is 1 to the class of the sky."""
+
+
+def mean_of_best(scores: Scores, candidates: int) -> Quarter:
+    """Give the expected disparity [px] over the disparities of the highest scores."""
+    best = scores.topk(candidates, 1)
+    return STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
+
+
+def mean_of_all(scores: Scores) -> Quarter:
+    """Give the expected disparity [px] over all disparities."""
+    bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
+    return STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
+
+
+def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
+    """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
+
+    As PSMNet's confidence: between the disparities that have a score, scores are interpolated.
+    """
+    bins = scores.shape[1]
+    count = STEP_PX * (bins - 1) + 1
+    matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
+    probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
+    steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
+    is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
+    return (probability * is_near).sum(1).clamp(0, 1)
+
+
+class SkyHead(nn.Module):
+    """Probability of the sky at 1/4 size; it begins as unlikely everywhere."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.hidden = conv_norm_2d(width + 2, 32)
+        self.logit = nn.Conv2d(32, 1, 1)
+        nn.init.zeros_(self.logit.weight)
+        assert self.logit.bias is not None
+        nn.init.constant_(self.logit.bias, -2.0)
+
+    def forward(self, features: Features, scores: Scores, quarter_px: Quarter) -> Quarter:
+        """Tell the sky by features of the left view, and by its match, which learns nothing."""
+        sharpness = scores.detach().softmax(1).amax(1)
+        match = torch.stack([sharpness, quarter_px.detach() / _USUAL_PX], 1)
+        hidden = F.relu(self.hidden(torch.cat([features, match.to(features)], 1)))
+        return self.logit(hidden)[:, 0].to(scores).sigmoid()
+
+
+class Reading(NamedTuple):
+    """What the scores say about the left view.
+
+    Attributes:
+        found_px: disparity before the refinement [px].
+        disparity_px: after it; in eval mode with the sky at its least value.
+        confidence: 0..1, or None where it was not asked for.
+        sky: probability of the sky, or None where the network has no such class.
+    """
+
+    found_px: Maps
+    disparity_px: Maps
+    confidence: Maps | None
+    sky: Maps | None

@@ -1,0 +1,217 @@
+"""The sky in pairs: a class of the light network, from its loss to the files of an estimate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.depth.test_stereo_light import SMALL, random_network, shifted_pair, training_batch
+from tests.synthetic_street import make_street
+
+from depthpose.core.camera import StereoRig
+from depthpose.depth.config import LightConfig, MatcherConfig
+from depthpose.depth.disparity import resized_match
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator.far import is_cut_off, join_far
+from depthpose.depth.estimator.rig import join_matches
+from depthpose.depth.export import depth_export
+from depthpose.depth.labels import LabelConfig, label_pair
+from depthpose.depth.losses import sky_loss
+from depthpose.depth.predictions import read_sky, write_estimate
+from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, normalise
+from depthpose.depth.train import StereoTask
+from depthpose.depth.train.config import StereoTraining
+from depthpose.depth.types import DepthEstimate, Match
+from depthpose.depth.weights import DepthWeights
+
+PLAIN = replace(SMALL, with_sky=False)
+
+
+def partly_sky(config: LightConfig = SMALL) -> LightStereo:
+    """A random network that takes some pixels of random images for sky, and not others."""
+    network = random_network(config)
+    assert network.sky is not None
+    torch.nn.init.normal_(network.sky.logit.weight)
+    assert network.sky.logit.bias is not None
+    torch.nn.init.zeros_(network.sky.logit.bias)
+    return network
+
+
+class UpperHalf:
+    """A matcher that sees the sky in the upper half of a view and 4 px below."""
+
+    def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
+        is_sky = torch.zeros(left.shape[1:], dtype=torch.bool)
+        is_sky[: left.shape[1] // 2] = True
+        disparity_px = torch.where(is_sky, 0.01, 4.0)
+        return Match(disparity_px=disparity_px, confidence=torch.ones_like(left[0]), is_sky=is_sky)
+
+
+def rig(height: int, width: int, apart_px: float = 0.0) -> StereoRig:
+    K = torch.tensor([[100.0, 0, width / 2], [0, 100, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return StereoRig(
+        width=width, height=height, K=K, baseline_m=0.5, cx_right_minus_left_px=apart_px
+    )
+
+
+def estimated(apart_px: float = 0.0) -> DepthEstimate:
+    image = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(0))
+    net = FakestereoNet(UpperHalf())
+    return net.estimate(image, rig(20, 30, apart_px), right=image, with_check=False)
+
+
+def test_the_loss_is_the_cross_entropy_where_the_sky_is_known() -> None:
+    probability = torch.tensor([[[0.8, 0.3, 0.9, 0.5]]], requires_grad=True)
+    truth_px = torch.tensor([[[0.0, 7.0, torch.nan, 0.0]]])
+    loss = sky_loss(probability, truth_px)
+    expected = -(np.log(0.8001) + np.log(0.7001) + np.log(0.5001)) / 3
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
+    (gradient,) = torch.autograd.grad(loss, probability)
+    assert float(gradient[0, 0, 2]) == 0
+    assert float(sky_loss(torch.zeros(1, 1, 1), truth_px[..., 2:3])) == 0
+    certain = torch.zeros(1, 1, 1, requires_grad=True)
+    (gradient,) = torch.autograd.grad(sky_loss(certain, truth_px[..., :1]), certain)
+    assert bool(gradient.isfinite())
+
+
+def test_the_sky_is_learnt_as_a_class_and_not_as_a_disparity() -> None:
+    torch.manual_seed(0)
+    config = StereoTraining(light=SMALL, with_frozen_stem=False, encoder_rate=1.0, sky_weight=1.0)
+    task = StereoTask(LightStereo(SMALL), config, None)
+    batch = training_batch()
+    for view in (batch.left, batch.right):
+        view[:, :, :24] = 1.0
+    batch.left_px[:, :24] = 0.0
+    optimizer = torch.optim.Adam(task.matcher.parameters(), lr=5e-3)
+    for _ in range(30):
+        (turn,) = task.step(batch)
+        optimizer.zero_grad()
+        turn.loss.backward()
+        optimizer.step()
+    (turn,) = task.step(batch)
+    assert set(turn.facts) == {"epe", "sky"}
+    assert float(turn.facts["sky"]) < 0.3
+    with torch.no_grad():
+        views = normalise(batch.left), normalise(batch.right)
+        heads, sky = task.matcher.forward_with_sky(*views)
+    assert sky is not None
+    assert len(heads) == 3
+    is_sky = batch.left_px == 0
+    assert float(sky[is_sky].mean()) > float(sky[~is_sky].mean()) + 0.3
+    assert float(heads[-1][is_sky].mean()) > 1, "its disparity is not taught"
+
+
+def test_the_match_says_where_the_sky_is() -> None:
+    network = partly_sky()
+    left, right = shifted_pair(40, 70, 5)
+    found = LightMatcher(network).match(left, right)
+    assert found.is_sky is not None
+    assert found.is_sky.shape == (40, 70)
+    assert 0.05 < float(found.is_sky.float().mean()) < 0.95
+    assert float(found.disparity_px[found.is_sky].max()) == pytest.approx(0.01)
+    assert float(found.disparity_px[~found.is_sky].max()) > 1
+    assert found.confidence is not None
+    assert float(found.confidence[found.is_sky].min()) > 0.5, "its probability"
+    unsure = LightMatcher(network, MatcherConfig(with_confidence=False)).match(left, right)
+    assert unsure.is_sky is not None
+    assert unsure.confidence is None
+    assert float((unsure.is_sky != found.is_sky).float().mean()) < 0.001
+    for settings in ({"tile_px": (20, 35)}, {"with_left_right_check": True}):
+        other = LightMatcher(network, MatcherConfig(**settings)).match(left, right)  # pyright: ignore[reportArgumentType]
+        assert other.is_sky is not None
+        assert other.is_sky.shape == (40, 70)
+        assert bool(other.is_sky.any())
+
+
+def test_another_size_has_the_same_sky() -> None:
+    left = torch.rand(3, 20, 30)
+    found = resized_match(UpperHalf().match(left, left), 40, 90)
+    assert found.is_sky is not None
+    assert torch.equal(found.is_sky, torch.arange(40)[:, None].expand(40, 90) < 20)
+
+
+@pytest.mark.parametrize("apart_px", [0.0, 6.0])
+def test_an_estimate_has_no_depth_in_the_sky(apart_px: float) -> None:
+    found = estimated(apart_px)
+    assert found.is_sky is not None
+    assert found.depth_m is not None
+    assert torch.equal(found.depth_m.isnan(), found.is_sky)
+    assert torch.equal(found.is_sky, torch.arange(20)[:, None].expand(20, 30) < 10)
+    expected_px = torch.where(found.is_sky, 100 * 0.5 / 10_000 - apart_px, 4.0)
+    torch.testing.assert_close(found.disparity_px, expected_px)
+    assert "sky 50%" in repr(found)
+    assert len(found.cloud().points) == 300
+
+
+def test_without_a_rig_the_disparity_of_the_sky_is_next_to_nothing() -> None:
+    image = torch.rand(3, 20, 30)
+    found = FakestereoNet(UpperHalf()).estimate(image, right=image, with_check=False)
+    assert found.is_sky is not None
+    assert float(found.disparity_px[found.is_sky].max()) == pytest.approx(0.01)
+
+
+def test_the_sky_is_not_what_a_rig_cuts_off() -> None:
+    left = torch.rand(3, 20, 30)
+    found = UpperHalf().match(left, left)
+    assert not is_cut_off(found)
+    assert is_cut_off(replace(found, is_sky=None))
+    joined = join_far(found, UpperHalf().match(torch.rand(3, 20, 35), left), 5)
+    assert joined.is_sky is not None
+    assert joined.is_sky.shape == (20, 30)
+
+
+def test_the_generator_is_believed_where_the_matcher_sees_the_sky() -> None:
+    left = torch.rand(3, 2, 3)
+    own = Match(disparity_px=torch.full((2, 3), 16.0), confidence=torch.ones(2, 3))
+    joined = join_matches(own, UpperHalf().match(left, left))
+    torch.testing.assert_close(joined.disparity_px[0], torch.full((3,), 16.0))
+    torch.testing.assert_close(joined.disparity_px[1], torch.full((3,), 8.0))
+
+
+def test_labels_leave_the_sky_out() -> None:
+    image = torch.rand(3, 20, 30)
+    pair = replace(make_street(0.1).input, left=image, right=image, camera=rig(20, 30))
+    known_px = label_pair(FakestereoNet(UpperHalf()), pair, LabelConfig())
+    assert bool(known_px[:10].isnan().all())
+    assert float(known_px[10:, 4:].min()) == 4.0
+
+
+def test_the_sky_is_written_beside_the_depth(tmp_path: Path) -> None:
+    found = estimated()
+    assert found.seen is not None
+    write_estimate(tmp_path, found.seen, found)
+    written = read_sky(tmp_path, found.seen.name)
+    assert written is not None
+    assert found.is_sky is not None
+    assert torch.equal(written, found.is_sky)
+
+
+def test_a_network_without_the_class_says_nothing_of_the_sky() -> None:
+    network: StereoNetwork = random_network(PLAIN)
+    left, right = shifted_pair(32, 64, 5)
+    with torch.no_grad():
+        heads, sky = network.forward_with_sky(left[None], right[None])
+    assert sky is None
+    assert len(heads) == 1
+    assert LightMatcher(random_network(PLAIN)).match(left, right).is_sky is None
+
+
+@pytest.mark.slow
+def test_the_graph_of_a_pair_has_the_sky() -> None:
+    """Of a random network, a few pixels lie on the border of a decision."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    network = partly_sky(replace(SMALL, work_focal_px=90.0))
+    export = depth_export(DepthWeights(generator=None, matcher=network, facts={}), "pair", {})
+    session = onnxruntime.InferenceSession(export.graph().model({}).SerializeToString())
+    names = [output.name for output in session.get_outputs()]
+    assert sorted(names) == ["confidence", "disparity_px", "is_sky"]
+    shares = []
+    for case in export.cases():
+        found = dict(zip(names, session.run(None, dict(case.inputs)), strict=True))
+        expected = case.expected["is_sky"]
+        shares.append(float(expected.mean()))
+        assert found["is_sky"].dtype == bool
+        assert float((found["is_sky"] != expected).mean()) < 0.02
+        assert set(found["disparity_px"][found["is_sky"]]) <= {np.float32(0.01)}
+    assert 0.01 < max(shares) < 0.99
