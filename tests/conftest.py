@@ -1,5 +1,6 @@
 import contextlib
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # How long an example takes is the machine's, not the code's.
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
+
+# Nothing of a test stays in the user's cache, nor comes from there.
+os.environ["DEPTHPOSE_CACHE"] = tempfile.mkdtemp(prefix="depthpose-cache-")
 
 # One thread each, as 'make test' has it: sums of several threads are added in another order, and a
 # short training may then end elsewhere. Programs that a test starts inherit it.

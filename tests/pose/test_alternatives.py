@@ -1,7 +1,10 @@
 """Poses that fit as well as the best: found by the shape of the model, shared, named, counted."""
 
 import math
+from collections import OrderedDict
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +21,15 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import difference_of, find_copies, share_out
-from depthpose.pose.mesh import make_model, near_symmetries, true_symmetries, turn_about
+from depthpose.pose.mesh import (
+    NearSymmetry,
+    kept,
+    make_model,
+    near,
+    near_symmetries,
+    true_symmetries,
+    turn_about,
+)
 from depthpose.pose.metrics import add_m
 from depthpose.pose.types import ObjectModel, Symmetries
 
@@ -136,3 +147,41 @@ def test_words_tell_the_axis_and_the_shift() -> None:
                                  torch.tensor(math.pi / 2, dtype=torch.float64))  # fmt: skip
     said = difference_of(oblique, first, copies)
     assert said == "turned by 90 degrees about the model's axis (0.71, 0.71, 0.00)"
+
+
+def test_what_was_found_is_kept_for_the_next_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
+    monkeypatch.setattr(kept, "_memory", OrderedDict())
+    model = replace(bar(), symmetries=Symmetries(is_found=True))
+    found = near_symmetries(model)
+    (path,) = tmp_path.glob("near_symmetries/*.json")
+    assert found
+    searches: list[ObjectModel] = []
+    search = near._search
+
+    def counted(model: ObjectModel) -> Any:  # noqa: ANN401
+        searches.append(model)
+        return search(model)
+
+    monkeypatch.setattr(near, "_search", counted)
+
+    def again() -> tuple[NearSymmetry, ...]:
+        monkeypatch.setattr(kept, "_memory", OrderedDict())
+        return near_symmetries(model)
+
+    assert all(
+        one.deviation == other.deviation
+        and torch.equal(one.model_from_model.matrix(), other.model_from_model.matrix())
+        for one, other in zip(again(), found, strict=True)
+    )
+    assert true_symmetries(model).is_found
+    assert not searches
+    path.write_text('{"near": [[1')
+    assert len(again()) == len(found)
+    assert len(searches) == 1, "a damaged file is no answer"
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path / "file"))
+    assert len(again()) == len(found), "what cannot be written is found again"
+    assert len(searches) == 2

@@ -11,6 +11,7 @@ from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
 from depthpose.core.files.disk import AnyPath as AnyPath
 from depthpose.core.files.disk import atomic_write as atomic_write
+from depthpose.core.files.disk import cache_folder as cache_folder
 from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
 from depthpose.core.files.images import encode_image as encode_image

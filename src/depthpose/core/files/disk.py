@@ -100,6 +100,15 @@ def refused_write(path: AnyPath) -> Iterator[None]:
         ) from error
 
 
+def cache_folder() -> Path:
+    """Give the folder of what can be fetched or computed again.
+
+    It is ``$DEPTHPOSE_CACHE``, by default ``~/.cache/depthpose``; it need not exist.
+    """
+    named = os.environ.get("DEPTHPOSE_CACHE")
+    return Path(named) if named else Path("~/.cache/depthpose").expanduser()
+
+
 @contextmanager
 def atomic_write(path: AnyPath) -> Iterator[Path]:
     """Write a file whole or not at all.

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import os
 import re
 import tarfile
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, read_bytes, read_json, write_json
+from depthpose.core.files import atomic_write, cache_folder, read_bytes, read_json, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.shards import SOURCE
 from depthpose.depth.datasets.frames import Frame
@@ -98,8 +97,7 @@ def local_folder(folder: Path | str) -> Path:
     if _URL.match(text) is None:
         return Path(folder)
     url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
-    cache = Path(os.environ.get("DEPTHPOSE_CACHE", Path.home() / ".cache/depthpose"))
-    here = cache / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
+    here = cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
     _fetch_small(url, here)
     write_json(here / SOURCE, {"url": url})
     return here

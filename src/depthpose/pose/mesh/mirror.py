@@ -1,7 +1,6 @@
 """How far the mirror image of a model is from it: whether a left and a right part differ."""
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -9,6 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, fit_rigid, geodesic_rad
+from depthpose.pose.mesh.kept import kept
 from depthpose.pose.mesh.propose import SurfaceDeviation
 from depthpose.pose.mesh.sampling import fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -25,16 +25,20 @@ _NEAREST = 0.9
 _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 
 
-@lru_cache(maxsize=64)
 def mirror_deviation(model: ObjectModel) -> float:
     """Measure how far the mirror image of a model deviates from it, in diameters.
 
     The mirror image is laid on the model by ICP from the best of 400 mirror planes and rotary
-    reflections; the deviation is the largest distance but for 2 % of the points. About a second.
+    reflections; the deviation is the largest distance but for 2 % of the points. It takes about a
+    second, once for each shape: it is kept in ``$DEPTHPOSE_CACHE``.
 
     Args:
         model: the object, a mesh or points with normals.
     """
+    return kept(model, "mirror_deviation", _deviation, float)
+
+
+def _deviation(model: ObjectModel) -> float:
     surface = SurfaceDeviation(model)
     found = [slid(surface, R @ _FLIP, _FLIP) for R in _starts(surface)]
     R, shift = torch.stack([t.R for t in found]) @ _FLIP, torch.stack([t.t_m for t in found])

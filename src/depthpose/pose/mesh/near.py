@@ -1,16 +1,15 @@
 """Near-symmetries: turns of a model that a depth sensor hardly distinguishes from none."""
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
-from hashlib import sha256
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh.kept import kept
 from depthpose.pose.mesh.mirror import slid
 from depthpose.pose.mesh.propose import SurfaceDeviation, promising_turns
 from depthpose.pose.mesh.symmetry import symmetry_transforms, turn_about
@@ -31,7 +30,6 @@ _FINE_STEP = math.pi / 36
 _MOST = 24
 _STARTS = 24
 """Turns that ICP refines."""
-_KEPT_MODELS = 64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,20 +47,22 @@ class NearSymmetry:
 
 
 class _Known(NamedTuple):
-    """What is kept of a model: turns that look alike, and those that nearly do."""
+    """What is kept of a model.
 
-    alike: Symmetries
+    Attributes:
+        near: turns that nearly look alike.
+        alike: which discrete symmetries that were found look alike, and which axes.
+    """
+
     near: tuple[NearSymmetry, ...]
-
-
-_known: OrderedDict[str, _Known] = OrderedDict()
+    alike: tuple[list[bool], list[bool]]
 
 
 def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     """Find the turns that leave a model nearly as it is, the nearest first.
 
     Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
-    once for each shape in a process, which takes a second or a few.
+    once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
 
     Args:
         model: the object, a mesh or points with normals.
@@ -78,42 +78,33 @@ def true_symmetries(model: ObjectModel) -> Symmetries:
     """
     if not model.symmetries.is_found:
         return model.symmetries
-    return _look_up(model).alike
+    return _true(model.symmetries, _look_up(model).alike)
 
 
 def _look_up(model: ObjectModel) -> _Known:
-    key = _key_of(model)
-    if key not in _known:
-        _known[key] = _search(model)
-        while len(_known) > _KEPT_MODELS:
-            _known.popitem(last=False)
-    return _known[key]
+    return kept(model, "near_symmetries", _search, _decoded)
 
 
-def _key_of(model: ObjectModel) -> str:
-    """Name a shape and its symmetries by their bytes."""
-    symmetries = model.symmetries
-    every = [model.vertices_m, model.faces]
-    if symmetries.discrete is not None:
-        every.append(symmetries.discrete.R)
-    every += [axis.direction for axis in symmetries.continuous]
-    digest = sha256(str(symmetries.is_found).encode())
-    for tensor in every:
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
+def _decoded(found: Any) -> _Known:  # noqa: ANN401
+    turns = torch.tensor([matrix for matrix, _ in found["near"]], dtype=torch.float64)
+    near = [
+        NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
+        for M, (_, deviation) in zip(turns.reshape(-1, 4, 4), found["near"], strict=True)
+    ]
+    discrete, axes = found["alike"]
+    return _Known(tuple(near), (discrete, axes))
 
 
-def _search(model: ObjectModel) -> _Known:
+def _search(model: ObjectModel) -> dict[str, Any]:
     surface = SurfaceDeviation(model)
-    given = model.symmetries
-    alike = _alike(given, surface) if given.is_found else given
-    same = symmetry_transforms(alike, _FINE_STEP).R.double()
-    kept: list[NearSymmetry] = []
+    alike = _alike(model.symmetries, surface)
+    same = symmetry_transforms(_true(model.symmetries, alike), _FINE_STEP).R.double()
+    near: list[tuple[Rigid, float]] = []
     for off, turn in sorted(_measured(model, surface), key=lambda pair: pair[0]):
-        others = [torch.eye(3).double(), *(one.model_from_model.R for one in kept)]
-        if len(kept) < _MOST and off <= 2 * _TOLERANCE and _is_new(turn.R, others, same):
-            kept.append(NearSymmetry(model_from_model=turn, deviation=off))
-    return _Known(alike, tuple(kept))
+        others = [torch.eye(3).double(), *(one.R for one, _ in near)]
+        if len(near) < _MOST and off <= 2 * _TOLERANCE and _is_new(turn.R, others, same):
+            near.append((turn, off))
+    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
 
 
 def _measured(model: ObjectModel, surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
@@ -160,23 +151,26 @@ def _in_model(turn: Rigid, surface: SurfaceDeviation, model: ObjectModel) -> Rig
     return Rigid(turn.R, centre_m - turn.R @ centre_m + turn.t_m * model.diameter_m)
 
 
-def _alike(given: Symmetries, surface: SurfaceDeviation) -> Symmetries:
-    """Keep the symmetries whose copies lie on the surface."""
+def _alike(given: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
+    """Mark the discrete symmetries, and the axes, whose copies lie on the surface."""
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    axes = tuple(
-        axis
-        for axis in given.continuous
-        if float(
-            surface.deviation(
-                turn_about(axis.direction.double(), torch.zeros(3).double(), circle).R
-            ).max()
-        )
-        <= ALIKE
-    )
+    zero = torch.zeros(3).double()
+    turns = [turn_about(axis.direction.double(), zero, circle).R for axis in given.continuous]
+    axes = [float(surface.deviation(R).max()) <= ALIKE for R in turns]
+    if given.discrete is None:
+        return [], axes
+    return (surface.deviation(given.discrete.R.double()) <= ALIKE).tolist(), axes
+
+
+def _true(given: Symmetries, alike: tuple[list[bool], list[bool]]) -> Symmetries:
+    """Give the symmetries that were marked; declared ones are all true."""
+    if not given.is_found:
+        return given
     discrete = given.discrete
     if discrete is not None:
-        is_alike = surface.deviation(discrete.R.double()) <= ALIKE
-        discrete = discrete[is_alike] if is_alike.any() else None
+        discrete = discrete[torch.tensor(alike[0])] if any(alike[0]) else None
+    marked = zip(given.continuous, alike[1], strict=True)
+    axes = tuple(axis for axis, is_alike in marked if is_alike)
     return Symmetries(discrete=discrete, continuous=axes, is_found=True)
 
 
