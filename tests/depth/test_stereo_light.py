@@ -139,7 +139,7 @@ def test_weights_without_a_part_are_trained_on_with_it(part: str, tmp_path: Path
     network = random_network(plain)
     facts = {"licence": "MIT", "trained_on": "nothing"}
     write_depth_weights(start, matcher=network, facts=facts)
-    config = StereoTraining(light=SMALL, start=str(start))
+    config = StereoTraining(light=SMALL, start=str(start), sky_weight=0.5)
     found = make_matcher_network(config)
     assert isinstance(found, LightStereo)
     pair = torch.randn(2, 1, 3, 32, 64).unbind()
@@ -305,7 +305,9 @@ def training_batch() -> TrainingPair:
 
 def stereo_task(**settings: Any) -> StereoTask:  # noqa: ANN401
     torch.manual_seed(0)
-    return StereoTask(LightStereo(SMALL), StereoTraining(light=SMALL, **settings), None)
+    return StereoTask(
+        LightStereo(SMALL), StereoTraining(light=SMALL, sky_weight=0.5, **settings), None
+    )
 
 
 def test_it_learns_and_every_part_gets_gradients() -> None:
@@ -375,7 +377,7 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     pairs = PairsConfig(streets=StreetsConfig(frames=2, scale=0.1))
     run, loop = Run(folder=tmp_path / "run"), LoopConfig(steps=1)
     with pytest.raises(InputError, match="give --encoder"):
-        train_stereo(StereoTraining(light=SMALL, pairs=pairs, loop=loop), run)
+        train_stereo(StereoTraining(light=SMALL, sky_weight=0.5, pairs=pairs, loop=loop), run)
     with pytest.raises(InputError, match="give the config a light network"):
         train_stereo(StereoTraining(encoder="x.safetensors", pairs=pairs, loop=loop), run)
     other = tmp_path / "psmnet.safetensors"
@@ -383,9 +385,14 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     facts = {"licence": "MIT", "trained_on": "nothing"}
     write_depth_weights(other, matcher=PSMNet(tiny), facts=facts)
     with pytest.raises(InputError, match="weights of PSMNet, but the config trains LightStereo"):
-        train_stereo(StereoTraining(light=SMALL, start=str(other), pairs=pairs, loop=loop), run)
+        train_stereo(
+            StereoTraining(light=SMALL, sky_weight=0.5, start=str(other), pairs=pairs, loop=loop),
+            run,
+        )
     two_deep = dataclasses.replace(SMALL, max_disparity_px=64)
     loop = LoopConfig(steps=1, precision="bf16")
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="max_disparity_px 96, or precision fp32"):
-            train_stereo(StereoTraining(light=two_deep, pairs=pairs, loop=loop), run)
+            train_stereo(
+                StereoTraining(light=two_deep, sky_weight=0.5, pairs=pairs, loop=loop), run
+            )

@@ -10,6 +10,9 @@ from tests.depth.test_stereo_light import SMALL, random_network, shifted_pair, t
 from tests.synthetic_street import make_street
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.draw import draw_disparity
+from depthpose.core.errors import InputError
+from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resized_match
 from depthpose.depth.estimator import FakestereoNet
@@ -21,7 +24,10 @@ from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_sky, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, normalise
 from depthpose.depth.train import StereoTask
+from depthpose.depth.train.adapt import AdaptationCheck
 from depthpose.depth.train.config import StereoTraining
+from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.stages import validate_pairs
 from depthpose.depth.types import DepthEstimate, Match
 from depthpose.depth.weights import DepthWeights
 
@@ -39,12 +45,12 @@ def partly_sky(config: LightConfig = SMALL) -> LightStereo:
 
 
 class UpperHalf:
-    """A matcher that sees the sky in the upper half of a view and 4 px below."""
+    """A matcher that finds 4 px everywhere and the sky in the upper half of a view."""
 
     def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
         is_sky = torch.zeros(left.shape[1:], dtype=torch.bool)
         is_sky[: left.shape[1] // 2] = True
-        disparity_px = torch.where(is_sky, 0.01, 4.0)
+        disparity_px = torch.full(left.shape[1:], 4.0)
         return Match(disparity_px=disparity_px, confidence=torch.ones_like(left[0]), is_sky=is_sky)
 
 
@@ -109,8 +115,6 @@ def test_the_match_says_where_the_sky_is() -> None:
     assert found.is_sky is not None
     assert found.is_sky.shape == (40, 70)
     assert 0.05 < float(found.is_sky.float().mean()) < 0.95
-    assert float(found.disparity_px[found.is_sky].max()) == pytest.approx(0.01)
-    assert float(found.disparity_px[~found.is_sky].max()) > 1
     assert found.confidence is not None
     assert float(found.confidence[found.is_sky].min()) > 0.5, "its probability"
     unsure = LightMatcher(network, MatcherConfig(with_confidence=False)).match(left, right)
@@ -129,6 +133,7 @@ def test_another_size_has_the_same_sky() -> None:
     found = resized_match(UpperHalf().match(left, left), 40, 90)
     assert found.is_sky is not None
     assert torch.equal(found.is_sky, torch.arange(40)[:, None].expand(40, 90) < 20)
+    assert torch.equal(found.disparity_px, torch.full((40, 90), 12.0)), "beside the sky too"
 
 
 @pytest.mark.parametrize("apart_px", [0.0, 6.0])
@@ -155,7 +160,12 @@ def test_the_sky_is_not_what_a_rig_cuts_off() -> None:
     left = torch.rand(3, 20, 30)
     found = UpperHalf().match(left, left)
     assert not is_cut_off(found)
-    assert is_cut_off(replace(found, is_sky=None))
+    far_px = torch.where(torch.arange(30) < 2, 1.0, found.disparity_px)
+    assert is_cut_off(replace(found, disparity_px=far_px))
+    assert found.is_sky is not None
+    in_sky = replace(found, disparity_px=torch.where(found.is_sky, 1.0, 4.0))
+    assert not is_cut_off(in_sky)
+    assert is_cut_off(replace(in_sky, is_sky=None))
     joined = join_far(found, UpperHalf().match(torch.rand(3, 20, 35), left), 5)
     assert joined.is_sky is not None
     assert joined.is_sky.shape == (20, 30)
@@ -167,6 +177,80 @@ def test_the_generator_is_believed_where_the_matcher_sees_the_sky() -> None:
     joined = join_matches(own, UpperHalf().match(left, left))
     torch.testing.assert_close(joined.disparity_px[0], torch.full((3,), 16.0))
     torch.testing.assert_close(joined.disparity_px[1], torch.full((3,), 8.0))
+
+
+def test_held_out_pairs_measure_the_sky() -> None:
+    """Of the sky a third is missed, and half of the rest is taken for it."""
+
+    class Seen(StereoNetwork):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+            self.config = SMALL
+
+        def forward_with_sky(self, left, right):  # noqa: ANN001, ANN202, ARG002
+            sky = torch.zeros(1, 32, 64)
+            sky[:, :8] = sky[:, 12:22] = 0.9
+            return (torch.full((1, 32, 64), 5.0),), sky
+
+    truth_px = torch.full((32, 64), 5.0)
+    truth_px[:12] = 0.0
+    view = torch.rand(3, 32, 64)
+    pair = TrainingPair(view, view, truth_px, truth_px, torch.tensor(torch.nan))
+
+    class OnePair(TrainingPairs):
+        def __init__(self) -> None:
+            pass
+
+        def __len__(self) -> int:
+            return 1
+
+        def read(self, index: int) -> TrainingPair:  # noqa: ARG002
+            return pair
+
+    found = validate_pairs(Seen(), OnePair()).numbers
+    assert found == pytest.approx(
+        {
+            "held_out/epe_px": 2.5,
+            "held_out/d1": 0.5,
+            "held_out/sky_missed": 1 / 3,
+            "held_out/sky_false": 0.5,
+        }
+    )
+
+
+def test_a_class_that_would_not_be_learnt_is_refused() -> None:
+    with pytest.raises(InputError, match="the sky would not be learnt; set sky_weight"):
+        StereoTraining(light=SMALL)
+
+
+def test_what_becomes_sky_does_not_count_as_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
+    street = make_street(0.2).input
+
+    def matcher_of(network: StereoNetwork, _: MatcherConfig) -> object:
+        return network
+
+    class Finds(StereoNetwork):
+        def __init__(self, rows: int) -> None:
+            super().__init__()
+            self.rows = rows
+
+        def match(self, left: torch.Tensor, right: torch.Tensor) -> Match:  # noqa: ARG002
+            is_sky = torch.arange(left.shape[1])[:, None].expand(left.shape[1:]) < self.rows
+            return Match(disparity_px=torch.full(left.shape[1:], 4.0), is_sky=is_sky)
+
+    monkeypatch.setattr("depthpose.depth.train.adapt.make_matcher", matcher_of)
+    check = AdaptationCheck([street], 0, MatcherConfig())
+    before, same, more = (check.measure(Finds(rows)).disagreeing for rows in (10, 10, 20))
+    assert same == before
+    assert more > before
+
+
+def test_a_disparity_is_drawn_grey_in_the_sky() -> None:
+    drawn = draw_disparity(torch.zeros(2, 2), is_sky=torch.tensor([[True, False]] * 2))
+    nothing = draw_disparity(torch.full((2, 2), torch.nan))
+    assert torch.equal(drawn[..., 0], nothing[..., 0])
+    assert not torch.equal(drawn[..., 1], nothing[..., 1])
 
 
 def test_labels_leave_the_sky_out() -> None:

@@ -72,10 +72,13 @@ def draw_depth(
 
 
 def draw_disparity(
-    disparity_px: Float[Tensor, "h w"], largest_px: float = 96.0
+    disparity_px: Float[Tensor, "h w"],
+    largest_px: float = 96.0,
+    is_sky: Bool[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Colour disparity, large (near) bright, on the fixed scale 0..``largest_px``."""
-    return draw_share(1 - disparity_px / largest_px)
+    """Colour disparity, large (near) bright, on the fixed scale 0..``largest_px``; sky is grey."""
+    share = 1 - disparity_px / largest_px
+    return draw_share(share if is_sky is None else torch.where(is_sky, torch.nan, share))
 
 
 def draw_share(share: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:

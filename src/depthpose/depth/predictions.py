@@ -77,7 +77,7 @@ def write_estimate(
     if estimate.is_sky is not None:
         write_image(_file(base, "sky.png"), estimate.is_sky.float().expand(3, -1, -1))
     picture = (
-        draw_disparity(estimate.disparity_px)
+        draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
         if estimate.depth_m is None
         else draw_depth(estimate.depth_m, *range_m)
     )

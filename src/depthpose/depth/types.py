@@ -65,8 +65,8 @@ class Match:
         disparity_px: disparity of the left image, dense or NaN where the matcher has no answer.
         confidence: 0 (guess) to 1 (sure), from the matching distribution; None where the matcher
             has no distribution.
-        is_sky: left pixels that show the sky, where disparity is about 0; None where the matcher
-            does not know it.
+        is_sky: left pixels that show the sky, whose disparity means nothing; None where the matcher
+            does not know the sky.
     """
 
     disparity_px: Float[Tensor, "h w"]
@@ -82,7 +82,7 @@ class DepthEstimate:
         depth_m: metres along the optical axis; NaN where disparity is invalid, and in the sky.
             None without a rig.
         disparity_px: disparity that the depth was made from, at the size of the input; in the sky
-            that of a point 10 km away.
+            that of a point 10 km away, or 0.01 of a pair without a rig.
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
         is_sky: where the image shows the sky, or None where the weights do not know it.

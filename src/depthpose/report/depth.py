@@ -99,11 +99,11 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
     if depth_m is not None:
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
-        if found.is_sky is not None:
-            facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
         if len(known_m):
             low, middle, high = (float(f(known_m)) for f in (torch.min, torch.median, torch.max))
             facts.append(("nearest, middle, farthest", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
+    if found.is_sky is not None:
+        facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
     if found.warning:
         facts.insert(0, ("warning", found.warning))
     if found.confidence is not None:
@@ -130,7 +130,7 @@ def _map_drawing(shown: DepthShown) -> Drawing:
     found = shown.estimate
     if found.depth_m is None:
         return Drawing(
-            image=draw_disparity(found.disparity_px),
+            image=draw_disparity(found.disparity_px, is_sky=found.is_sky),
             caption=f"estimated disparity, large (near) bright; {grey_caption(found)}",
             scale=rising_scale("disparity [px]", 96.0, has_more=True),
         )

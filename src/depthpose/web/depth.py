@@ -17,6 +17,8 @@ from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 _MOST_WORK_PIXELS = 8_000_000
 """Of the image as networks get it, resized to the focal length that they were trained at."""
+_ALL_SKY = 0.5
+"""Share of the sky from which a pair without a depth is not taken for a wrong one."""
 _PHONE = 0.75
 """Focal length of a phone's main camera, in widths of the image."""
 
@@ -172,11 +174,9 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     is_sky = found.is_sky
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     if len(known_m) == 0:
-        why = (
-            ": is the pair rectified, and are left and right as they should be?"
-            if pair.right is not None
-            else (f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else ".")
-        )
+        why = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
+        if pair.right is not None and sky < _ALL_SKY:
+            why = ": is the pair rectified, and are left and right as they should be?"
         return f"No pixel got a depth from {given}{why}"
     warning = f"Careful: {found.warning}. " if found.warning else ""
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())

@@ -112,9 +112,10 @@ def match(
 ) -> int:
     """Match real stereo pairs to metric depth.
 
-    For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid), NAME.depth.png
-    (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.color.png, and
-    NAME.cloud.ply with --cloud. report.html shows some of them, with the cloud in 3D. A rerun skips
+    For each NAME.png on the left: NAME.depth_m.npy (metres, NaN where invalid and in the sky),
+    NAME.depth.png (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1),
+    NAME.sky.png by weights that predict the sky, NAME.color.png, and NAME.cloud.ply with --cloud.
+    report.html shows some of them, with the cloud in 3D. A rerun skips
     what is finished; other settings need another --out. Only files of the same run are overwritten.
 
         depthpose depth match left.png right.png --camera cam.json --out out
@@ -123,7 +124,7 @@ def match(
     Args:
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
             ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
-        right: right image, folder or pattern; images are paired in sorted order.
+        right: right image, folder or pattern; images are paired in the order of their names.
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.

@@ -60,12 +60,12 @@ def is_cut_off(match: Match) -> bool:
 
     The sky does not count.
     """
-    is_known = match.disparity_px.isfinite()
-    is_least = match.disparity_px < _LEAST_PX
+    disparity_px = match.disparity_px
     if match.is_sky is not None:
-        is_least &= ~match.is_sky
-    count = int(is_known.sum())
-    return 2 * count < is_known.numel() or int(is_least.sum()) > _CUT_OFF * count
+        disparity_px = disparity_px[~match.is_sky]
+    count = int(disparity_px.isfinite().sum())
+    is_least = disparity_px < _LEAST_PX
+    return 2 * count < disparity_px.numel() or int(is_least.sum()) > _CUT_OFF * count
 
 
 def moved_apart(

@@ -77,7 +77,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     focal_m_px = _focal_m_px(K, rig)
     depth_m = _depth(disparity_px, focal_m_px)
     if found.sky is not None:
-        is_sky = _is_sky(found.sky, full)
+        is_sky = resized_map(found.sky, full).op("Greater", np.float32(0.5))
         depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
         disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
         graph.output("is_sky", is_sky, np.bool_, _MAPS)
@@ -92,7 +92,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     Inputs ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
     float64) where the weights were trained at one focal length. Outputs ``disparity_px`` and
     ``confidence`` (batch, height, width), and of a network that knows the sky ``is_sky`` (the same;
-    bool), where disparity is 0.01 px. Depth is ``fx * baseline / disparity``.
+    bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
 
     Raises:
         InputError: there is no matcher in the weights.
@@ -110,7 +110,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     found = _matched(left, right, focal_px, network, config)
     disparity_px = found.disparity_px
     if found.sky is not None:
-        is_sky = _is_sky(found.sky, size_of(left))
+        is_sky = found.sky.op("Greater", np.float32(0.5))
         disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
         graph.output("is_sky", is_sky, np.bool_, _MAPS)
     _output_maps(graph, None, disparity_px, found.confidence)
@@ -140,10 +140,6 @@ def _own(seen: DrawnValues) -> _Maps:
     assert seen.disparity_px is not None and seen.confidence is not None  # noqa: PT018
     sky = None if seen.is_sky is None else seen.is_sky.cast(np.float32)
     return _Maps(seen.disparity_px, seen.confidence, sky)
-
-
-def _is_sky(sky: Value, size: Value) -> Value:
-    return resized_map(sky, size).op("Greater", np.float32(0.5))
 
 
 def _both(one: _Maps, other: _Maps) -> _Maps:

@@ -76,11 +76,11 @@ class DynamicLightStereo(nn.Module):
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Maps, ...]:
         """Give disparity [px], confidence and, with that class, the sky of normalised images."""
-        scores, seen = self.network.scores(left, right, self.network.config.max_disparity_px)
-        read = self.network.read(scores, seen, with_confidence=True)
+        reach = self.network.config.max_disparity_px
+        read = self.network.read(left, right, reach, with_confidence=True)
         assert read.confidence is not None
         sky = () if read.sky is None else ((read.sky > 0.5).float(),)
-        return read.disparity_px, read.confidence, *sky
+        return read.heads[-1], read.confidence, *sky
 
 
 DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {

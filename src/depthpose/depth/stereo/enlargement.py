@@ -8,10 +8,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from depthpose.depth.stereo.network_matcher import Maps
 from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d
 
 Features = Float[Tensor, "b _ _ _"]
-Maps = Float[Tensor, "b h w"]
 Quarter = Float[Tensor, "b h4 w4"]
 
 STEM = 16
@@ -19,7 +19,8 @@ STEM = 16
 _OFFSETS = (-2, -1, 0, 1, 2)
 """Where the refinement compares the views: so many pixels at half size from the disparity."""
 LEAST_PX = 0.01
-"""Of a corrected disparity in use, and of the sky: depth stays finite, some tens of kilometres."""
+"""Of a corrected disparity in use: depth stays finite. It is what a pair without a rig has in the
+sky."""
 _REFINED = 32
 """Channels of the refinement at half size."""
 

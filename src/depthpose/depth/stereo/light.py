@@ -23,7 +23,6 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.enlargement import (
-    LEAST_PX,
     STEM,
     ConvexUpsampling,
     Features,
@@ -204,50 +203,50 @@ class LightStereo(StereoNetwork):
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Maps, ...]:
-        """Give the disparity maps of :meth:`forward_with_sky`."""
-        return self.forward_with_sky(left, right)[0]
+        """Give the disparity maps of :meth:`read`."""
+        return self.read(left, right, self.config.max_disparity_px).heads
 
     def forward_with_sky(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[tuple[Maps, ...], Maps | None]:
-        """Match the pair.
+        """Give the disparity maps of :meth:`read`, and the probability of the sky."""
+        read = self.read(left, right, self.config.max_disparity_px)
+        return read.heads, read.sky
 
-        Returns:
-            Disparity of the left view [px], while training that of all scores, enlarged without
-            the image, then that before the refinement, then the answer; in eval mode the answer
-            alone. Then the probability of the sky, or None without that class.
+    def read(
+        self,
+        left: Float[Tensor, "b 3 h w"],
+        right: Float[Tensor, "b 3 h w"],
+        max_disparity_px: int,
+        *,
+        with_confidence: bool = False,
+    ) -> Reading:
+        """Match the pair, and read disparity, confidence and sky off the scores.
 
         Raises:
             InputError: the images' size does not suit the network.
         """
-        scores, seen = self.scores(left, right, self.config.max_disparity_px)
-        read = self.read(scores, seen, with_confidence=False)
-        if not self.training:
-            return (read.disparity_px,), read.sky
-        coarse_px = mean_of_all(scores)[:, None]
-        coarse_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
-        heads = (read.found_px,) if self.refinement is None else (read.found_px, read.disparity_px)
-        return (coarse_px, *heads), read.sky
-
-    def read(self, scores: Scores, seen: Seen, *, with_confidence: bool) -> Reading:
-        """Read disparity, confidence and sky off the scores, at the images' size."""
+        scores, seen = self.scores(left, right, max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
         quarters = [quarter_px]
         if with_confidence:
             quarters.append(self._confidence(scores, quarter_px))
         if self.sky is not None:
             quarters.append(self.sky(seen.left.levels[0], scores, quarter_px))
+        coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
         found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
-        disparity_px = self.refine(found_px, seen)
+        heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
+        if coarse_px is None:
+            heads = heads[-1:]
+        else:
+            wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
+            heads = (wide_px, *heads)
         sky = rest.pop() if self.sky is not None else None
         confidence = rest.pop() if with_confidence else None
-        if sky is not None and not self.training:
-            is_sky = sky > 0.5
-            disparity_px = torch.where(is_sky, LEAST_PX, disparity_px)
-            if confidence is not None:
-                confidence = torch.where(is_sky, sky, confidence * (1 - sky))
-        return Reading(found_px, disparity_px, confidence, sky)
+        if sky is not None and confidence is not None:
+            confidence = torch.where(sky > 0.5, sky, confidence * (1 - sky))
+        return Reading(heads, confidence, sky)
 
     def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:
         """By rows: probabilities between the scores are the largest volume."""

@@ -52,12 +52,14 @@ class LightMatcher(NetworkMatcher):
             rows=self._network.rows or height // 4,
         )
         footprint.refuse_more_than(self.config.max_memory_bytes)
-        scores, seen = self._network.scores(
-            left.to(self.dtype), right.to(self.dtype), network.max_disparity_px
+        read = self._network.read(
+            left.to(self.dtype),
+            right.to(self.dtype),
+            network.max_disparity_px,
+            with_confidence=self.config.with_confidence,
         )
-        read = self._network.read(scores, seen, with_confidence=self.config.with_confidence)
         nothing = [None] * len(left)
         sure = nothing if read.confidence is None else read.confidence
         sky = nothing if read.sky is None else read.sky > 0.5
-        parts = zip(read.disparity_px, sure, sky, strict=True)
+        parts = zip(read.heads[-1], sure, sky, strict=True)
         return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]

@@ -260,11 +260,13 @@ def lower_where_disagreeing(found: Match, right_px: Float[Tensor, "h w"]) -> Mat
     """Lower the confidence where the right view's own disparity is another.
 
     Halved at least where the matching point lies outside the right view: nothing there can
-    agree, and nothing contradicts.
+    agree, and nothing contradicts. That of the sky is kept.
     """
     difference_px = left_right_difference_px(found.disparity_px, right_px)
     agreement = torch.exp(-difference_px / AGREEMENT_PX).nan_to_num(0.0)
     confidence = agreement if found.confidence is None else found.confidence * (1 + agreement) / 2
+    if found.confidence is not None and found.is_sky is not None:
+        confidence = torch.where(found.is_sky, found.confidence, confidence)
     return replace(found, confidence=confidence)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
-from depthpose.depth.stereo.network_matcher import StereoNetwork
+from depthpose.depth.stereo.network_matcher import Maps, StereoNetwork
 
 
 class ConvNorm(nn.Module):
@@ -116,7 +116,6 @@ class FeatureExtractor(nn.Module):
 
 
 Volume = Float[Tensor, "b _ _ _ _"]
-Maps = Float[Tensor, "b h w"]
 
 
 def conv_norm_3d(inputs: int, outputs: int, stride: int = 1) -> ConvNorm:

@@ -68,13 +68,13 @@ class Reading(NamedTuple):
     """What the scores say about the left view.
 
     Attributes:
-        found_px: disparity before the refinement [px].
-        disparity_px: after it; in eval mode with the sky at its least value.
-        confidence: 0..1, or None where it was not asked for.
+        heads: disparity [px], the last one the answer: while training that of all scores, enlarged
+            without the image, that before the refinement, and that after it; in eval mode the last
+            alone. What it says in the sky means nothing where the network has that class.
+        confidence: 0..1, in the sky its probability; None where it was not asked for.
         sky: probability of the sky, or None where the network has no such class.
     """
 
-    found_px: Maps
-    disparity_px: Maps
+    heads: tuple[Maps, ...]
     confidence: Maps | None
     sky: Maps | None

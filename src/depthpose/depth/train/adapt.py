@@ -107,7 +107,8 @@ class AdaptMetrics:
     Attributes:
         photometric: difference of left views and right ones looked up, where the start's two
             disparities agreed.
-        disagreeing: share of pixels whose disparities of both views do not agree.
+        disagreeing: share of pixels whose disparities of both views do not agree, or that are newly
+            taken for sky.
         street_d1: share of bad disparities on synthetic streets; NaN without any.
         street_epe_px: mean error there [px].
     """
@@ -132,6 +133,7 @@ class AdaptationCheck:
         made = Streets(StreetsConfig(seed=_STREETS_SEED, scale=0.5, frames=max(streets, 1)))
         self.streets = [made[index] for index in range(streets)]
         self._seen: list[Bool[Tensor, "h w"]] = []
+        self._sky: list[Bool[Tensor, "h w"] | None] = []
 
     @torch.no_grad()
     def measure(self, matcher: StereoNetwork) -> AdaptMetrics:
@@ -144,6 +146,10 @@ class AdaptationCheck:
             agrees = is_consistent(left_px, right_px, _LIMITS)
             if len(self._seen) == number:
                 self._seen.append(agrees)
+                self._sky.append(found.is_sky)
+            before = self._sky[number]
+            if found.is_sky is not None and before is not None:
+                agrees &= before | ~found.is_sky  # nothing disagrees where all is sky
             assert pair.right is not None
             looked_up = warp_right_to_left(pair.right, left_px)
             counts = self._seen[number] & looked_up[0].isfinite()

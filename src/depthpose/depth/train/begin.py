@@ -18,7 +18,7 @@ _FREE_OF_WEIGHTS = ("max_disparity_px", "least_confidence")
 """Settings that no weight depends on: a matcher searches any disparities in the same way, and below
 which confidence images are refused is chosen after a training, by ``depth calibrate``."""
 _CAN_BE_ADDED = ("with_agreement", "with_refinement", "with_sky")
-"""Parts that begin without effect, so weights without them can be trained on with them."""
+"""Parts that begin with next to no effect, so weights without them can be trained on with them."""
 
 
 def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:

@@ -189,6 +189,11 @@ class StereoTraining:
         for name in ("encoder_rate", "sky_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        if self.light is not None and self.light.with_sky and self.sky_weight == 0:
+            raise InputError(
+                "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "
+                "sky_weight to 0.5, or leave with_sky out"
+            )
 
     @property
     def network(self) -> PSMNetConfig | LightConfig:

@@ -57,7 +57,8 @@ _MEASURED = {
     "select": "Depth from left images that were held out: mean relative error (abs_rel), share "
     "within 25 % (d1), share of the sky that is missed.",
     "stereo": "Disparity of pairs that were held out: mean error (px), and the share of "
-    "pixels off by more than 3 px and 5 % (d1).",
+    "pixels off by more than 3 px and 5 % (d1); shares of the sky that is missed, and of the rest "
+    "that is taken for sky.",
     "finetune": "Disparity from left images that were held out, by the drawn right view: "
     "mean error (px), and the share of pixels off by more than 3 px and 5 % (d1).",
 }

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
@@ -88,13 +88,23 @@ def validate_pairs(
     held_out: TrainingPairs,
     draw: Callable[[Tensor], Tensor] | None = None,
 ) -> ValidationResult:
-    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws."""
-    errors, bad, pictures = [], [], {}
+    """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws.
+
+    What is taken for sky has a disparity of 0.
+    """
+    errors, bad, missed, false, pictures = [], [], [], [], {}
     for index in range(len(held_out)):
         pair = held_out.read(index)
         right = pair.right if draw is None else draw(pair.left)
-        found = match_whole(matcher, pair.left, right)
+        found, is_sky = match_whole(matcher, pair.left, right)
         is_known = valid_disparity(pair.left_px[None], matcher.config.max_disparity_px)[0]
+        is_true_sky = pair.left_px == 0
+        if is_sky is not None:
+            found = torch.where(is_sky, 0.0, found)
+            if bool(is_true_sky.any()):
+                missed.append(float((~is_sky[is_true_sky]).float().mean()))
+            if bool(is_known.any()):
+                false.append(float(is_sky[is_known].float().mean()))
         if index == 0:
             views = [pair.left, right, draw_disparity(found)]
             pictures["left_right_disparity"] = torch.cat(views, 1)
@@ -104,8 +114,9 @@ def validate_pairs(
         errors.append(float(error.mean()))
         is_bad = (error > 3) & (error > 0.05 * pair.left_px[is_known])
         bad.append(float(is_bad.float().mean()))
-    count = max(len(errors), 1)
-    numbers = {"held_out/epe_px": sum(errors) / count, "held_out/d1": sum(bad) / count}
+    named = {"epe_px": errors, "d1": bad}
+    named |= {name: v for name, v in (("sky_missed", missed), ("sky_false", false)) if v}
+    numbers = {f"held_out/{name}": sum(v) / max(len(v), 1) for name, v in named.items()}
     return ValidationResult(numbers=numbers, pictures=pictures)
 
 
@@ -114,12 +125,18 @@ def match_whole(
     matcher: StereoNetwork,
     left: Float[Tensor, "3 h w"],
     right: Float[Tensor, "3 h w"],
-) -> Float[Tensor, "h w"]:
-    """Match one pair of any size with the network as it stands."""
+) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"] | None]:
+    """Match one pair of any size with the network as it stands; say where it sees the sky."""
     device = next(matcher.parameters()).device
     height, width = left.shape[-2:]
     padded = [pad_top_right(normalise(v.to(device)), matcher.config)[None] for v in (left, right)]
-    return matcher(*padded)[-1][0, -height:, :width].float().cpu()
+    heads, sky = matcher.forward_with_sky(*padded)
+    found, seen = (
+        None if maps is None else maps[0, -height:, :width].float().cpu()
+        for maps in (heads[-1], sky)
+    )
+    assert found is not None
+    return found, None if seen is None else seen > 0.5
 
 
 @torch.no_grad()
