@@ -38,6 +38,7 @@ class Arm:
     Attributes:
         name: in the table.
         augment: changes of the augmentation.
+        light: changes of the network.
         change: changes of the rest of the config.
         data: which synthetic scenes.
         streets: others that are rendered while training.
@@ -46,6 +47,7 @@ class Arm:
 
     name: str
     augment: dict[str, Any] = field(default_factory=dict)
+    light: dict[str, Any] = field(default_factory=dict)
     change: dict[str, Any] = field(default_factory=dict)
     data: tuple[str, ...] = ("streets", "clutter")
     streets: StreetsConfig | None = None
@@ -54,6 +56,7 @@ class Arm:
 
 OTHER_RIGS = StreetsConfig(frames=700, seed=33, scale=0.5, rigs="varied", with_lidar=False)
 """Half of them by rigs of 0.12 to 0.8 m and other fields of view."""
+NO_SKY = {"with_sky": False}
 SCRATCH = {"encoder": None, "with_frozen_stem": False, "encoder_rate": 1.0}
 ARMS = (
     Arm(name="the recipe"),
@@ -64,8 +67,9 @@ ARMS = (
     Arm(name="no clutter", data=("streets",)),
     Arm(name="no streets", data=("clutter",)),
     Arm(name="half of the rigs others than KITTI's", data=("clutter",), streets=OTHER_RIGS),
-    Arm(name="the sky has no truth", change={"sky_weight": 0.0}),
-    Arm(name="the sky counts a tenth", change={"sky_weight": 0.1}),
+    Arm(name="the sky is a disparity of 0", light=NO_SKY, change={"sky_weight": 1.0}),
+    Arm(name="the sky has no truth", light=NO_SKY, change={"sky_weight": 0.0}),
+    Arm(name="the sky counts a tenth", light=NO_SKY, change={"sky_weight": 0.1}),
     Arm(name="encoder from scratch", change=SCRATCH),
     Arm(name="the recipe", seed=1),
 )
@@ -93,7 +97,9 @@ def config_of(arm: Arm, options: argparse.Namespace) -> StereoTraining:
 def run_arm(arm: Arm, options: argparse.Namespace) -> None:
     """Train once; a finished run is reused, another one resumed."""
     folder = options.out / f"{arm.name.replace(' ', '_')}-{arm.seed}"
-    config = replace(config_of(arm, options), **arm.change)
+    base = config_of(arm, options)
+    assert base.light is not None
+    config = replace(base, **{"light": replace(base.light, **arm.light)} | arm.change)
     weights = STAGES["stereo"][1](config, Run(folder=folder, resume=folder.exists()))
     row: dict[str, Any] = {"arm": arm.name, "seed": arm.seed} | held_out(folder)
     for name, data in (("eval", options.evaluate), ("Motorcycle", None)):

@@ -193,12 +193,17 @@ class LightStereo(StereoNetwork):
             self.config.width, with_agreement=self.config.with_agreement
         )
         self.refinement = Refinement() if self.config.with_refinement else None
-        self.sky = SkyHead(self.config.width) if self.config.with_sky else None
+        self.sky_head = SkyHead(self.features.widths) if self.config.with_sky else None
 
     @property
     def encoder(self) -> LiteEncoder:
         """Of ImageNet, in the features."""
         return self.features.encoder
+
+    @property
+    def sky(self) -> SkyHead | None:
+        """The class of the sky."""
+        return self.sky_head
 
     def forward(
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
@@ -231,8 +236,8 @@ class LightStereo(StereoNetwork):
         quarters = [quarter_px]
         if with_confidence:
             quarters.append(self._confidence(scores, quarter_px))
-        if self.sky is not None:
-            quarters.append(self.sky(seen.left.levels[0], scores, quarter_px))
+        if self.sky_head is not None:
+            quarters.append(self.sky_head(seen.left.levels, scores, quarter_px))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
         found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
@@ -242,7 +247,7 @@ class LightStereo(StereoNetwork):
         else:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
             heads = (wide_px, *heads)
-        sky = rest.pop() if self.sky is not None else None
+        sky = rest.pop() if self.sky_head is not None else None
         confidence = rest.pop() if with_confidence else None
         if sky is not None and confidence is not None:
             confidence = torch.where(sky > 0.5, sky, confidence * (1 - sky))

@@ -64,6 +64,11 @@ class StereoNetwork(nn.Module):
         """The part that may begin with weights of ImageNet, which trains more slowly."""
         return None
 
+    @property
+    def sky(self) -> nn.Module | None:
+        """The class of the sky, which may be trained alone."""
+        return None
+
 
 class NetworkMatcher(ABC):
     """A network with pre- and post-processing: normalisation, padding, device, tiles.

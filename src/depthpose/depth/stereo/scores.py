@@ -17,6 +17,8 @@ STEP_PX = 4
 """Distance of neighbouring disparities that have a score."""
 _USUAL_PX = 64
 """A disparity of this size is 1 to the class of the sky."""
+_SKY_WIDTH = 32
+"""Channels of the class of the sky."""
 
 
 def mean_of_best(scores: Scores, candidates: int) -> Quarter:
@@ -46,21 +48,35 @@ def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
 
 
 class SkyHead(nn.Module):
-    """Probability of the sky at 1/4 size; it begins as unlikely everywhere."""
+    """Probability of the sky at 1/4 size; it begins as unlikely everywhere.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        widths: channels of the left view's features at 1/4, 1/8, 1/16 and 1/32.
+    """
+
+    def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.hidden = conv_norm_2d(width + 2, 32)
-        self.logit = nn.Conv2d(32, 1, 1)
+        quarter, *coarser = widths
+        above = [_SKY_WIDTH] * len(coarser)
+        self.coarse = nn.ModuleList(
+            conv_norm_2d(w + a, _SKY_WIDTH) for w, a in zip(coarser, [*above[1:], 0], strict=True)
+        )
+        self.hidden = conv_norm_2d(quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
+        self.logit = nn.Conv2d(_SKY_WIDTH, 1, 1)
         nn.init.zeros_(self.logit.weight)
         assert self.logit.bias is not None
         nn.init.constant_(self.logit.bias, -2.0)
 
-    def forward(self, features: Features, scores: Scores, quarter_px: Quarter) -> Quarter:
+    def forward(self, levels: tuple[Features, ...], scores: Scores, quarter_px: Quarter) -> Quarter:
         """Tell the sky by features of the left view, and by its match, which learns nothing."""
+        quarter, *coarser = levels
+        found: list[Tensor] = []
+        for layer, level in zip(reversed(self.coarse), reversed(coarser), strict=True):
+            x = F.relu(layer(torch.cat([level, *found], 1)))
+            found = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
         sharpness = scores.detach().softmax(1).amax(1)
         match = torch.stack([sharpness, quarter_px.detach() / _USUAL_PX], 1)
-        hidden = F.relu(self.hidden(torch.cat([features, match.to(features)], 1)))
+        hidden = F.relu(self.hidden(torch.cat([quarter, *found, match.to(quarter)], 1)))
         return self.logit(hidden)[:, 0].to(scores).sigmoid()
 
 

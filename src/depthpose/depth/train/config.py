@@ -172,6 +172,9 @@ class StereoTraining:
     weight where another one with truth has 1; networks with a class of the sky (``with_sky``) are
     taught that class instead, and this is the weight of its cross entropy."""
 
+    sky_alone: bool = False
+    """Train the class of the sky alone: the rest of the network stays as it began."""
+
     adam: AdamConfig = field(default_factory=lambda: AdamConfig(schedule="halving"))
     """The optimiser: 1e-4, halved every quarter of the training."""
 
@@ -193,6 +196,12 @@ class StereoTraining:
             raise InputError(
                 "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "
                 "sky_weight to 0.5, or leave with_sky out"
+            )
+        has_sky = self.light is not None and self.light.with_sky
+        if self.sky_alone and (self.start is None or not has_sky):
+            raise InputError(
+                "sky_alone trains a class of the sky for a matcher that is there: it takes start "
+                "and light.with_sky: true"
             )
 
     @property

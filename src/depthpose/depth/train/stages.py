@@ -40,13 +40,17 @@ class StereoTask:
         self._fixed = matcher.encoder if config.with_frozen_stem else None
         if self._fixed is not None:
             self._fixed.freeze_early()
+        self._alone = matcher.sky if config.sky_alone else None
+        if self._alone is not None:
+            matcher.requires_grad_(False)
+            self._alone.requires_grad_(True)
         self._train()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
         self.optimizers = {"matcher": (make_adam(self._groups(), config.adam), config.adam)}
 
     def _groups(self) -> list[dict[str, object]]:
-        if self.matcher.encoder is None:
-            return [{"params": list(self.matcher.parameters())}]
+        if self._alone is not None or self.matcher.encoder is None:
+            return [{"params": [p for p in self.matcher.parameters() if p.requires_grad]}]
         encoder = list(self.matcher.encoder.parameters())
         ours = set(encoder)
         rest = [p for p in self.matcher.parameters() if p not in ours]
@@ -57,6 +61,9 @@ class StereoTask:
         self.matcher.train()
         if self._fixed is not None:
             self._fixed.keep_statistics()
+        if self._alone is not None:
+            for part in self.matcher.children():
+                part.train(part is self._alone)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One update: match and compare."""
