@@ -486,7 +486,8 @@ def test_training_by_config_and_words(
 ) -> None:
     (tmp_path / "view.yaml").write_text(VIEW)
     words = ["depth", "train", "view", "--config", str(tmp_path / "view.yaml")]
-    words += ["--data", str(pairs), "--held-out", str(pairs), "--out", str(tmp_path / "run")]
+    held_out = shutil.copytree(pairs, tmp_path / "held")
+    words += ["--data", str(pairs), "--held-out", str(held_out), "--out", str(tmp_path / "run")]
     assert main([*words, "--steps", "2"]) == 0
     said = capsys.readouterr().out
     assert "generator.safetensors" in said
@@ -568,7 +569,7 @@ def test_kills_at_any_moment_change_no_weight_of_a_stage(
     (tmp_path / "stage.yaml").write_text(text)
     words = [sys.executable, "-m", "depthpose", "depth", "train", stage, "--resume"]
     words += ["--config", str(tmp_path / "stage.yaml"), "--data", str(pairs)]
-    words += ["--held-out", str(pairs), "--out"]
+    words += ["--held-out", str(shutil.copytree(pairs, tmp_path / "held")), "--out"]
     subprocess.run([*words, str(tmp_path / "whole")], check=True, capture_output=True)
     moments, killed = random.Random(1), tmp_path / "killed"
     state = killed / "state.pt"

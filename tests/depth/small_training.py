@@ -1,5 +1,6 @@
 """Small networks and short trainings of depth, which several tests share."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ TINY_MATCHER = PSMNetConfig(width=2, max_disparity_px=16, blocks=(1, 1, 1, 1), p
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A plain folder of three synthetic pairs with disparity."""
     return write_pairs(tmp_path_factory.mktemp("pairs"), (0.2, 0.2, 0.25))
+
+
+@pytest.fixture(scope="module")
+def held_folder(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The same pairs in other files, to hold out."""
+    return str(shutil.copytree(folder, tmp_path_factory.mktemp("held") / "pairs"))
 
 
 @pytest.fixture

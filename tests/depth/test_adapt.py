@@ -159,8 +159,8 @@ def test_what_became_worse_is_refused(change: dict[str, float], message: str) ->
 def test_what_became_better_is_kept(change: dict[str, float]) -> None:
     refuse_worse(SAME, dataclasses.replace(SAME, **change, street_d1=0.054))
     refuse_worse(
-        dataclasses.replace(SAME, street_d1=torch.nan),
-        dataclasses.replace(SAME, **change, street_d1=torch.nan),
+        dataclasses.replace(SAME, street_d1=None),
+        dataclasses.replace(SAME, **change, street_d1=None),
     )
 
 
@@ -182,7 +182,7 @@ def test_the_guard_tells_a_worse_matcher(monkeypatch: pytest.MonkeyPatch) -> Non
     guard = AdaptationCheck([street.input], 0, MatcherConfig())
     good, bad = guard.measure(Fixed(0.0)), guard.measure(Fixed(5.0))
     assert good.photometric < bad.photometric
-    assert good.street_d1 != good.street_d1, "no streets were asked for"
+    assert good.street_d1 is None, "no streets were asked for"
 
 
 @pytest.fixture
@@ -233,17 +233,20 @@ def test_pairs_are_adapted_to_at_the_size_of_a_fine_match(
     assert fine_focal_px(config, network) == pytest.approx(own_px / 1.1**0.5)
 
 
+@pytest.mark.parametrize("streets", [1, 0])
 def test_an_adapted_matcher_carries_its_card(
-    tmp_path: Path, start: Path, monkeypatch: pytest.MonkeyPatch
+    streets: int, tmp_path: Path, start: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[AdaptMetrics] = []
     monkeypatch.setattr("depthpose.depth.train.runs.refuse_worse", lambda *both: seen.extend(both))
-    path = train_adapt(config_of(tmp_path, start, 1e-3), Run(folder=tmp_path / "out"))
+    config = dataclasses.replace(config_of(tmp_path, start, 1e-3), streets=streets)
+    path = train_adapt(config, Run(folder=tmp_path / "out"))
     assert seen[0] != seen[1]
     one, other = (read_matcher(file).state_dict() for file in (start, path))
     assert any(not torch.equal(one[name], other[name]) for name in one)
     card = path.with_suffix(".md").read_text()
     assert f"| photometric | {seen[0].photometric:.4g} | {seen[1].photometric:.4g} |" in card
+    assert ("| street_d1 |" in card) == (streets > 0)
     assert "depth train adapt" in card
     labelled = tmp_path / "out/labels/0-pairs/disp_occ"
     assert [path.stem for path in sorted(labelled.iterdir())] == ["00", "01"], "02 is held out"

@@ -28,7 +28,7 @@ from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
 from depthpose.depth.estimator.rig import join_matches
-from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence
+from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
 from depthpose.depth.types import Match, StereoInput
@@ -502,6 +502,9 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
     assert isinstance(found, SelectionGenerator)
     assert found.config.least_confidence == least
     assert read_checkpoint(out).facts == read_checkpoint(given).facts
+    for share in (0.0, 1.0, math.nan):
+        with pytest.raises(InputError, match="must be above 0 and below 1"):
+            refuse_share(100, share)
     with pytest.raises(InputError, match=r"7 images cannot say what refuses 0\.01 of them"):
         calibrate(given, [*known, 0.1, 0.9], 0.01, out)
 

@@ -1,11 +1,12 @@
 """The three stages on small synthetic pairs: what moves, what stays, what is refused."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
-from tests.depth.small_training import LOOP, folder, pairs, snapshot
+from tests.depth.small_training import LOOP, folder, held_folder, pairs, snapshot
 from tests.synthetic_street import make_street
 from torch import Tensor
 
@@ -37,7 +38,7 @@ from depthpose.depth.train import (
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
-__all__ = ["folder", "pairs"]  # fixtures
+__all__ = ["folder", "held_folder", "pairs"]  # fixtures
 GENERATOR = GeneratorConfig(width=4, levels=4, virtual_focal_px=130.0, virtual_baseline_m=0.54)
 LIGHT = LightConfig(
     max_disparity_px=32, groups=2, width=8, volume_widths=(4, 4, 4, 4), encoder_width=0.25
@@ -122,14 +123,16 @@ def test_gradients_reach_the_whole_generator_through_the_matcher(
     assert all(p.grad is None for p in matcher.parameters())
 
 
-def test_the_three_stages_run_and_their_weights_estimate(folder: Path, tmp_path: Path) -> None:
+def test_the_three_stages_run_and_their_weights_estimate(
+    folder: Path, held_folder: str, tmp_path: Path
+) -> None:
     pairs = PairsConfig(
         folders=(str(folder),),
         focal_px=130.0,
         with_cache=True,
         augment=AugmentConfig(crop_px=(48, 96)),
     )
-    held_out = dataclasses.replace(pairs, limit=1)
+    held_out = dataclasses.replace(pairs, folders=(held_folder,), limit=1)
     view = ViewTraining(
         generator=GENERATOR, discriminator_width=4, pairs=pairs, held_out=held_out, loop=LOOP
     )
@@ -279,6 +282,34 @@ def test_other_settings_do_not_share_a_run(
     other = dataclasses.replace(config, l1_weight=10.0)
     with pytest.raises(InputError, match=r"l1_weight = 100\.0, but now it is 10\.0"):
         train_view(other, Run(folder=tmp_path, resume=True))
+
+
+def test_a_run_does_not_go_on_with_other_frames(pairs: PairsConfig, tmp_path: Path) -> None:
+    home = tmp_path / "pairs"
+    shutil.copytree(pairs.folders[0], home)
+    config = ViewTraining(
+        generator=GENERATOR,
+        discriminator="none",
+        pairs=dataclasses.replace(pairs, folders=(str(home),)),
+        loop=LOOP,
+    )
+    train_view(config, Run(folder=tmp_path / "run"))
+    train_view(config, Run(folder=tmp_path / "run", resume=True))
+    (home / "left/02.png").unlink()
+    with pytest.raises(InputError, match="frames_sha256"):
+        train_view(config, Run(folder=tmp_path / "run", resume=True))
+
+
+def test_what_is_trained_on_is_not_held_out(pairs: PairsConfig, tmp_path: Path) -> None:
+    config = ViewTraining(
+        generator=GENERATOR,
+        discriminator="none",
+        pairs=dataclasses.replace(pairs, exclude=("00",)),
+        held_out=dataclasses.replace(pairs, limit=3),
+        loop=LOOP,
+    )
+    with pytest.raises(InputError, match="2 of the pairs held out are trained on too, 01 first"):
+        train_view(config, Run(folder=tmp_path))
 
 
 def test_a_warm_start_begins_with_the_given_weights(pairs: PairsConfig, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.depth.small_training import LOOP, folder, pairs, snapshot
+from tests.depth.small_training import LOOP, folder, held_folder, pairs, snapshot
 
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
@@ -34,7 +34,7 @@ from depthpose.depth.train.config import FinetuneTraining, SelectTraining
 from depthpose.depth.train.select import SelectionSample, SelectionSamples
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 
-__all__ = ["folder", "pairs"]  # fixtures
+__all__ = ["folder", "held_folder", "pairs"]  # fixtures
 TINY = SelectionConfig(
     encoder_width=0.1,
     widths=(8, 8, 8, 8),
@@ -156,14 +156,14 @@ def test_the_encoder_learns_at_its_own_rate(pairs: PairsConfig) -> None:
     assert optimizer.param_groups[1]["weight_decay"] == adam.weight_decay == 1e-2
 
 
-def test_it_learns_disparity_and_view(folder: Path, tmp_path: Path, pairs: PairsConfig) -> None:
+def test_it_learns_disparity_and_view(held_folder: str, tmp_path: Path, pairs: PairsConfig) -> None:
     config = SelectTraining(
         generator=TINY,
         with_frozen_stem=False,
         encoder_rate=1.0,
         adam=AdamConfig(learning_rate=4e-3),
         pairs=dataclasses.replace(pairs, with_cache=True),
-        held_out=dataclasses.replace(pairs, limit=1),
+        held_out=dataclasses.replace(pairs, folders=(held_folder,), limit=1),
         degrade=DegradeConfig(colour=0.0, hue_share=0.0, haze_share=0.0, glare_share=0.0),
         loop=dataclasses.replace(LOOP, steps=80, log_every_steps=10),
     )
@@ -180,20 +180,21 @@ def test_it_learns_disparity_and_view(folder: Path, tmp_path: Path, pairs: Pairs
 
 
 def test_held_out_pairs_are_measured_at_the_focal_length_of_the_generator(
-    pairs: PairsConfig, tmp_path: Path
+    pairs: PairsConfig, held_folder: str, tmp_path: Path
 ) -> None:
+    held_out = dataclasses.replace(pairs, folders=(held_folder,))
     config = SelectTraining(
         generator=TINY, with_frozen_stem=False, pairs=pairs, loop=dataclasses.replace(LOOP, steps=1)
     )
     found = []
     for focal_px in (130.0, None):
-        given = dataclasses.replace(pairs, focal_px=focal_px)
+        given = dataclasses.replace(held_out, focal_px=focal_px)
         train_select(
             dataclasses.replace(config, held_out=given), Run(folder=tmp_path / str(focal_px))
         )
         found.append(read_metrics(tmp_path / str(focal_px))[-1]["held_out/abs_rel"])
     assert found[0] == found[1]
-    other = dataclasses.replace(config, held_out=dataclasses.replace(pairs, focal_px=200.0))
+    other = dataclasses.replace(config, held_out=dataclasses.replace(held_out, focal_px=200.0))
     with pytest.raises(InputError, match=r"leave held_out\.focal_px out"):
         train_select(other, Run(folder=tmp_path / "other"))
 

@@ -38,6 +38,21 @@ def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) 
     return found
 
 
+def refuse_share(images: int, alarm_share: float) -> None:
+    """Refuse a share of images that so many of them cannot tell.
+
+    Raises:
+        InputError: it is no share, or less than one image.
+    """
+    if not 0 < alarm_share < 1:
+        raise InputError(f"alarm_share is {alarm_share:g}; it must be above 0 and below 1")
+    if images * alarm_share < 1:
+        raise InputError(
+            f"{images} images cannot say what refuses {alarm_share:g} of them; "
+            f"give {math.ceil(1 / alarm_share)} images or more, or a larger share"
+        )
+
+
 def calibrate(weights: Path, image_confidence: list[float], alarm_share: float, out: Path) -> float:
     """Write weights that refuse all but ``1 - alarm_share`` of images like some that are known.
 
@@ -53,11 +68,7 @@ def calibrate(weights: Path, image_confidence: list[float], alarm_share: float, 
     Raises:
         InputError: too few images for that share, or weights of another kind.
     """
-    if not 0 < alarm_share < 1 or len(image_confidence) * alarm_share < 1:
-        raise InputError(
-            f"{len(image_confidence)} images cannot say what refuses {alarm_share:g} of them; "
-            f"give {math.ceil(1 / max(alarm_share, 1e-6))} images or more, or a larger share"
-        )
+    refuse_share(len(image_confidence), alarm_share)
     least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
     found = read_checkpoint(weights)
     config = dict(found.config)

@@ -137,6 +137,13 @@ def pack(
         raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
     refuse_to_replace(out / "index.json")
     dataset = open_dataset(path, split)
+    if any(part.suffix == ".tar" for frame in dataset.frames[:1] for part in frame.left.parents):
+        raise InputError(f"{path}: is packed already; give the folder that it was made of")
+    if out.resolve() == path.resolve():
+        raise InputError(
+            f"--out {out}: is the data set itself, which would be read as packed from then on; "
+            "choose another folder"
+        )
     with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
         shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
     print(f"{len(dataset)} frames in {shards} shards: {out}")

@@ -163,6 +163,7 @@ def calibrate(
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
+    out_of_distribution.refuse_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
     known = out_of_distribution.measure_image_confidence(net, map(dataset.read_input, shown))

@@ -109,14 +109,14 @@ class AdaptMetrics:
             disparities agreed.
         disagreeing: share of pixels whose disparities of both views do not agree, or that are newly
             taken for sky.
-        street_d1: share of bad disparities on synthetic streets; NaN without any.
-        street_epe_px: mean error there [px].
+        street_d1: share of bad disparities on synthetic streets; None without any.
+        street_epe_px: mean error there [px]; None likewise.
     """
 
     photometric: float
     disagreeing: float
-    street_d1: float
-    street_epe_px: float
+    street_d1: float | None
+    street_epe_px: float | None
 
 
 class AdaptationCheck:
@@ -164,7 +164,7 @@ class AdaptationCheck:
             street_epe_px=off_px,
         )
 
-    def _on_streets(self, net: FakestereoNet) -> tuple[float, float]:
+    def _on_streets(self, net: FakestereoNet) -> tuple[float, float] | tuple[None, None]:
         bad, off_px = [], []
         for street in self.streets:
             truth_px = street.truth.disparity_px
@@ -175,7 +175,7 @@ class AdaptationCheck:
             bad.append(errors.d1_all)
             off_px.append(errors.epe_px)
         if not bad:
-            return float("nan"), float("nan")
+            return None, None
         return sum(bad) / len(bad), sum(off_px) / len(off_px)
 
 
@@ -198,7 +198,7 @@ def refuse_worse(before: AdaptMetrics, after: AdaptMetrics) -> None:
     # NaN, where no pixel could be compared, is no gain either.
     if not (all(c <= _NOTHING for c in changes) and any(c <= -_NOTHING for c in changes)):
         raise InputError(f"the held-out pairs fit no better: {said}; {advice}.")
-    if after.street_d1 > before.street_d1 + _FORGOTTEN:
+    if (after.street_d1 or 0.0) > (before.street_d1 or 0.0) + _FORGOTTEN:
         raise InputError(
             f"synthetic streets are matched worse by more than {_FORGOTTEN:.1%} bad disparities: "
             f"{said}; {advice}."
@@ -250,7 +250,9 @@ def fine_focal_px(config: AdaptTraining, network: StereoNetwork) -> float:
 def adapted_text(before: AdaptMetrics, after: AdaptMetrics) -> str:
     """Show for a card what changed, as Markdown."""
     rows = [
-        f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |" for name, old in vars(before).items()
+        f"| {name} | {old:.4g} | {asdict(after)[name]:.4g} |"
+        for name, old in vars(before).items()
+        if old is not None
     ]
     head = ["Held-out pairs, and synthetic streets:", "", "| | before | after |"]
     return "\n".join([*head, "| --- | --- | --- |", *rows])

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from hashlib import sha256
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
+from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig, street_rig
 
@@ -27,6 +28,30 @@ class _Place(NamedTuple):
     source: Dataset | Streets
     number: int
     truth: TruthKind | None
+
+
+def name_frames(frames: Iterable[Frame]) -> str:
+    """Give a hash of the names of frames and the sizes of their left images."""
+    digest = sha256()
+    for frame in frames:
+        size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
+        digest.update(f"{frame.name} {size}\n".encode())
+    return digest.hexdigest()
+
+
+def refuse_common(trained: Iterable[Frame], held_out: Iterable[Frame]) -> None:
+    """Refuse to hold out what is trained on.
+
+    Raises:
+        InputError: a left image is in both.
+    """
+    seen = {frame.left.resolve() for frame in trained}
+    common = [frame.name for frame in held_out if frame.left.resolve() in seen]
+    if common:
+        raise InputError(
+            f"{len(common)} of the pairs held out are trained on too, {common[0]} first, so their "
+            "error would be too good; give --held-out other pairs, or exclude these in the config"
+        )
 
 
 class TrainingPairs:
@@ -68,6 +93,15 @@ class TrainingPairs:
 
     def __len__(self) -> int:
         return len(self._places)
+
+    @property
+    def frames(self) -> list[Frame]:
+        """Those of folders, not what is rendered."""
+        return [
+            place.source.frames[place.number]
+            for place in self._places
+            if isinstance(place.source, Dataset)
+        ]
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make the n-th sample."""

@@ -43,7 +43,7 @@ from depthpose.depth.train.config import (
     StereoTraining,
     ViewTraining,
 )
-from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.pairs import TrainingPairs, name_frames, refuse_common
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
@@ -204,6 +204,13 @@ def _run_stage(
     }
     if pairs.truths:
         more["truth"] = list(pairs.truths)
+    sources = pairs.sources if isinstance(pairs, SelectionSamples) else [pairs]
+    frames = [frame for source in sources for frame in source.frames]
+    if frames:
+        more["frames_sha256"] = name_frames(frames)
+    held_out: TrainingPairs | None = getattr(task, "held_out", None)
+    if held_out is not None:
+        refuse_common(frames, held_out.frames)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     warn_of_terms(facts)
     run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))
