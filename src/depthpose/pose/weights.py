@@ -162,8 +162,18 @@ def _refuse_another(
 
 
 def known_numbers(path: Path) -> tuple[int, ...]:
-    """Give the numbers of the objects that weights know, with or without their surfaces."""
-    records = read_checkpoint(path).config.get("models")
+    """Give the numbers of the objects that weights know, with or without their surfaces.
+
+    Raises:
+        InputError: they are of another kind, or damaged.
+    """
+    checkpoint = read_checkpoint(path)
+    if checkpoint.kind not in _NETWORKS:
+        raise InputError(
+            f"{path}: holds weights of kind {checkpoint.kind!r}, which know no objects; give those "
+            "of a pose network ('depthpose weights list')"
+        )
+    records = checkpoint.config.get("models")
     with refused_as(path, "file of pose weights", "it is damaged, or knows no objects"):
         return tuple(int(record["number"]) for record in records or ())
 
