@@ -547,6 +547,8 @@ def test_epochs_become_steps() -> None:
         ({"steps": None}, "give one of the two"),
         ({"batch_size": 0}, "batch_size must be positive, got 0"),
         ({"workers": -1}, "workers must be 0 or more"),
+        ({"seed": -1}, "seed is -1; take 0 or more"),
+        ({"seed": 2**63}, "seed is 9223372036854775808; take 0 or more, up to 9223372036854775807"),
         ({"ema_decay": 1.0}, "ema_decay must be between 0 and 1"),
     ],
 )
