@@ -22,7 +22,7 @@ def cad(tmp_path: Path) -> Path:
     views = Objects([make_part("connector")], config)
     write_cloud(tmp_path / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
-    centre_px = torch.tensor(config.centre_px)
+    centre_px = torch.tensor(config.principal_point_px)
     left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
     width, height = config.image_px
     height_px, width_px = window.mask.shape

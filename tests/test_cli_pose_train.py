@@ -172,6 +172,16 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     assert own.start == "parts"
 
 
+@pytest.mark.parametrize("words", [["--seed", "99999999999999999999"], ["--number", "50001"]])
+def test_scenes_that_no_reader_could_number_are_not_written(
+    part: Path, tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = ["data", "make", "objects", "--cad", str(part), "--out", str(tmp_path / "out"), *words]
+    assert main(made) == 2
+    assert "take a seed of 0 to 999999, and at most 50000 frames" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_path: Path) -> None:
     made, config, run = tmp_path / "made", tmp_path / "masks.yaml", tmp_path / "run"
     words = ["data", "make", "objects", "--cad", str(part), "--unit", "mm", "--number", "1"]

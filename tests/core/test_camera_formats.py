@@ -302,3 +302,6 @@ def test_yaml_takes_the_keys_of_our_json_too(tmp_path: Path, key: str) -> None:
     path.write_text(text.replace("0.12", "wide"))
     with pytest.raises(InputError, match=r"baseline_m is 'wide'; write a number"):
         read_rig(path)
+    path.write_text(f"{text}baseline_m: 0.2\n")
+    with pytest.raises(InputError, match="key 'baseline_m' is given twice"):
+        read_rig(path)

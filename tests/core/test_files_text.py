@@ -77,6 +77,7 @@ def test_yaml_may_refer_to_what_stands_above(tmp_path: Path) -> None:
         ),
         ("a: *b", r"refers to itself|not a readable YAML file"),
         ("a: [", "not a readable YAML file"),
+        ("a: {b: 1,\n b: 2}", "line 2: key 'b' is given twice"),
     ],
 )
 def test_yaml_beyond_bounds_is_refused(tmp_path: Path, text: str, said: str) -> None:

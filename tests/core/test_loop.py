@@ -109,6 +109,16 @@ def test_what_was_stopped_is_finished_with_the_steps_so_far(tmp_path: Path) -> N
     assert_equal(weights(whole), weights(trained(tmp_path / "whole", loop(ema_decay=0.9))))
 
 
+def test_the_card_counts_the_steps_of_the_state_that_was_finished(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"log_every_steps": 4, "validate_every_steps": 100}
+    interrupted(tmp_path, loop(**changes), after=5)
+    step = torch.load(tmp_path / "state.pt", weights_only=True)["step"]
+    assert step > read_metrics(tmp_path)[-1]["step"]
+    trained(tmp_path, loop(**changes), finish=True)
+    write_card(tmp_path / "net.safetensors", "depth train view", 3.0, {}, "")
+    assert f"- **Time**: {step} steps in 3 s on " in (tmp_path / "net.md").read_text()
+
+
 def test_ctrl_c_twice_finishes_with_the_step_at_hand(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +173,8 @@ def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     rows = [{"step": 4, "held_out/error": 0.5}, {"step": 8, "held_out/error": 1 / 3},
             {"step": 12, "net/loss": 0.1}]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    trained(tmp_path / "run", loop(steps=12))
+    (tmp_path / "run" / "state.pt").rename(folder / "state.pt")
     measured = held_out_text(folder, "Errors (m).")
     assert measured == "Errors (m).\n\n| held out | |\n| --- | --- |\n| error | 0.3333 |"
     facts = {"trained_on": "kitti", "terms": "For research."}
@@ -535,6 +547,8 @@ def test_epochs_become_steps() -> None:
         ({"steps": None}, "give one of the two"),
         ({"batch_size": 0}, "batch_size must be positive, got 0"),
         ({"workers": -1}, "workers must be 0 or more"),
+        ({"seed": -1}, "seed is -1; take 0 or more"),
+        ({"seed": 2**63}, "seed is 9223372036854775808; take 0 or more, up to 9223372036854775807"),
         ({"ema_decay": 1.0}, "ema_decay must be between 0 and 1"),
     ],
 )

@@ -237,6 +237,7 @@ def test_flips_come_at_their_share() -> None:
         ({"crop_px": (0, 5)}, "crop_px must be two positive sizes"),
         ({"scale": (0.0, 1.0)}, "scale must be a range"),
         ({"scale": (2.0, 1.0)}, "scale must be a range"),
+        ({"scale": (100.0, 100.0)}, "scale must be a range of positive sizes to 10"),
         ({"jitter": 1.0}, "jitter must be in"),
         ({"flip_share": 1.5}, "flip_share must be in"),
         ({"erased_share": -0.1}, "erased_share must be in"),

@@ -15,7 +15,7 @@ from depthpose.depth.losses import (
     plane_loss,
     view_loss,
 )
-from depthpose.depth.train.config import StereoTraining
+from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 
 NAN = float("nan")
 LOGITS = torch.tensor([2.0, -1.0]).reshape(1, 1, 1, 2)
@@ -132,3 +132,16 @@ def test_unknown_truth_gives_the_selecting_losses_no_nan() -> None:
 def test_a_weight_that_is_no_share_is_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=rf"{name} must be from 0 to 1, got {value}"):
         config_from_dict({name: value}, StereoTraining, source="here")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "least"),
+    [
+        ("l1_weight", -3, FinetuneTraining, 0),
+        ("l1_weight", -3, ViewTraining, 0),
+        ("discriminator_width", -4, ViewTraining, 1),
+    ],
+)
+def test_what_cannot_train_is_refused(name: str, value: int, kind: type, least: int) -> None:
+    with pytest.raises(InputError, match=rf"{name} must be {least} or more, got {value}"):
+        config_from_dict({name: value}, kind, source="here")

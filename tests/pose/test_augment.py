@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
+from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
 from depthpose.pose.augment import (
     grow_mask,
@@ -16,6 +18,7 @@ from depthpose.pose.augment import (
     whole,
 )
 from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.train import PoseTraining
 
 
 def _generator(seed: int = 0) -> torch.Generator:
@@ -184,6 +187,16 @@ def test_whole_numbers_stay_below_their_count() -> None:
     [
         ({"number": 0}, "number is 0 and views 2000; both are 1 or more"),
         ({"seed": -1}, "seed is -1; take 0 or more"),
+        (
+            {"seed": 2**64},
+            "seed is 18446744073709551616; take 0 or more, up to 9223372036854775807",
+        ),
+        (
+            {"centre_px": (-5000.0, 9000.0)},
+            "centre_px is (-5000.0, 9000.0), but the principal point lies within the image, and "
+            "image_px is (640, 480); leave it out for the middle, (319.5, 239.5)",
+        ),
+        ({"image_px": (320, 240), "centre_px": (325.3, 242.0)}, "centre_px is (325.3, 242.0)"),
         ({"image_px": (0, 480)}, "image_px is (0, 480)"),
         ({"occluded_share": 1.5}, "occluded_share is 1.5, but a share is 0 to 1"),
         ({"mask_error_px": -1}, "mask_error_px is -1; take 0 to 20, usually 3"),
@@ -200,6 +213,23 @@ def test_bad_settings_of_objects_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError) as error:
         ObjectsConfig(**values)
     assert text in str(error.value)
+
+
+def test_the_principal_point_is_that_of_the_image(tmp_path: Path) -> None:
+    assert ObjectsConfig().principal_point_px == (325.2611, 242.04899)
+    assert config_to_dict(ObjectsConfig())["centre_px"] == [325.2611, 242.04899]
+    assert ObjectsConfig(image_px=(320, 240)).principal_point_px == (159.5, 119.5)
+    assert ObjectsConfig(centre_px=(0.0, 479.0)).principal_point_px == (0.0, 479.0)
+    path = tmp_path / "c.yaml"
+    for text, centre_px in (
+        ("{image_px: [320, 240]}", (159.5, 119.5)),
+        ("{image_px: [320, 240], centre_px: [160, 121]}", (160.0, 121.0)),
+        ("{image_px: [640, 480], number: 3}", (325.2611, 242.04899)),
+    ):
+        path.write_text(f"objects: {text}")
+        assert read_config(path, PoseTraining).objects.centre_px == centre_px
+    write_config(path, PoseTraining(objects=ObjectsConfig(centre_px=(300.0, 200.0))))
+    assert read_config(path, PoseTraining).objects.centre_px == (300.0, 200.0)
 
 
 @pytest.mark.parametrize(

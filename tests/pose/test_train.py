@@ -585,6 +585,13 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
         (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
         (lambda: CalibrationConfig(number=5), "number is 5; nothing can be chosen by fewer"),
         (lambda: CalibrationConfig(max_wrong_share=1.0), "max_wrong_share is 1.0"),
+        (
+            lambda: CalibrationConfig(occlusion=(0.6, 0.0)),
+            "calibration.occlusion is (0.6, 0.0), but it is a range within 0.0 to 0.95, the lower",
+        ),
+        (lambda: HeldOutConfig(occlusions=(0.0, 1.0)), "held_out.occlusions is (1.0, 1.0)"),
+        (lambda: ModelsConfig(symmetry_tolerance=-1.0), "symmetry_tolerance is -1.0"),
+        (lambda: PoseTraining(confidence_weight=-1.0), "confidence_weight is -1.0; take 0"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make, said: str) -> None:  # noqa: ANN001

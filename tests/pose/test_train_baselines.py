@@ -349,6 +349,7 @@ def test_training_images_are_the_same_for_the_same_index(colored: Path) -> None:
     [
         (lambda: ImageAugmentConfig(crop_px=(100, 64)), "multiples of 32"),
         (lambda: ImageAugmentConfig(scale=(0.0, 1.0)), "positive range"),
+        (lambda: ImageAugmentConfig(scale=(100.0, 100.0)), "positive range up to 10"),
         (lambda: ImageAugmentConfig(jitter=1.0), "both are shares"),
         (lambda: SegmentationTraining(object_weight=0.0), "object_weight is 0.0"),
         (lambda: DepthImageTraining(surface_points=2), "surface_points is 2"),

@@ -3,11 +3,18 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import dacite
 import yaml
 
+from depthpose.core.config_values import (
+    LONGEST,
+    dataclass_in,
+    default_of,
+    refuse_distorted,
+    shown,
+)
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import atomic_write, read_text
 from depthpose.core.files.text import parse_yaml
@@ -16,8 +23,6 @@ ConfigT = TypeVar("ConfigT")
 
 _MAX_BYTES = 2**17
 """Of a config: a hundred times the largest of ours."""
-_LONGEST = 500
-"""Letters of a value that an error shows."""
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
@@ -45,15 +50,16 @@ def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source:
         InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
     """
     _refuse_unknown_keys(content, kind, source, prefix="")
+    refuse_distorted(content, kind, source)
     try:
         return dacite.from_dict(kind, content, dacite.Config(cast=[tuple, float, Path]))
     except dacite.WrongTypeError as error:
         raise InputError(
-            f"{source}: {error.field_path} is {_shown(error.value)}, which is not of type "
+            f"{source}: {error.field_path} is {shown(error.value)}, which is not of type "
             f"{error.field_type}. Give a value of that type."
         ) from error
     except (dacite.DaciteError, ValueError, TypeError, OverflowError, AttributeError) as error:
-        raise InputError(f"{source}: {str(error)[:_LONGEST]}") from error
+        raise InputError(f"{source}: {str(error)[:LONGEST]}") from error
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
@@ -76,7 +82,7 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
     laid: dict[str, Any] = dict(content)
     for field in dataclasses.fields(kind):
         own = content.get(field.name)
-        default = _default_of(field)
+        default = default_of(field)
         if isinstance(own, Mapping) and dataclasses.is_dataclass(default):
             rivals = getattr(type(default), "INSTEAD", {})
             left_out = {rivals[name] for name in own if name in rivals}
@@ -84,17 +90,6 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
             nested = _over_defaults(own, type(default))
             laid[field.name] = kept | nested
     return laid
-
-
-def _default_of(field: dataclasses.Field[Any]) -> object:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def _plain_value(value: object) -> object:
@@ -115,16 +110,9 @@ def _refuse_unknown_keys(content: Mapping[Any, Any], kind: type, source: str, pr
     for key, value in content.items():
         if key not in known:
             raise InputError(
-                f"{source}: unknown key {_shown(prefix + str(key))}; "
-                f"{nearest_name(str(key)[:_LONGEST], known)}"
+                f"{source}: unknown key {shown(prefix + str(key))}; "
+                f"{nearest_name(str(key)[:LONGEST], known)}"
             )
-        nested = _dataclass_in(hints[key])
+        nested = dataclass_in(hints[key])
         if nested is not None and isinstance(value, Mapping):
             _refuse_unknown_keys(value, nested, source, f"{prefix}{key}.")
-
-
-def _dataclass_in(hint: object) -> type | None:
-    candidates = (hint, *get_args(hint))
-    return next(
-        (c for c in candidates if isinstance(c, type) and dataclasses.is_dataclass(c)), None
-    )

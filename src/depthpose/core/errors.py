@@ -57,6 +57,16 @@ def _import(module: str, package_and_extra: tuple[str, str], purpose: str) -> An
         raise MissingExtraError(*package_and_extra, purpose) from error
 
 
+def refuse_seed(seed: int) -> None:
+    """Refuse a seed that random numbers cannot begin with.
+
+    Raises:
+        InputError: it is below 0, or takes more than 63 bits.
+    """
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed is {seed}; take 0 or more, up to {2**63 - 1} (63 bits)")
+
+
 def refuse_unknown(what: str, name: object, known: Iterable[str]) -> None:
     """Refuse a word that is none of the known ones.
 

@@ -11,6 +11,8 @@ from depthpose.core.errors import InputError
 
 _FRAMES_A_SCENE = 50
 _SCENES_A_SEED = 1000
+_MOST_SEED = 10**6 - 1
+"""Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
 
 if TYPE_CHECKING:
     from depthpose.depth.config import StreetsConfig
@@ -88,6 +90,12 @@ class ObjectsOptions:
 
         if self.number < 1:
             raise InputError(f"--number {self.number}: at least 1 frame")
+        if not 0 <= self.seed <= _MOST_SEED or self.number > _SCENES_A_SEED * _FRAMES_A_SCENE:
+            raise InputError(
+                f"--seed {self.seed} --number {self.number}: scenes are numbered by the seed; take "
+                f"a seed of 0 to {_MOST_SEED}, and at most {_SCENES_A_SEED * _FRAMES_A_SCENE} "
+                "frames of each"
+            )
         if not re.fullmatch(r"[\w-]+", self.split) or self.split == "models":
             raise InputError(f"--split {self.split}: a name of letters and digits, not 'models'")
         sensor = SensorConfig(kinds=(self.sensor,))

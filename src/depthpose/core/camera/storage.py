@@ -12,7 +12,7 @@ from depthpose.core.camera.facts import KNOWN_FILES
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
 from depthpose.core.files.disk import refused_as
-from depthpose.core.files.text import YAML_LOADER, refuse_yaml_bomb
+from depthpose.core.files.text import YamlLoader, refuse_yaml_bomb
 
 Names = dict[str, Any]
 """Values by name; names in small letters and digits alone, for everyone spells them otherwise."""
@@ -77,7 +77,7 @@ def numbers(value: object) -> list[float] | None:
     return found if found and len(found) == len(words) else None
 
 
-class _Loader(YAML_LOADER):
+class _Loader(YamlLoader):
     """Plain values, OpenCV's tags ignored."""
 
 

@@ -22,12 +22,33 @@ _MOST_MEMORY = 700_000_000
 _MOST_DEPTH = 50
 _MOST_VALUES = 2_000_000
 """Of YAML whose references are written out."""
-YAML_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""Plain values alone; ten times faster where PyYAML was built with libyaml, as its wheels are."""
+_PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""Ten times faster where PyYAML was built with libyaml, as its wheels are."""
+_MERGE = "tag:yaml.org,2002:merge"
 _OF_JSON = {b",": 60, b"[": 100, b"{": 100, b":": 200}
 
 _KEY_VALUE = re.compile(r"([^\s:=]+)\s*[:=](.*)")
 _BRACKETS = str.maketrans("[];,", "    ")
+
+
+class YamlLoader(_PLAIN):
+    """Plain values alone, and no key twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Give a mapping; of a key that stands twice the first value would be lost.
+
+        Raises:
+            ValueError: there is one.
+        """
+        seen: set[tuple[str, str]] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
+                continue
+            if (key.tag, key.value) in seen:
+                line = key.start_mark.line + 1
+                raise ValueError(f"line {line}: key {key.value!r} is given twice")
+            seen.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)
 
 
 def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
@@ -104,7 +125,7 @@ def parse_yaml(path: AnyPath, text: str) -> object:
     """
     refuse_yaml_bomb(path, text)
     with refused_as(path, "YAML file", "correct it there"):
-        return yaml.load(text, YAML_LOADER)  # noqa: S506  a safe loader
+        return yaml.load(text, YamlLoader)  # noqa: S506  a safe loader
 
 
 def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
@@ -118,7 +139,7 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     sizes: dict[str, int] = {}
     unfinished: list[tuple[str | None, int]] = []
     with suppress(yaml.YAMLError):
-        for event in yaml.parse(text, YAML_LOADER):
+        for event in yaml.parse(text, YamlLoader):
             if isinstance(event, yaml.CollectionStartEvent):
                 unfinished.append((event.anchor, 1))
                 if len(unfinished) > _MOST_DEPTH:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import nn
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_seed
 
 Schedule = Literal["constant", "constant-linear", "halving", "cosine"]
 
@@ -138,6 +138,7 @@ class LoopConfig:
         for name, value in counts.items():
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} must be positive, got {value}")
+        refuse_seed(self.seed)
         if self.workers < 0:
             raise InputError(f"workers must be 0 or more processes, got {self.workers}")
         if self.precision not in ("fp32", "bf16", "fp16"):

@@ -22,7 +22,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refused_write
 from depthpose.core.files.text import refuse_heavy
-from depthpose.core.loop.state import BEFORE, STATE, write_state
+from depthpose.core.loop.state import BEFORE, STATE, saved_step, write_state
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
@@ -172,11 +172,10 @@ def write_card(
         measured: Markdown; :func:`held_out_text` where validation measured.
     """
     folder, here = weights.parent, environment()
-    steps = max((row["step"] for row in read_metrics(folder)), default=0)
     where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
     made = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
-        "time": f"{steps} steps in {_duration(seconds)} on {where}; {here['date']}",
+        "time": f"{saved_step(folder)} steps in {_duration(seconds)} on {where}; {here['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
         part.write_text(card_text(weights.stem, {**facts, **made}, measured))

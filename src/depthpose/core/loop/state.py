@@ -30,6 +30,14 @@ def saved_states(folder: Path) -> list[Path]:
     return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
 
 
+def saved_step(folder: Path) -> int:
+    """Give the step of the last state that is whole; 0 where there is none."""
+    for path in saved_states(folder):
+        with suppress(InputError):
+            return _read_state(path)["step"]
+    return 0
+
+
 def write_state(folder: Path, state: Mapping[str, Any], *, keeps_last: bool) -> None:
     """Write the last state, all or nothing.
 

@@ -9,6 +9,9 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 """scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
 (KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
 
+_MOST_FOCAL_PX = 20_000
+"""Of pairs: several times that of the largest images; beyond it they would fill the memory."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DegradeConfig:
@@ -87,8 +90,8 @@ class AugmentConfig:
         """Refuse changes that would break a pair."""
         if min(self.crop_px) < 1:
             raise InputError(f"crop_px must be two positive sizes, got {self.crop_px}")
-        if not 0 < self.scale[0] <= self.scale[1]:
-            raise InputError(f"scale must be a range of positive sizes, got {self.scale}")
+        if not 0 < self.scale[0] <= self.scale[1] <= 10:
+            raise InputError(f"scale must be a range of positive sizes to 10, got {self.scale}")
         if not 0 <= self.jitter < 1:
             raise InputError(f"jitter must be in [0, 1), got {self.jitter}; the thesis takes 0.2")
         if not 0 <= self.flip_share <= 1:
@@ -194,5 +197,7 @@ class PairsConfig:
         """Refuse what selects nothing."""
         if self.limit is not None and self.limit < 1:
             raise InputError(f"limit must be 1 pair or more, got {self.limit}")
-        if self.focal_px is not None and self.focal_px <= 0:
-            raise InputError(f"focal_px must be positive, got {self.focal_px}")
+        if self.focal_px is not None and not 0 < self.focal_px <= _MOST_FOCAL_PX:
+            raise InputError(
+                f"focal_px must be positive pixels, at most {_MOST_FOCAL_PX}, got {self.focal_px}"
+            )

@@ -59,8 +59,13 @@ class ViewTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown loss."""
+        """Refuse an unknown loss, and a network and a weight that are none."""
         refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
+        if self.discriminator_width < 1:
+            raise InputError(
+                f"discriminator_width must be 1 or more, got {self.discriminator_width}; take 64"
+            )
+        _refuse_negative("l1_weight", self.l1_weight)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,8 +141,7 @@ class SelectTraining:
             "view_weight": self.view_weight,
         }
         for name, value in weights.items():
-            if value < 0:
-                raise InputError(f"{name} must be 0 or more, got {value}")
+            _refuse_negative(name, value)
         _refuse_views_changed_apart(self.pairs)
         if self.more is not None:
             _refuse_views_changed_apart(self.more)
@@ -291,6 +295,15 @@ class FinetuneTraining:
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
     """How long."""
+
+    def __post_init__(self) -> None:
+        """Refuse a weight that is none."""
+        _refuse_negative("l1_weight", self.l1_weight)
+
+
+def _refuse_negative(name: str, value: float) -> None:
+    if value < 0:
+        raise InputError(f"{name} must be 0 or more, got {value}")
 
 
 def _refuse_views_changed_apart(pairs: PairsConfig) -> None:

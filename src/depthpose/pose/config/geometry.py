@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.errors import InputError, refuse_seed, refuse_unknown
 
 Unit = Literal["m", "mm"]
 """Unit of a model or cloud file."""
@@ -131,6 +131,7 @@ class VotingConfig:
         """Refuse values outside their range."""
         refuse_unknown("method", self.method, get_args(VotingMethod))
         refuse_unknown("inlier_test", self.inlier_test, get_args(InlierTest))
+        refuse_seed(self.seed)
         if self.hypotheses < 1:
             raise InputError(f"hypotheses is {self.hypotheses}, but one pair at least is tried; "
                              "take 128")  # fmt: skip

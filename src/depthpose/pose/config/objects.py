@@ -1,14 +1,18 @@
 """Settings of synthetic views: how they look, and the errors of the sensor that sees them."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_seed
 
 SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 """What measures depth, and so what its errors look like."""
+_LINEMOD_PX = (640, 480)
+_LINEMOD_CENTRE_PX = (325.2611, 242.04899)
 MOST_NOISE = 20.0
 """Times the noise of its kind that a sensor may have."""
+OCCLUSIONS = (0.0, 0.95)
+"""Least and largest share of a silhouette that something may occlude."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,15 +42,18 @@ class SensorConfig:
         known = get_args(SensorKind)
         if not self.kinds or any(kind not in known for kind in self.kinds):
             raise InputError(f"kinds is {self.kinds}; name one or more of {', '.join(known)}")
-        _refuse_range("noise", self.noise, (0.0, MOST_NOISE), "(0.5, 1.5)")
+        refuse_range("noise", self.noise, (0.0, MOST_NOISE), "(0.5, 1.5)")
         if self.noise_correlation_px is not None:
-            _refuse_range("noise_correlation_px", self.noise_correlation_px, (0.0, 30.0), "(3, 6)")
-        _refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
+            refuse_range("noise_correlation_px", self.noise_correlation_px, (0.0, 30.0), "(3, 6)")
+        refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsConfig:
     """Synthetic views of known objects. Ranges are of what each sample draws."""
+
+    INSTEAD: ClassVar[dict[str, str]] = {"image_px": "centre_px"}
+    """A config file that gives another image has that one's middle, not the default's."""
 
     number: int = 1000
     """Samples; sample i shows object i modulo their number."""
@@ -68,8 +75,9 @@ class ObjectsConfig:
     focal_px: tuple[float, float] = (572.4114, 573.57043)
     """fx and fy; LineMOD's Kinect."""
 
-    centre_px: tuple[float, float] = (325.2611, 242.04899)
-    """Principal point."""
+    centre_px: tuple[float, float] | None = None
+    """Principal point, within the image; None: the middle of the image, or that of LineMOD's Kinect
+    in an image of 640x480. It is always known once the settings are made."""
 
     resolution: tuple[float, float] = (0.4, 0.8)
     """The image is so many times as large: coarser pictures are faster."""
@@ -99,13 +107,13 @@ class ObjectsConfig:
         """Refuse counts of nothing, shares beyond one and empty ranges."""
         if self.number < 1 or (self.views is not None and self.views < 1):
             raise InputError(f"number is {self.number} and views {self.views}; both are 1 or more")
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}; take 0 or more")
+        refuse_seed(self.seed)
         if min(*self.image_px, *self.focal_px) <= 0:
             raise InputError(
                 f"image_px is {self.image_px} and focal_px {self.focal_px}; both are positive "
                 "pixels, as (640, 480) and (572.4114, 573.57043)"
             )
+        self._place_centre()
         if not 0 <= self.occluded_share <= 1:
             raise InputError(f"occluded_share is {self.occluded_share}, but a share is 0 to 1")
         if not 0 <= self.mask_error_px <= 20:
@@ -118,14 +126,38 @@ class ObjectsConfig:
                     f"{name} is ({low}, {high}), but it goes from {least} or more upward; usual is "
                     f"({2 * least}, {4 + 2 * least})"
                 )
-        _refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
-        _refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.4, 0.8)")
-        _refuse_range("occlusion", self.occlusion, (0.0, 0.95), "(0.0, 0.4)")
+        refuse_range("distance_m", self.distance_m, (0.05, 20.0), "(0.6, 1.1), in metres")
+        refuse_range("resolution", self.resolution, (0.05, 4.0), "(0.4, 0.8)")
+        refuse_range("occlusion", self.occlusion, OCCLUSIONS, "(0.0, 0.4)")
+
+    @property
+    def principal_point_px(self) -> tuple[float, float]:
+        """``centre_px``, or what it is where it was not given."""
+        assert self.centre_px is not None
+        return self.centre_px
+
+    def _place_centre(self) -> None:
+        width, height = self.image_px
+        middle = ((width - 1) / 2, (height - 1) / 2)
+        if self.centre_px is None:
+            usual = _LINEMOD_CENTRE_PX if self.image_px == _LINEMOD_PX else middle
+            object.__setattr__(self, "centre_px", usual)
+        x, y = self.principal_point_px
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise InputError(
+                f"centre_px is {(x, y)}, but the principal point lies within the image, and "
+                f"image_px is {self.image_px}; leave it out for the middle, {middle}"
+            )
 
 
-def _refuse_range(
+def refuse_range(
     name: str, given: tuple[float, float], limits: tuple[float, float], usual: str
 ) -> None:
+    """Refuse a range that is empty or reaches beyond its limits.
+
+    Raises:
+        InputError: that is so; ``usual`` is what one takes otherwise.
+    """
     low, high = given
     if not limits[0] <= low <= high <= limits[1]:
         raise InputError(

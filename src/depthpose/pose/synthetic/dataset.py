@@ -207,7 +207,7 @@ class Objects:
 
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix of the sensor's image at so many times its size."""
-        (fx, fy), (cx, cy) = self.config.focal_px, self.config.centre_px
+        (fx, fy), (cx, cy) = self.config.focal_px, self.config.principal_point_px
         rows = [
             [scale * fx, 0, scale * (cx + 0.5) - 0.5],
             [0, scale * fy, scale * (cy + 0.5) - 0.5],

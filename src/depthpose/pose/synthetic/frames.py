@@ -145,7 +145,7 @@ def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
 
 
 def _intrinsics(config: ObjectsConfig) -> Float[Tensor, "3 3"]:
-    (fx, fy), (cx, cy) = config.focal_px, config.centre_px
+    (fx, fy), (cx, cy) = config.focal_px, config.principal_point_px
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 

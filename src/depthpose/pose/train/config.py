@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
+from depthpose.pose.config.objects import OCCLUSIONS, refuse_range
 from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
@@ -44,6 +45,14 @@ class ModelsConfig:
 
     terms: str = ""
     """Said whenever the weights are loaded; for licences that bind the user."""
+
+    def __post_init__(self) -> None:
+        """Refuse a tolerance that nothing meets, or that everything does."""
+        if not 0 < self.symmetry_tolerance < 1:
+            raise InputError(
+                f"symmetry_tolerance is {self.symmetry_tolerance}, but it is a share of the "
+                "diameter, above 0 and below 1; take 0.02"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +100,8 @@ class HeldOutConfig:
                 f"number is {self.number} and occlusions {self.occlusions}: nothing would be "
                 "measured; take 25 and (0.0, 0.3)"
             )
+        for share in self.occlusions:
+            refuse_range("held_out.occlusions", (share, share), OCCLUSIONS, "0.0 and 0.3")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +138,7 @@ class CalibrationConfig:
         if self.number and self.number < 20:
             raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
                              "views: take 600 (a training may take 0: no refusal)")  # fmt: skip
+        refuse_range("calibration.occlusion", self.occlusion, OCCLUSIONS, "(0.0, 0.6)")
         if self.negatives < 0:
             raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
         for name in self.without:
@@ -204,3 +216,5 @@ class PoseTraining:
         refuse_unknown("loss", self.loss, POINT_LOSSES)
         if self.first_alone < 0:
             raise InputError(f"first_alone is {self.first_alone}; take 0 or more synthetic views")
+        if self.confidence_weight < 0:
+            raise InputError(f"confidence_weight is {self.confidence_weight}; take 0 or more, 0.1")

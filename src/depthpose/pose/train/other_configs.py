@@ -121,8 +121,10 @@ class ImageAugmentConfig:
                 f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take "
                 "multiples of 32"
             )
-        if not 0 < self.scale[0] <= self.scale[1]:
-            raise InputError(f"scale is {self.scale}; take a positive range, as (0.75, 1.5)")
+        if not 0 < self.scale[0] <= self.scale[1] <= 10:
+            raise InputError(
+                f"scale is {self.scale}; take a positive range up to 10, as (0.75, 1.5)"
+            )
         if not (0 <= self.flip_share <= 1 and 0 <= self.jitter < 1):
             raise InputError(
                 f"flip_share is {self.flip_share} and jitter {self.jitter}; both are shares"
