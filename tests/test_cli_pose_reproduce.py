@@ -4,18 +4,28 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.pose.synthetic_frames import moved, predictions_of
-from tests.pose.synthetic_linemod import make_linemod
+from tests.pose.synthetic_frames import frame_models, make_dataset, moved, predictions_of
+from tests.pose.synthetic_linemod import linemod_models, make_linemod
+from tests.pose.synthetic_objects import tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import read_image
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.predictions import write_bop_results
+from depthpose.pose.weights import write_pose_weights
 
 
 @pytest.fixture(scope="module")
 def linemod(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_linemod(tmp_path_factory.mktemp("lm") / "Linemod_preprocessed")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained, of the objects of that folder."""
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    write_pose_weights(path, tiny_weights(*linemod_models()))
+    return path
 
 
 def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:
@@ -57,6 +67,21 @@ def test_table_3_2_walks_over_the_layout_of_the_thesis(
     changed = [*words, "--diameters", "pvnet"]
     assert main(["reproduce", "3.2", *changed]) == 2
     assert "diameters = 'bop', but now it is 'pvnet'" in capsys.readouterr().err
+
+
+def test_table_3_2_is_of_linemod_alone(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Its objects bear numbers of LineMOD, as those of most data sets do.
+    own, plain = make_dataset(tmp_path / "own"), make_linemod(tmp_path / "plain", frame_models())
+    words = ["reproduce", "3.2", "--weights", str(weights), "--out", str(tmp_path / "out")]
+    for folder, name in ((own.folder, "bracket"), (plain.folder, "obj_000007")):
+        assert main([*words, "--bop", str(folder)]) == 2
+        said = capsys.readouterr().err
+        assert f"object 7 ({name}, " in said
+        assert "is none of LineMOD" in said
+        assert "for other data sets take 'reproduce 3.1'" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_table_3_1_sets_methods_side_by_side(

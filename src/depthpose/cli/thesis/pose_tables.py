@@ -1,6 +1,6 @@
 """The work behind ``depthpose reproduce 3.1``, ``3.2`` and ``3.3``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from depthpose.report.tables import (
     write_page,
     write_table,
 )
-from depthpose.thesis.pose_tables import TITLES, join_by_object
+from depthpose.thesis.pose_tables import TITLES, join_by_object, linemod_number
 from depthpose.thesis.voting import cases_of, compare_voting
 
 _RESULTS = (
@@ -38,10 +38,11 @@ _RESULTS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TableSpec:
-    """What to make: a table, of which instances, with how many pictures."""
+    """What to make: a table, of which instances, the number of each object, how many pictures."""
 
     number: str
     dataset: BopDataset
+    numbers: Mapping[str, int]
     pictures: int
 
 
@@ -49,12 +50,15 @@ def make_spec(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Tabl
     """Open the one data set that was named.
 
     Raises:
-        InputError: none was named, or two.
+        InputError: none was named, or two, or table 3.2 is asked for of another than LineMOD.
     """
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
     dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
-    return TableSpec(number=number, dataset=dataset, pictures=how.pictures)
+    models = dataset.objects.values()
+    own = {model.name: linemod_number(model) if number == "3.2" else model.number
+           for model in models}  # fmt: skip
+    return TableSpec(number=number, dataset=dataset, numbers=own, pictures=how.pictures)
 
 
 def reproduce_by_object(
@@ -71,8 +75,7 @@ def reproduce_by_object(
     shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
-    numbers = {model.name: number for number, model in dataset.objects.items()}
-    joined = join_by_object(measured.rows, numbers, with_published=spec.number == "3.2")
+    joined = join_by_object(measured.rows, spec.numbers, with_published=spec.number == "3.2")
     rows, every = [row.columns() for row in joined], pose_evaluating.table_of(measured.rows)
     write_table(out, rows)
     write_table(out, every, name="all")
