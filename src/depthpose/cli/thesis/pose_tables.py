@@ -7,18 +7,18 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
 from depthpose.cli.pose import evaluating as pose_evaluating
 from depthpose.cli.pose import masks as pose_masks
 from depthpose.cli.pose import methods as pose_methods
 from depthpose.cli.thesis.pose_figures import picture_sections
-from depthpose.cli.thesis.views import open_views
+from depthpose.cli.thesis.views import open_views, settings_of
 from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import claim_folder, environment
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.evaluate import frames_hash
 from depthpose.report.tables import (
     Section,
     markdown_table,
@@ -52,6 +52,7 @@ def make_spec(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Tabl
     Raises:
         InputError: none was named, or two, or table 3.2 is asked for of another than LineMOD.
     """
+    refuse_below(0, "--pictures", how.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
     dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
@@ -71,7 +72,9 @@ def reproduce_by_object(
     """Predict what is missing, measure, join with the published rows, and write everything."""
     dataset = spec.dataset
     methods = pose_methods.pose_methods(weights, how.estimate, tuple(dataset.objects.values()))
-    claim_folder(out, _settings(spec, methods, how), _RESULTS)
+    masks = pose_masks.mask_files(how.masks) if methods else []
+    files = {"masks": masks, "csv": [pose_masks.named_file(path) for path in csv]}
+    claim_folder(out, _settings(spec, methods, how) | files, _RESULTS)
     shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
@@ -96,9 +99,11 @@ def reproduce_voting(
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
     views = open_views(net, data, None, synthetic)
-    facts = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12], **views.facts}
+    sha256 = file_sha256(path)
+    facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
     files = [*table_files("rows"), "report.md", "report.html"]
-    claim_folder(out, {"command": "reproduce 3.3"}, files)
+    own = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
+    claim_folder(out, own | views.settings, files)
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count))
@@ -128,8 +133,8 @@ def _settings(
     """What decides the results; the files of a run of other settings are not touched."""
     return {
         "table": spec.number,
-        "frames_sha256": frames_hash(spec.dataset.instances),
-        "diameters": how.diameters,
+        **settings_of(spec.dataset),
+        "rule": config_to_dict(how.evaluation),
         "methods": {method.name: dict(method.settings) for method in methods},
     }
 
