@@ -4,18 +4,28 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.pose.synthetic_frames import moved, predictions_of
-from tests.pose.synthetic_linemod import make_linemod
+from tests.pose.synthetic_frames import frame_models, make_dataset, moved, predictions_of
+from tests.pose.synthetic_linemod import linemod_models, make_linemod
+from tests.pose.synthetic_objects import FACTS, tiny_weights
 
 from depthpose.cli import main
 from depthpose.core.files import read_image
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.predictions import write_bop_results
+from depthpose.pose.weights import write_pose_weights
 
 
 @pytest.fixture(scope="module")
 def linemod(tmp_path_factory: pytest.TempPathFactory) -> BopDataset:
     return make_linemod(tmp_path_factory.mktemp("lm") / "Linemod_preprocessed")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained, of the objects of that folder."""
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    write_pose_weights(path, tiny_weights(*linemod_models()))
+    return path
 
 
 def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:
@@ -57,6 +67,32 @@ def test_table_3_2_walks_over_the_layout_of_the_thesis(
     changed = [*words, "--diameters", "pvnet"]
     assert main(["reproduce", "3.2", *changed]) == 2
     assert "diameters = 'bop', but now it is 'pvnet'" in capsys.readouterr().err
+    for more, said in (
+        (["--masks", "truth"], "made with masks = ['truth', 'predicted'], but now it is ['truth']"),
+        (["--vsd"], "made with rule.with_vsd = False, but now it is True"),
+        (["--pictures", "-1"], "--pictures -1: give 0 or more, such as 4"),
+    ):
+        assert main(["reproduce", "3.2", *words, *more]) == 2
+        assert said in capsys.readouterr().err
+    write_bop_results(theirs, good[:1])
+    assert main(["reproduce", "3.2", *words]) == 2
+    assert "made with csv = ['oracle_lm-test.csv " in capsys.readouterr().err
+    assert rows_of(out) == rows
+
+
+def test_table_3_2_is_of_linemod_alone(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Its objects bear numbers of LineMOD, as those of most data sets do.
+    own, plain = make_dataset(tmp_path / "own"), make_linemod(tmp_path / "plain", frame_models())
+    words = ["reproduce", "3.2", "--weights", str(weights), "--out", str(tmp_path / "out")]
+    for folder, name in ((own.folder, "bracket"), (plain.folder, "obj_000007")):
+        assert main([*words, "--bop", str(folder)]) == 2
+        said = capsys.readouterr().err
+        assert f"object 7 ({name}, " in said
+        assert "is none of LineMOD" in said
+        assert "for other data sets take 'reproduce 3.1'" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_table_3_1_sets_methods_side_by_side(
@@ -91,6 +127,54 @@ def test_table_3_3_votes_on_frames_and_on_synthetic_views(
         ways = {(row["method"], row["hypotheses"]) for row in rows}
         assert ways >= {("RANSAC, ours", 1024), ("least squares, ours", None)}
         assert all(row["weights"] == "tiny" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--objects", "flange", "--split", "foo"],
+         "--objects flange and --split foo: chooses from a data set, and none is named"),
+        (["--points", "-5"], "--points -5: give 1 or more, such as 500"),
+        (["--points", "60", "60"], "--points 60 is given twice"),
+        (["--points"], "--points without a value"),
+        (["--synthetic", "0"], "--synthetic 0: give 1 or more, such as 40"),
+        (["--synthetic", "2", "--bop", "."], "rendered where no data set is given, and . is"),
+    ],
+)  # fmt: skip
+def test_options_of_table_3_3_are_never_ignored(
+    weights: Path, tmp_path: Path, words: list[str], message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    out = tmp_path / "out"
+    assert main(["reproduce", "3.3", "--weights", str(weights), "--out", str(out), *words]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_results_of_views_are_not_replaced_by_others(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.safetensors"
+    write_pose_weights(other, tiny_weights(*linemod_models(), facts=FACTS | {"licence": "CC0"}))
+    table = ["reproduce", "3.3", "--points", "60", "--out", str(tmp_path / "table")]
+    figure = ["figure", "3-5", "--out", str(tmp_path / "figure")]
+    own = ["--weights", str(weights)]
+    assert main([*table, *own, "--synthetic", "2"]) == 0
+    assert main([*figure, *own, "--number", "2"]) == 0
+    before = (tmp_path / "table/rows.json").read_bytes()
+    for words, setting in (
+        ([*table, *own, "--synthetic", "1"], "synthetic = 2, but now it is 1"),
+        ([*table, *own, "--synthetic", "2", "--points", "50"], "points = [60], but now it is [50]"),
+        ([*table, "--weights", str(other), "--synthetic", "2"], "weights_sha256 = "),
+        ([*figure, *own, "--number", "1"], "synthetic = 2, but now it is 1"),
+        ([*figure, "--weights", str(other), "--number", "2"], "weights_sha256 = "),
+    ):
+        assert main(words) == 2
+        assert f"holds results made with {setting}" in capsys.readouterr().err
+    assert (tmp_path / "table/rows.json").read_bytes() == before
+    assert main([*figure, *own, "--number", "2"]) == 0
+    assert main(["figure", "3-5", *own, "--number", "0", "--out", str(tmp_path / "no")]) == 2
+    assert "--number 0: give 1 or more" in capsys.readouterr().err
 
 
 def test_figures_are_drawn_and_explained(

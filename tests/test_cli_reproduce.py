@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.methods import Method
 from depthpose.cli.thesis.depth_tables import TableSpec, reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
@@ -200,6 +202,16 @@ def test_a_rerun_measures_the_same_files_and_refuses_other_settings(
         ),
         (["2.1", "--weights", "nope"], "neither a file nor the name of weights"),
         (["2.2", "--matcher", "sgbm", "--protocol", "kitti-2015"], "the tables hold depth"),
+        (["2.2", "--matcher", "sgbm", "--cap", "80", "80"], "--cap 80 is given twice"),
+        (["2.2", "--matcher", "sgbm", "--cap", "0"], "--cap 0: a distance in metres, above 0"),
+        (["2.2", "--matcher", "sgbm", "--cap", "nan"], "--cap nan: a distance in metres"),
+        (["2.2", "--matcher", "sgbm", "--cap"], "--cap without a value"),
+        (
+            ["2.2", "--matcher", "sgbm", "--beside", "kitti-nc"],
+            "--beside kitti-nc: adds methods of one image, and table 2.2 is of pairs",
+        ),
+        (["2.2", "--matcher", "sgbm", "--train-without", "a"], "--train-without a: leaves frames"),
+        (["2.2", "--matcher", "sgbm", "--pictures", "-1"], "--pictures -1: give 0 or more"),
     ],
 )
 def test_an_order_that_cannot_be_filled_is_refused_before_work(
@@ -234,6 +246,21 @@ def test_figures_are_drawn_and_explained(
     assert "(c) synthesised right image" in page
 
 
+def test_a_figure_of_other_frames_or_weights_needs_another_folder(
+    street: Path, tmp_path: Path
+) -> None:
+    data, method = open_dataset(street), mono("w", 15.0)
+    assert write_figure("2-5", data, [0, 2], method, tmp_path) == 0
+    assert write_figure("2-5", data, [0, 2], method, tmp_path) == 0
+    with pytest.raises(InputError, match="holds results made with frames = "):
+        write_figure("2-5", data, [1], method, tmp_path)
+    with pytest.raises(InputError, match=r"made with method\.weights = 'w'"):
+        write_figure("2-5", data, [0, 2], mono("v", 15.0), tmp_path)
+    shutil.copytree(street, tmp_path / "copy")
+    with pytest.raises(InputError, match="holds results made with frames_sha256 = "):
+        write_figure("2-5", open_dataset(tmp_path / "copy"), [0, 2], method, tmp_path)
+
+
 def test_an_unknown_frame_has_no_figure(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -266,6 +293,14 @@ def test_near_duplicates_are_listed(
     unlike = ["data", "duplicates", str(street), str(tmp_path / "other"), "--at-least", "-1"]
     assert main(unlike) == 1
     assert "4 pairs of similarity -1 or more" in capsys.readouterr().out
+    capsys.readouterr()
+    other = ["data", "duplicates", str(street), str(tmp_path / "other")]
+    assert main([*other, "--out", str(tmp_path / "o")]) == 2
+    assert "holds results made with evaluation = " in capsys.readouterr().err
+    assert main([*words, "--at-least", "0.2"]) == 2
+    assert "made with at_least = 0.3, but now it is 0.2" in capsys.readouterr().err
+    assert main([*other, "--out", str(tmp_path / "none")]) == 0
+    assert (tmp_path / "none/duplicates.md").read_text() == "none\n"
     assert main([*words, "--at-least", "2"]) == 2
     assert "a similarity is -1 .. 1" in capsys.readouterr().err
 

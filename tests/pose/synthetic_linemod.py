@@ -8,11 +8,29 @@ import yaml
 from tests.pose.synthetic_frames import draw_frame, frame_models
 
 from depthpose.core.files import write_depth_png, write_image
+from depthpose.pose.config import MeshConfig
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.datasets.linemod import segnet_mask
 from depthpose.pose.datasets.write import write_bop_models, write_mask
+from depthpose.pose.mesh import make_model
 from depthpose.pose.types import ObjectModel
+from depthpose.thesis.pose_tables import LINEMOD_DIAMETERS_M
+
+
+def linemod_models() -> list[ObjectModel]:
+    """The two of frames, as large as LineMOD's objects of their numbers."""
+    return [
+        make_model(
+            model.vertices_m * (LINEMOD_DIAMETERS_M[model.number] / model.diameter_m),
+            model.faces,
+            name=model.name,
+            number=model.number,
+            symmetries=model.symmetries,
+            config=MeshConfig(keypoints=len(model.keypoints_m)),
+        )
+        for model in frame_models()
+    ]
 
 
 def make_linemod(
@@ -22,7 +40,7 @@ def make_linemod(
 
     As published: models have no name and no symmetry.
     """
-    models = frame_models() if models is None else models
+    models = linemod_models() if models is None else models
     home = write_bop_models(folder, models)
     info = json.loads((home / "models_info.json").read_text())
     (home / "models_info.json").unlink()

@@ -14,7 +14,13 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.prepare import Prepared, prepare_cloud
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
 from depthpose.pose.synthetic import Objects
-from depthpose.thesis.pose_tables import LINEMOD, ROWS, join_by_object
+from depthpose.thesis.pose_tables import (
+    LINEMOD,
+    LINEMOD_DIAMETERS_M,
+    ROWS,
+    join_by_object,
+    linemod_number,
+)
 from depthpose.thesis.voting import VotingCase, cases_of, compare_voting
 
 
@@ -61,6 +67,27 @@ def test_ours_stand_beside_the_print_and_below_the_difference() -> None:
     last = join_by_object(rows, every, with_published=True)[-1]
     assert last.mean == pytest.approx(50.0 - 94.3)
     assert last.diameters == "pvnet against bop"
+
+
+def test_an_object_of_linemod_is_known_by_name_or_diameter() -> None:
+    def found(name: str, number: int, diameter_m: float) -> int:
+        model = replace(bracket(name), number=number, diameter_m=diameter_m)
+        return linemod_number(model)
+
+    assert set(LINEMOD) < set(LINEMOD_DIAMETERS_M)
+    assert found("obj_000006", 6, 0.1545) == 6
+    assert found("cat", 1, 0.1526) == 6  # numbered anew, with the diameter of PVNet's table
+    assert found("eggbox", 10, 0.1646) == 10
+    assert found("bowl", 3, 0.1674) == 3
+    for name, number, diameter_m, said in (
+        ("obj_000001", 1, 0.1717, "LineMOD's object 1 is 0.1021 m"),  # YCB's first
+        ("obj_000021", 21, 0.1, "0.1000 m across) is none of LineMOD. Table"),
+        ("flange", 6, 0.1545, "object 6 (flange, "),
+        ("can", 5, 0.12, "LineMOD's object 5 is 0.2014 m"),
+    ):
+        with pytest.raises(InputError, match="take 'reproduce") as refused:
+            found(name, number, diameter_m)
+        assert said in str(refused.value)
 
 
 def test_columns_of_a_table_come_in_the_declared_order() -> None:

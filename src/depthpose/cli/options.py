@@ -26,6 +26,16 @@ def voting_config(voting: Voting, hypotheses: int | None = None) -> VotingConfig
     return changed(VotingConfig(method=method), hypotheses=hypotheses)
 
 
+def refuse_below(least: int, option: str, given: int, usual: str) -> None:
+    """Refuse a count that is too small.
+
+    Raises:
+        InputError: the option, its value, the least and a usual value are named.
+    """
+    if given < least:
+        raise InputError(f"{option} {given}: give {least} or more, such as {usual}")
+
+
 @group
 class PoseDataOptions:
     """The data set of a table or figure of poses."""
@@ -50,7 +60,18 @@ class PoseDataOptions:
             raise InputError(
                 f"two data sets were named, {self.linemod} and {self.bop}; a table is of one."
             )
+        if self.linemod is None and self.bop is None:
+            self._refuse_ignored()
         return self.linemod or self.bop
+
+    def _refuse_ignored(self) -> None:
+        given = [f"--objects {' '.join(self.objects)}"] if self.objects else []
+        given += [f"--split {self.split}"] if self.split != "test" else []
+        if given:
+            raise InputError(
+                f"{' and '.join(given)}: chooses from a data set, and none is named; give "
+                "--linemod or --bop, or leave it out"
+            )
 
 
 @group

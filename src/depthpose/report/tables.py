@@ -116,7 +116,12 @@ def _markdown_name(name: str) -> str:
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
-    """Format rows as a Markdown table, columns in order of their first appearance."""
+    """Format rows as a Markdown table, columns in order of their first appearance.
+
+    No rows are the word none.
+    """
+    if not rows:
+        return "none\n"
     names = column_names(rows)
     lines = [names, ["---"] * len(names)]
     lines += [[show_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]

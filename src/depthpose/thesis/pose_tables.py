@@ -4,7 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from depthpose.core.errors import InputError
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
+from depthpose.pose.types import ObjectModel
 
 TITLES = {
     "3.1": "Table 3.1: comparison with baselines on LineMOD, ADD(-S)",
@@ -19,6 +21,21 @@ LINEMOD = {
     10: "eggbox*", 11: "glue*", 12: "holepuncher", 13: "iron", 14: "lamp", 15: "phone",
 }  # fmt: skip
 """Column of each object, by BOP's number; ADD-S where there is a star."""
+
+LINEMOD_DIAMETERS_M = {
+    1: 0.102099, 2: 0.247506, 3: 0.167355, 4: 0.172492, 5: 0.201404, 6: 0.154546, 7: 0.124264,
+    8: 0.261472, 9: 0.108999, 10: 0.164628, 11: 0.175889, 12: 0.145543, 13: 0.278078, 14: 0.282601,
+    15: 0.212358,
+}  # fmt: skip
+"""Of all its objects, as BOP and Linemod_preprocessed have them; 3 and 7 are in no printed row."""
+
+_NUMBERS = {name.rstrip("*"): number for number, name in LINEMOD.items()} | {
+    "bowl": 3, "cam": 4, "cup": 7,
+}  # fmt: skip
+_SAME_DIAMETER = 0.02
+"""Of a model without a name, which its diameter has to tell."""
+_SAME_NAMED = 0.25
+"""Of a model with a name: tables of LineMOD's diameters differ by up to 16 %."""
 
 PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 """Trained, as ours, as one network of all objects: the rows that differences are taken from."""
@@ -167,6 +184,27 @@ class ComparedRow:
         return found | {f"ms_{stage}": value for stage, value in self.ms.items()}
 
 
+def linemod_number(model: ObjectModel) -> int:
+    """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
+
+    A model without a name is known by its number and diameter.
+
+    Raises:
+        InputError: it is none of them.
+    """
+    is_named = model.name != f"obj_{model.number:06d}"
+    number = _NUMBERS.get(model.name.lower(), 0) if is_named else model.number
+    theirs_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
+    if abs(theirs_m / model.diameter_m - 1) <= (_SAME_NAMED if is_named else _SAME_DIAMETER):
+        return number
+    theirs = f"; LineMOD's object {number} is {theirs_m:.4f} m" if theirs_m else ""
+    raise InputError(
+        f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
+        f"LineMOD{theirs}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
+        "sets take 'reproduce 3.1', or leave the object out by --objects"
+    )
+
+
 def join_by_object(
     rows: Sequence[ObjectRow], numbers: Mapping[str, int], *, with_published: bool
 ) -> list[ComparedRow]:
@@ -174,7 +212,8 @@ def join_by_object(
 
     Args:
         rows: of ``pose.evaluate``, with their origin and conditions.
-        numbers: BOP's number of each object, by the name in the rows.
+        numbers: BOP's number of each object, by the name in the rows; with printed rows that of
+            LineMOD's object (:func:`linemod_number`).
         with_published: set the printed rows of LineMOD before ours, and the differences to
             ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 

@@ -173,11 +173,17 @@ def duplicates(
     """
     from tqdm import tqdm
 
+    from depthpose.core.run import claim_folder
     from depthpose.depth.datasets import find_duplicates, open_dataset
+    from depthpose.report.tables import table_files
 
     if not -1 <= at_least <= 1:
         raise InputError(f"--at-least {at_least:g}: a similarity is -1 .. 1; take 0.3")
     sets = open_dataset(train), open_dataset(evaluation)
+    if out is not None:
+        about = {"train": str(train.resolve()), "evaluation": str(evaluation.resolve())}
+        about |= {"command": "data duplicates", "at_least": at_least}
+        claim_folder(out, about, table_files("duplicates"))
     ranked = find_duplicates(*sets, at_least, partial(tqdm, unit=" frames", disable=None))
     count = _list_duplicates([pair for pair in ranked if pair.similarity >= at_least], out)
     best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
@@ -188,14 +194,12 @@ def duplicates(
 
 def _list_duplicates(pairs: "list[Duplicate]", out: Path | None) -> int:
     """Print pairs, and write them; give their number."""
-    from depthpose.core.run import claim_folder
-    from depthpose.report.tables import markdown_table, table_files, write_table
+    from depthpose.report.tables import markdown_table, write_table
 
     rows = [asdict(pair) for pair in pairs]
     if rows:
         print(markdown_table(rows))
     if out is not None:
-        claim_folder(out, {"command": "data duplicates"}, table_files("duplicates"))
         write_table(out, rows, name="duplicates")
     return len(rows)
 

@@ -212,14 +212,18 @@ class ProtocolOptions:
     """metres beyond which truth does not count; a row each."""
 
     def refuse_unusable(self) -> None:
-        """Refuse a cap that is no distance.
+        """Refuse caps that are no distances, a repeated one, and none at all.
 
         Raises:
-            InputError: it is none.
+            InputError: which, and the rule.
         """
+        if not self.cap:
+            raise InputError("--cap without a value: give a distance in metres, such as 80")
         for cap_m in self.cap:
             if not 0 < cap_m < math.inf:
                 raise InputError(f"--cap {cap_m:g}: a distance in metres, above 0")
+            if self.cap.count(cap_m) > 1:
+                raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
 
 
 def parse_bytes(text: str | None) -> int | None:

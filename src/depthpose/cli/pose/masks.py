@@ -67,6 +67,30 @@ def find_masks(
     ]
 
 
+def mask_files(kinds: Sequence[str]) -> list[str]:
+    """Name masks as :func:`find_masks` takes them; files by what they hold.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    paths = [_path_of(kind) for kind in kinds]
+    return [
+        kind if path is None else named_file(path) for kind, path in zip(kinds, paths, strict=True)
+    ]
+
+
+def named_file(path: Path) -> str:
+    """Name a file with the start of its SHA-256: another one of that name is another name.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        return f"{path.name} {file_sha256(path)[:12]}"
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
+
+
 def of_dataset(dataset: BopDataset) -> dict[str, Any]:
     """Settings that say which data set results are of."""
     return {"dataset": dataset.folder.resolve().name, "split": dataset.split}

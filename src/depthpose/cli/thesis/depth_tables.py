@@ -1,6 +1,7 @@
 """The work behind ``depthpose reproduce`` and ``depthpose figure``."""
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.datasets import Dataset, has_lidar, lidar_truth
+from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.report.choose import spread_evenly
@@ -153,7 +154,9 @@ def write_figure(
     number: str, dataset: Dataset, indices: Sequence[int], method: Method, out: Path
 ) -> int:
     """Estimate the frames, draw the figure, and write it with a page that explains it."""
-    claim_figure(out, number)
+    frames = [dataset.frames[index] for index in indices]
+    about = {"frames": [f.name for f in frames], "frames_sha256": _frames_hash(frames)}
+    claim_figure(out, number, {**about, "method": method.settings})
     columns = [
         _draw_column(number, dataset, index, method)
         for index in tqdm(indices, unit=" frames", disable=None)
@@ -175,14 +178,20 @@ def write_figure(
     return 0
 
 
-def claim_figure(out: Path, number: str) -> None:
+def claim_figure(out: Path, number: str, settings: Mapping[str, Any]) -> None:
     """Claim a folder for a figure.
 
+    Args:
+        out: the folder.
+        number: of the figure.
+        settings: what decides its panels.
+
     Raises:
-        InputError: it is another command's, or holds files that would be written over.
+        InputError: it is another command's or another figure's, or holds files that would be
+            written over.
     """
     files = (f"figure-{number}.png", "panels", "report.html")
-    claim_folder(out, {"command": f"figure {number}"}, files)
+    claim_folder(out, {"command": f"figure {number}", **settings}, files)
 
 
 def _draw_column(number: str, dataset: Dataset, index: int, method: Method) -> list[Panel]:
@@ -243,10 +252,17 @@ def _settings(spec: TableSpec, methods: Sequence[Method]) -> dict[str, Any]:
         "table": spec.table.number,
         "dataset": spec.dataset.name,
         "frames": len(spec.dataset),
+        "frames_sha256": _frames_hash(spec.dataset.frames),
         "protocol": spec.protocol,
         "caps_m": list(spec.caps_m),
         "methods": {method.name: method.settings for method in methods},
     }
+
+
+def _frames_hash(frames: Sequence[Frame]) -> str:
+    """Give the SHA-256 of the list of left images, a line each."""
+    lines = "".join(f"{frame.left.resolve()}\n" for frame in frames)
+    return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def _setting_rows(methods: Sequence[Method]) -> list[dict[str, Any]]:

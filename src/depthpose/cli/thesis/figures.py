@@ -1,9 +1,10 @@
 """``depthpose figure 3-2``, ``3-4`` and ``3-5``."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from depthpose.cli.options import PoseDataOptions
+from depthpose.cli.options import PoseDataOptions, refuse_below
 
 if TYPE_CHECKING:
     from depthpose.cli.thesis.views import Views
@@ -39,6 +40,7 @@ def figure_3_2(
     from depthpose.cli.thesis import pose_figures
 
     net, views = _open(weights, data, number)
+    _claim(out, "3-2", weights, {**views.settings, "perplexity": perplexity})
     panels = pose_figures.feature_panels(net, views, perplexity)
     return pose_figures.write_figure("3-2", _FEATURES, panels, out, columns=4)
 
@@ -67,6 +69,7 @@ def figure_3_4(
     from depthpose.cli.thesis import pose_figures
 
     net, views = _open(weights, data, number)
+    _claim(out, "3-4", weights, {**views.settings, "keypoint": keypoint})
     panels = pose_figures.field_panels(net, views, keypoint)
     text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
     return pose_figures.write_figure("3-4", text, panels, out, columns=3)
@@ -93,6 +96,7 @@ def figure_3_5(
     from depthpose.cli.thesis import pose_figures
 
     net, views = _open(weights, data, number)
+    _claim(out, "3-5", weights, views.settings)
     panels = pose_figures.box_panels(net, views)
     return pose_figures.write_figure("3-5", pose_figures.BOXES, panels, out, columns=3)
 
@@ -101,5 +105,15 @@ def _open(weights: str, data: PoseDataOptions, number: int) -> "tuple[GeoPoseNet
     from depthpose.cli.thesis.views import open_views
     from depthpose.pose.estimator import GeoPoseNet
 
+    refuse_below(1, "--number", number, "4")
     net = GeoPoseNet.load(weights)
     return net, open_views(net, data, number, number)
+
+
+def _claim(out: Path, number: str, weights: str, settings: Mapping[str, Any]) -> None:
+    """Claim the folder for a figure by these weights, and by these settings of its own."""
+    from depthpose.cli.thesis.depth_tables import claim_figure
+    from depthpose.core.checkpoint import file_sha256, find_weights
+
+    sha256 = file_sha256(find_weights(weights))
+    claim_figure(out, number, {"weights_sha256": sha256, **settings})

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from depthpose.cli.thesis.depth_tables import claim_figure
 from depthpose.cli.thesis.views import Views
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
@@ -41,8 +40,7 @@ class Panel(NamedTuple):
 
 
 def write_figure(number: str, text: str, panels: Sequence[Panel], out: Path, columns: int) -> int:
-    """Write the figure, each panel, and a page that explains it."""
-    claim_figure(out, number)
+    """Write the figure, each panel, and a page that explains it, to a folder that is claimed."""
     path = out / f"figure-{number}.png"
     write_image(path, arrange_grid([panel.image for panel in panels], columns))
     pictures: list[Picture] = []

@@ -1,24 +1,24 @@
 """The work behind ``depthpose reproduce 3.1``, ``3.2`` and ``3.3``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
 from depthpose.cli.pose import evaluating as pose_evaluating
 from depthpose.cli.pose import masks as pose_masks
 from depthpose.cli.pose import methods as pose_methods
 from depthpose.cli.thesis.pose_figures import picture_sections
-from depthpose.cli.thesis.views import open_views
+from depthpose.cli.thesis.views import open_views, settings_of
 from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.run import claim_folder, environment
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.evaluate import frames_hash
 from depthpose.report.tables import (
     Section,
     markdown_table,
@@ -27,7 +27,7 @@ from depthpose.report.tables import (
     write_page,
     write_table,
 )
-from depthpose.thesis.pose_tables import TITLES, join_by_object
+from depthpose.thesis.pose_tables import TITLES, join_by_object, linemod_number
 from depthpose.thesis.voting import cases_of, compare_voting
 
 _RESULTS = (
@@ -38,10 +38,11 @@ _RESULTS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TableSpec:
-    """What to make: a table, of which instances, with how many pictures."""
+    """What to make: a table, of which instances, the number of each object, how many pictures."""
 
     number: str
     dataset: BopDataset
+    numbers: Mapping[str, int]
     pictures: int
 
 
@@ -49,12 +50,16 @@ def make_spec(number: str, data: PoseDataOptions, how: PoseTableOptions) -> Tabl
     """Open the one data set that was named.
 
     Raises:
-        InputError: none was named, or two.
+        InputError: none was named, or two, or table 3.2 is asked for of another than LineMOD.
     """
+    refuse_below(0, "--pictures", how.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
     dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
-    return TableSpec(number=number, dataset=dataset, pictures=how.pictures)
+    models = dataset.objects.values()
+    own = {model.name: linemod_number(model) if number == "3.2" else model.number
+           for model in models}  # fmt: skip
+    return TableSpec(number=number, dataset=dataset, numbers=own, pictures=how.pictures)
 
 
 def reproduce_by_object(
@@ -67,12 +72,13 @@ def reproduce_by_object(
     """Predict what is missing, measure, join with the published rows, and write everything."""
     dataset = spec.dataset
     methods = pose_methods.pose_methods(weights, how.estimate, tuple(dataset.objects.values()))
-    claim_folder(out, _settings(spec, methods, how), _RESULTS)
+    masks = pose_masks.mask_files(how.masks) if methods else []
+    files = {"masks": masks, "csv": [pose_masks.named_file(path) for path in csv]}
+    claim_folder(out, _settings(spec, methods, how) | files, _RESULTS)
     shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
     measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
-    numbers = {model.name: number for number, model in dataset.objects.items()}
-    joined = join_by_object(measured.rows, numbers, with_published=spec.number == "3.2")
+    joined = join_by_object(measured.rows, spec.numbers, with_published=spec.number == "3.2")
     rows, every = [row.columns() for row in joined], pose_evaluating.table_of(measured.rows)
     write_table(out, rows)
     write_table(out, every, name="all")
@@ -93,9 +99,11 @@ def reproduce_voting(
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
     views = open_views(net, data, None, synthetic)
-    facts = {"weights": path.stem, "weights_sha256": file_sha256(path)[:12], **views.facts}
+    sha256 = file_sha256(path)
+    facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
     files = [*table_files("rows"), "report.md", "report.html"]
-    claim_folder(out, {"command": "reproduce 3.3"}, files)
+    own = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
+    claim_folder(out, own | views.settings, files)
     rows: list[dict[str, Any]] = []
     for count in points:
         cases = list(cases_of(net, tqdm(views.samples, f"{count} points", disable=None), count))
@@ -125,8 +133,8 @@ def _settings(
     """What decides the results; the files of a run of other settings are not touched."""
     return {
         "table": spec.number,
-        "frames_sha256": frames_hash(spec.dataset.instances),
-        "diameters": how.diameters,
+        **settings_of(spec.dataset),
+        "rule": config_to_dict(how.evaluation),
         "methods": {method.name: dict(method.settings) for method in methods},
     }
 

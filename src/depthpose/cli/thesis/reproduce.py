@@ -7,6 +7,7 @@ import tyro
 
 from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions
 from depthpose.cli.help import group
+from depthpose.cli.options import refuse_below
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
@@ -26,13 +27,30 @@ class RowOptions:
     """weights files; 2.2 takes a stereo matcher's too."""
     matcher: Literal["sgbm"] | None = None
     """sgbm: OpenCV's StereoSGBM as a row of table 2.2."""
-    beside: tuple[str, ...] = ("default",)
+    beside: tuple[str, ...] | None = None
     """tables 2.1 and 2.3: weights of other methods, a row each; by default those that ship.
     '--beside' without a name: none."""
     train: tuple[Path, ...] = ()
     """training folders, for two baselines (best depth of each row, nearest image)."""
     train_without: tuple[str, ...] = ()
     """names of training frames to leave out."""
+
+    def refuse_unusable(self, table: "PublishedTable") -> None:
+        """Refuse rows that a table does not have, and frames to leave out of no training.
+
+        Raises:
+            InputError: which, and the rule.
+        """
+        if self.beside is not None and table.with_right:
+            raise InputError(
+                f"--beside {' '.join(self.beside)}: adds methods of one image, and table "
+                f"{table.number} is of pairs; leave it out, or give more --weights"
+            )
+        if self.train_without and not self.train:
+            raise InputError(
+                f"--train-without {' '.join(self.train_without)}: leaves frames out of --train, "
+                "and none is given; give its folders, or leave this out"
+            )
 
     def methods(self, table: "PublishedTable", config: MatcherConfig) -> "list[tuple[str, Method]]":
         """Build each method, with the thesis's own row that it stands for, if any."""
@@ -42,7 +60,8 @@ class RowOptions:
         chosen = own_methods(table, self.weights, self.matcher, config)
         names = {method.name for _, method in chosen}
         if not table.with_right:
-            others = [methods.weights_method(n, config, with_right=False) for n in self.beside]
+            named = ("default",) if self.beside is None else self.beside
+            others = [methods.weights_method(n, config, with_right=False) for n in named]
             chosen += [("", other) for other in others if other.name not in names]
         if self.train:
             training = evaluating.open_training(self.train, self.train_without)
@@ -89,6 +108,9 @@ def reproduce(
         raise InputError(
             f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
         )
+    comparison.refuse_unusable()
+    refuse_below(0, "--pictures", pictures, "3")
+    rows.refuse_unusable(published)
     reproducing.refuse_wrong_count(published, rows.weights, rows.matcher)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
     chosen = rows.methods(published, matching.config)
@@ -134,8 +156,8 @@ def figure(
     from depthpose.cli.thesis import depth_tables as reproducing
 
     dataset = evaluating.open_frames(kitti, split)
-    if number is not None and number < 1:
-        raise InputError(f"--number {number}: at least 1 frame")
+    if number is not None:
+        refuse_below(1, "--number", number, "4")
     count = number or (1 if figure == "2-1" else 4)
     chosen = reproducing.choose_frames(dataset, frames, count)
     method = methods.weights_method(

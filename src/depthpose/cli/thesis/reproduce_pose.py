@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from depthpose.cli.options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
 from depthpose.core.errors import InputError
 
 
@@ -65,7 +65,7 @@ def table_3_3(
     weights: str,
     out: Path,
     data: PoseDataOptions = PoseDataOptions(),
-    synthetic: int = 40,
+    synthetic: int | None = None,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
 ) -> int:
     """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
@@ -80,9 +80,27 @@ def table_3_3(
     Args:
         weights: file or name, of the sparse network.
         out: folder for rows.json, rows.csv, table.md and report.html.
-        synthetic: number of synthetic views where no data set is given.
+        synthetic: number of synthetic views where no data set is given; 40 unless told.
         points: at most so many votes of a cloud; a block of rows each.
     """
     from depthpose.cli.thesis.pose_tables import reproduce_voting
 
-    return reproduce_voting(weights, data, synthetic, points, out)
+    folder = data.folder
+    if synthetic is not None and folder is not None:
+        raise InputError(
+            f"--synthetic {synthetic}: views are rendered where no data set is given, and "
+            f"{folder} is; leave one out"
+        )
+    number = 40 if synthetic is None else synthetic
+    refuse_below(1, "--synthetic", number, "40")
+    _refuse_points(points)
+    return reproduce_voting(weights, data, number, points, out)
+
+
+def _refuse_points(points: tuple[int, ...]) -> None:
+    if not points:
+        raise InputError("--points without a value: give a number of votes, such as 500")
+    for count in points:
+        refuse_below(1, "--points", count, "500")
+        if points.count(count) > 1:
+            raise InputError(f"--points {count} is given twice; each is a block: give it once")

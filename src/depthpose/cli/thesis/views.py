@@ -26,11 +26,19 @@ SYNTHETIC_SEED = 3303
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """Views, the picture of each, and what to write beside numbers of them."""
+    """Views with truth.
+
+    Attributes:
+        samples: what the network is given.
+        instances: of a data set, with the picture of each.
+        facts: what to write beside numbers of them.
+        settings: what decides which views they are.
+    """
 
     samples: Sequence[ViewSample]
     instances: Sequence[Instance | None]
     facts: dict[str, Any]
+    settings: dict[str, Any]
 
     def picture(self, index: int) -> Float[Tensor, "3 h w"]:
         """Give the picture of a view, or its depth in grey."""
@@ -64,8 +72,20 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         kept = [dataset.instances[i] for i in spread_evenly(len(dataset), number)]
         dataset = replace(dataset, instances=kept)
     return Views(
-        samples=list(_views_of(dataset, net)), instances=list(dataset.instances), facts=facts
+        samples=list(_views_of(dataset, net)),
+        instances=list(dataset.instances),
+        facts=facts,
+        settings=settings_of(dataset),
     )
+
+
+def settings_of(dataset: BopDataset) -> dict[str, Any]:
+    """Say which instances of which data set results are of."""
+    return {
+        "data": str(dataset.folder.resolve()),
+        "split": dataset.split,
+        "frames_sha256": frames_hash(dataset.instances),
+    }
 
 
 def _synthetic_views(net: GeoPoseNet, number: int) -> Views:
@@ -73,7 +93,8 @@ def _synthetic_views(net: GeoPoseNet, number: int) -> Views:
     objects = Objects(net.weights.models, config, net.weights.cloud)
     samples = [objects.view(i) for i in range(number)]
     facts = {"frames": f"synthetic, seed {SYNTHETIC_SEED}"}
-    return Views(samples=samples, instances=[None] * number, facts=facts)
+    settings = {"synthetic": number, "seed": SYNTHETIC_SEED}
+    return Views(samples=samples, instances=[None] * number, facts=facts, settings=settings)
 
 
 def _views_of(dataset: BopDataset, net: GeoPoseNet) -> Iterator[ViewSample]:
