@@ -9,12 +9,14 @@ from torch import Tensor, nn
 
 from depthpose.depth.stereo.enlargement import Features, Maps, Quarter
 from depthpose.depth.stereo.psmnet import conv_norm_2d
-from depthpose.depth.stereo.volume import WINDOW_PX, interpolation_matrix, linear_taps
+from depthpose.depth.stereo.volume import interpolation_matrix, linear_taps
 
 Scores = Float[Tensor, "b d h4 w4"]
 
 STEP_PX = 4
 """Distance of neighbouring disparities that have a score."""
+_WINDOW = 0.15
+"""Of a disparity: what lies so near to it counts for its confidence."""
 _USUAL_PX = 64
 """A disparity of this size is 1 to the class of the sky."""
 _SKY_WIDTH = 32
@@ -34,17 +36,21 @@ def mean_of_all(scores: Scores) -> Quarter:
 
 
 def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
-    """Give the probability of what lies within ``WINDOW_PX`` of a disparity.
+    """Give the probability of what lies within 15 % of a disparity.
 
-    As PSMNet's confidence: between the disparities that have a score, scores are interpolated.
+    As the confidence of a generator that selects: depth is then off by no more than about that.
+    Between the disparities that have a score, scores are interpolated.
     """
     bins = scores.shape[1]
     count = STEP_PX * (bins - 1) + 1
     matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
     probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
     steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
-    is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
-    return (probability * is_near).sum(1).clamp(0, 1)
+    distance_px = (steps_px - disparity_px[:, None]).abs()
+    window_px = _WINDOW * disparity_px.clamp(min=1)[:, None]
+    # Each whole disparity stands for the half pixel on both sides of it.
+    share = (window_px + 0.5 - distance_px).clamp(0, 1)
+    return (probability * share).sum(1).clamp(0, 1)
 
 
 class SkyHead(nn.Module):
