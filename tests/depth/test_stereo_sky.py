@@ -40,7 +40,11 @@ def partly_sky(config: LightConfig = SMALL) -> LightStereo:
     assert network.sky is not None
     torch.nn.init.normal_(network.sky.logit.weight)
     assert network.sky.logit.bias is not None
-    torch.nn.init.zeros_(network.sky.logit.bias)
+    with torch.no_grad():
+        pair = torch.randn(2, 1, 3, 64, 96, generator=torch.Generator().manual_seed(1)).unbind()
+        _, sky = network.forward_with_sky(*pair)
+        assert sky is not None
+        network.sky.logit.bias -= sky.logit(1e-6).median()
     return network
 
 

@@ -15,7 +15,7 @@ from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.depth.datasets import Duplicate
+    from depthpose.depth.datasets import Duplicate, Frame
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import LabelConfig
 
@@ -130,24 +130,29 @@ def pack(
     """
     from tqdm import tqdm
 
-    from depthpose.core.run import refuse_to_replace
     from depthpose.depth.datasets import open_dataset, pack_frames
 
     if shard_mb < 1:
         raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
-    refuse_to_replace(out / "index.json")
     dataset = open_dataset(path, split)
-    if any(part.suffix == ".tar" for frame in dataset.frames[:1] for part in frame.left.parents):
+    _refuse_to_pack(path, dataset.frames, out)
+    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
+        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
+    print(f"{len(dataset)} frames in {shards} shards: {out}")
+    return 0
+
+
+def _refuse_to_pack(path: Path, frames: "list[Frame]", out: Path) -> None:
+    from depthpose.core.run import refuse_to_replace
+
+    refuse_to_replace(out / "index.json")
+    if any(part.suffix == ".tar" for frame in frames[:1] for part in frame.left.parents):
         raise InputError(f"{path}: is packed already; give the folder that it was made of")
     if out.resolve() == path.resolve():
         raise InputError(
             f"--out {out}: is the data set itself, which would be read as packed from then on; "
             "choose another folder"
         )
-    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
-        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
-    print(f"{len(dataset)} frames in {shards} shards: {out}")
-    return 0
 
 
 def duplicates(
