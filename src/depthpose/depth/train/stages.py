@@ -133,17 +133,13 @@ def match_whole(
     left: Float[Tensor, "3 h w"],
     right: Float[Tensor, "3 h w"],
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"] | None]:
-    """Match one pair of any size with the network as it stands; say where it sees the sky."""
+    """Match one pair of any size with the network as it stands [px]; say where it sees the sky."""
     device = next(matcher.parameters()).device
     height, width = left.shape[-2:]
     padded = [pad_top_right(normalise(v.to(device)), matcher.config)[None] for v in (left, right)]
     heads, sky = matcher.forward_with_sky(*padded)
-    found, seen = (
-        None if maps is None else maps[0, -height:, :width].float().cpu()
-        for maps in (heads[-1], sky)
-    )
-    assert found is not None
-    return found, None if seen is None else seen > 0.5
+    found = heads[-1][0, -height:, :width].float().cpu()
+    return found, None if sky is None else sky[0, -height:, :width].cpu() > 0.5
 
 
 @torch.no_grad()
