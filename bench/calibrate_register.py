@@ -1,14 +1,14 @@
 """The risk of a wrong registration, calibrated on random parts and checked on others.
 
-    python bench/calibrate_register.py --parts 14 --check 6
+    python bench/calibrate_register.py --parts 60 --check 20
 
-Each random part is seen in five views with up to 60 % hidden, and in its place five negatives:
-another part, a scaled copy, a mirrored one, a blob, and a box or cylinder. Nothing is refused for
-its risk while signals are collected; ``calibrate_refusal`` then weighs them, and chooses the limit
-so that at most 2 % of the answers are wrong where nearly half of what is seen is not the part.
-Mirrored and scaled copies, of which some views hardly differ, are counted but not calibrated on.
-Prints the settings that ``src/depthpose/pose/estimator/register.py`` holds, and what they answer on
-the parts kept back; writes all signals to ``rows.json``. ``--rows`` takes those of an earlier run.
+Each random part is seen in eight depth images with up to 60 % hidden, and in its place one negative
+of each of eight kinds: another part, a scaled copy, a mirrored one where that differs, a blob, a
+plate, a box or cylinder, a ball and a hand. Nothing is refused for its risk while signals are
+collected; ``calibrate_refusal`` then weighs them, and chooses the limit so that at most 1 % of the
+answers are wrong and at most 1 % of the negatives are answered. Prints the settings that
+``src/depthpose/pose/estimator/register.py`` holds, and what they answer on the parts kept back;
+writes all signals to ``rows.json``. ``--rows`` takes those of an earlier run.
 """
 
 import argparse
@@ -16,26 +16,25 @@ import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import torch
 
 from depthpose.core.loop import sample_generator
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
 from depthpose.pose.estimator import calibrate_refusal, risk_of
-from depthpose.pose.estimator.evidence import CONTEXT, SIGNALS
+from depthpose.pose.estimator.evidence import CONTEXT
 from depthpose.pose.estimator.register import CANDIDATE_SLOPES, Registration
 from depthpose.pose.synthetic import Objects, random_part
-from depthpose.pose.synthetic.negatives import NegativeKind, negative_of
+from depthpose.pose.synthetic.negatives import NegativeKind, negative_kinds, negative_of
 from depthpose.pose.train.held_out import pose_error
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.tables import markdown_table
 
 SEED = 0x9A27
-VIEWS = 5
-NEGATIVES = ("another object", "scaled", "mirrored", "blob", "box or cylinder")
-NEAR = ("scaled", "mirrored")
-MAX_WRONG = 0.02
+VIEWS = 8
+ITSELF = "itself"
+MAX_WRONG = 0.01
 OPEN = RefusalConfig(max_risk=1.0, candidate_slopes=CANDIDATE_SLOPES)
 Row = dict[str, Any]
 
@@ -44,10 +43,10 @@ def seen_in_place(number: int) -> tuple[ObjectModel, list[tuple[str, ObjectModel
     """Make a part, and what is seen in each of its views."""
     generator = sample_generator(number, SEED)
     part, other = (random_part(generator) for _ in range(2))
-    shown = [("itself", part)] * VIEWS
-    for kind in NEGATIVES:
-        others = [dataclasses.replace(other, name="other")]
-        shown.append((kind, negative_of(part, cast(NegativeKind, kind), others, generator)))
+    others = [dataclasses.replace(other, name="other")]
+    shown = [(ITSELF, part)] * VIEWS
+    for kind in negative_kinds(part):
+        shown.append((kind, negative_of(part, kind, others, generator)))
     return part, shown
 
 
@@ -61,9 +60,9 @@ def rows_of(number: int) -> Iterator[Row]:
     )  # fmt: skip
     views = Objects([model for _, model in shown], config)
     for k, (kind, _) in enumerate(shown):
-        sample = views[k]
+        sample = views.view(k)
         found = registration.estimate_many([sample.input])[0]
-        error = pose_error(found, sample.truth, part) if kind == "itself" else 1.0
+        error = pose_error(found, sample.truth, part) if kind == ITSELF else 1.0
         yield {
             "part": number, "kind": kind, "status": found.status, "signals": found.signals,
             "right": found.is_ok and error < 0.1,
@@ -71,12 +70,11 @@ def rows_of(number: int) -> Iterator[Row]:
 
 
 def calibrated(rows: Sequence[Row]) -> RefusalConfig:
-    """Weigh the signals that registration has; those of votes for keypoints count as none."""
-    answered = [row for row in rows if row["status"] == "ok" and row["kind"] not in NEAR]
-    none = dict.fromkeys(SIGNALS, 0.0)
-    estimates = [cast(PoseEstimate, Answer({**none, **row["signals"]})) for row in answered]
+    """Weigh the signals that registration has."""
+    own = [row for row in rows if row["kind"] == ITSELF]
+    others = [row for row in rows if row["kind"] != ITSELF]
     found = calibrate_refusal(
-        estimates, [row["right"] for row in answered], MAX_WRONG, without=CONTEXT
+        estimates(own), [row["right"] for row in own], MAX_WRONG, estimates(others), without=CONTEXT
     )
     slopes = {name: round(k, 3) for name, k in found.slopes.items() if k > 1e-3}
     return dataclasses.replace(
@@ -85,17 +83,22 @@ def calibrated(rows: Sequence[Row]) -> RefusalConfig:
     )  # fmt: skip
 
 
+def estimates(rows: Sequence[Row]) -> list[PoseEstimate]:
+    """Give what calibration asks of estimates."""
+    return [cast(PoseEstimate, Answer(row["signals"], row["status"] == "ok")) for row in rows]
+
+
 @dataclasses.dataclass(frozen=True)
 class Answer:
     """What calibration asks of an estimate."""
 
     signals: dict[str, float]
-    is_ok: bool = True
+    is_ok: bool
 
 
 def counts(rows: Sequence[Row], refusal: RefusalConfig) -> Iterator[Row]:
     """Count right, refused and wrong answers of each kind."""
-    for kind in ("itself", *NEGATIVES):
+    for kind in (ITSELF, *get_args(NegativeKind)):
         some = [row for row in rows if row["kind"] == kind]
         ok = [row for row in some if row["status"] == "ok"
               and (risk_of(row["signals"], refusal) or 0.0) <= refusal.max_risk]  # fmt: skip
@@ -107,8 +110,8 @@ def counts(rows: Sequence[Row], refusal: RefusalConfig) -> Iterator[Row]:
 def main() -> None:
     """Collect, calibrate, check."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", type=int, default=14, help="by which is calibrated")
-    parser.add_argument("--check", type=int, default=6, help="by which is checked")
+    parser.add_argument("--parts", type=int, default=60, help="by which is calibrated")
+    parser.add_argument("--check", type=int, default=20, help="by which is checked")
     parser.add_argument("--rows", type=Path, help="rows.json of an earlier run")
     parser.add_argument("--out", type=Path, default=Path("out/calibrate_register"))
     words = parser.parse_args()
