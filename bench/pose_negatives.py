@@ -10,6 +10,7 @@ Views are rendered like held-out ones, half of them with up to a half occluded. 
 themselves, four times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of
 the diameter. ``--seed`` draws other views.
 Each is a depth image with a mask; ``--clouds`` gives the points in the mask alone.
+``--method register`` registers the objects without a network, ``both`` what the network doubts.
 ``--save`` writes all signals as JSON; then nothing is refused for its risk.
 """
 
@@ -25,14 +26,14 @@ import torch
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
-from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.config import EstimateConfig, ObjectsConfig
+from depthpose.pose.estimator import GeoPoseNet, Registration
+from depthpose.pose.estimator.base import PoseEstimator
 from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
 from depthpose.pose.train.held_out import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
-from depthpose.pose.weights import PoseWeights
 from depthpose.report.tables import markdown_table
 
 SEED = 0x0DD
@@ -55,18 +56,18 @@ def seen(
 
 
 def things(
-    weights: PoseWeights, kind: str, number: int, seed: int
+    known: Sequence[ObjectModel], kind: str, number: int, seed: int
 ) -> tuple[list[ObjectModel], list[int]]:
     """Give the model in view, and the number of the requested object."""
     generator = sample_generator(sum(map(ord, kind)), seed)
-    asked = [k % len(weights.models) for k in range(number)]
-    models = [weights.models[k] for k in asked]
+    asked = [k % len(known) for k in range(number)]
+    models = [known[k] for k in asked]
     if kind == ITSELF:
         return models, asked
     name, _, times = kind.partition(" by ")
     scale = float(times) if times else None
     found: Any = name
-    return [negative_of(m, found, weights.models, generator, scale) for m in models], asked
+    return [negative_of(m, found, known, generator, scale) for m in models], asked
 
 
 def kinds() -> Iterator[str]:
@@ -79,19 +80,19 @@ def kinds() -> Iterator[str]:
 
 
 def measure(
-    net: GeoPoseNet, kind: str, number: int, seed: int, with_scene: bool = True
+    net: PoseEstimator, kind: str, number: int, seed: int, with_scene: bool = True
 ) -> list[Row]:
     """Estimate every negative of a kind, or the objects themselves."""
-    models, asked = things(net.weights, kind, number, seed)
+    models, asked = things(net.models, kind, number, seed)
     samples = list(seen(models, seed, with_scene))
     starts = range(0, len(samples), TOGETHER)
     parts = ([sample.input for sample in samples[k : k + TOGETHER]] for k in starts)
     estimates = [estimate for part in parts for estimate in net.estimate_many(part)]
     rows = []
     for sample, which, found in zip(samples, asked, estimates, strict=True):
-        error = pose_error(found, sample.truth, net.weights.models[which])
+        error = pose_error(found, sample.truth, net.models[which])
         is_right = kind == ITSELF and error < 0.1
-        is_alike = kind == "mirrored" and is_mirror_alike(net.weights.models[which])
+        is_alike = kind == "mirrored" and is_mirror_alike(net.models[which])
         rows.append({
             "kind": ALIKE if is_alike else kind, "object": sample.input.object,
             "status": found.status,
@@ -113,6 +114,7 @@ def summary(rows: Sequence[Row]) -> Row:
     row: Row = {"kind": rows[0]["kind"], "number": len(rows), "answered": ok / len(rows)}
     if rows[0]["kind"] == ITSELF:
         row["right"] = sum(row["right"] for row in rows) / len(rows)
+        row["wrong"] = row["answered"] - row["right"]
     return row
 
 
@@ -123,14 +125,18 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=40)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--clouds", action="store_true", help="clouds in place of depth images")
+    parser.add_argument("--method", choices=("network", "register", "both"), default="network")
     parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
     words = parser.parse_args()
     torch.set_num_threads(1)
     for name in words.weights:
-        net = GeoPoseNet.load(find_weights(name))
-        if words.save:
-            opened = dataclasses.replace(net.weights.refusal, max_risk=1.0)
+        config = EstimateConfig(register_refused=words.method == "both")
+        net = GeoPoseNet.load(find_weights(name), config)
+        opened = dataclasses.replace(net.refusal, max_risk=1.0)
+        if words.method == "register":
+            net = Registration(net.models, refusal=opened if words.save else None)
+        elif words.save:
             net.weights = dataclasses.replace(net.weights, refusal=opened)
         began, rows = time.process_time(), []
         for kind in words.kinds or [ITSELF, *kinds()]:

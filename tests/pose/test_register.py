@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from depthpose import Registration
+from depthpose import GeoPoseNet, Registration
+from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
@@ -17,6 +18,7 @@ from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import Objects, make_part, random_part, write_part
 from depthpose.pose.types import CloudSample, ObjectModel
 from depthpose.pose.voting.point_pairs import prepare_pairs, propose_poses
+from depthpose.pose.weights import read_pose_weights
 
 
 @cache
@@ -117,3 +119,45 @@ def test_models_that_cannot_be_looked_for_are_named() -> None:
 def test_registration_without_icp_is_an_error() -> None:
     with pytest.raises(InputError, match="registration refines by ICP"):
         Registration([part()], EstimateConfig(with_icp=False))
+
+
+@cache
+def doubting_net() -> GeoPoseNet:
+    """Trained weights that take none of their own answers."""
+    weights = read_pose_weights(find_weights("parts"))
+    nothing = replace(weights, refusal=replace(weights.refusal, max_risk=0.0))
+    return GeoPoseNet(nothing, EstimateConfig(register_refused=True))
+
+
+def test_what_the_network_doubts_is_registered_where_wanted() -> None:
+    model = next(m for m in doubting_net().models if m.name == "connector")
+    samples = [view(model, index) for index in range(4)]
+    found = doubting_net().estimate_many([sample.input for sample in samples])
+    answered = [(f, s) for f, s in zip(found, samples, strict=True) if f.is_ok]
+    assert len(answered) >= 2
+    points_m = sample_surface(model, 500)[0]
+    for one, sample in answered:
+        assert one.camera_from_model is not None
+        error_m = add_m(one.camera_from_model, sample.truth.camera_from_model, points_m)
+        assert float(error_m) < 0.05 * model.diameter_m
+        assert {"network", "registration"} <= one.seconds.keys()
+
+
+def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:
+    given = replace(view(make_part("mug"), 0).input, object="connector")
+    found = doubting_net().estimate_many([given])[0]
+    assert found.status == "doubtful"
+    assert "registration" in found.seconds
+
+
+def test_regions_that_may_show_anything_are_not_registered() -> None:
+    samples = [view(make_part("connector"), index) for index in range(2)]
+    cloud_m = samples[0].input.points_m
+    found = doubting_net().estimate(cloud=cloud_m.numpy(), object=None)
+    assert not found.is_ok
+    assert "registration" not in found.seconds
+
+
+def test_registration_of_what_is_refused_needs_icp() -> None:
+    with pytest.raises(InputError, match="registration refines by ICP"):
+        EstimateConfig(register_refused=True, with_icp=False)

@@ -57,6 +57,8 @@ class EstimateOptions:
     """refine the voted pose by ICP."""
     up_to_symmetry: bool = False
     """copies of an object that look nearly alike are one answer, not alternatives."""
+    register_refused: bool = False
+    """what a network doubts is registered by its model alone, some tenths of a second each."""
     batch: int = 16
     """inputs in one call of the network."""
     device: Device = "cpu"
@@ -76,6 +78,7 @@ class EstimateOptions:
             voting=voting_config(self.voting, self.hypotheses),
             with_icp=self.icp,
             up_to_symmetry=self.up_to_symmetry,
+            register_refused=self.register_refused,
             device=own_device(self.device),
         )
 

@@ -90,6 +90,10 @@ class EstimateConfig:
     """Whether copies of the object that look nearly alike count as one answer: its certainty is
     then of them all, and they are not named as alternatives."""
 
+    register_refused: bool = False
+    """Whether what a network doubts is registered by its model alone: tenths of a second for each,
+    and more answers where much is occluded. Not where the object is not known to be there."""
+
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk decides: ICP
     corrects rough votes, and the risk detects those that stay wrong. Nothing is refused for it
@@ -110,6 +114,11 @@ class EstimateConfig:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "
                 f"voting.rigidity_diameters, is {self.voting.rigidity_diameters}; take 0.3"
+            )
+        if self.register_refused and not self.with_icp:
+            raise InputError(
+                "register_refused is true and with_icp false, but registration refines by ICP; "
+                "leave one of them as it is by default"
             )
         if self.max_cloud_points < 100 or self.batch_voxels < 1:
             raise InputError(

@@ -69,6 +69,10 @@ class PoseEstimator(ABC):
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
 
+    def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
+        """Estimate inputs of which most do not show their object."""
+        return self.estimate_many(inputs)
+
     def estimate(  # noqa: PLR0913  one input in several forms
         self,
         *,
@@ -107,8 +111,10 @@ class PoseEstimator(ABC):
 
     def _which(self, given: AnyInput, names: Sequence[str]) -> PoseEstimate:
         """Estimate one input as each of several objects, and take the one that it shows."""
-        estimates = self.estimate_many([replace(given, object=name) for name in names])
-        return estimates[0] if len(estimates) == 1 else which_object(estimates, self.refusal)
+        if len(names) == 1:
+            return self.estimate_many([given])[0]
+        estimates = self._try_many([replace(given, object=name) for name in names])
+        return which_object(estimates, self.refusal)
 
     def estimate_instances(
         self,
@@ -180,7 +186,7 @@ class PoseEstimator(ABC):
             models={name: self.models[self._number(name)] for name in objects},
             surface_of=lambda name: self._surface(self._number(name)),
             refusal=self.refusal,
-            estimate_many=self.estimate_many,
+            estimate_many=self._try_many,
         )
         return find_objects(view, known)
 

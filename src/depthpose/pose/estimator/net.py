@@ -20,8 +20,12 @@ from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.base import PoseEstimator, refused
 from depthpose.pose.estimator.pose import Voted, pose_from_directions
 from depthpose.pose.estimator.prepare import AnyInput, Prepared, Refusal, prepare_cloud
-from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints
+from depthpose.pose.estimator.register import Registration
+from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Status
 from depthpose.pose.weights import DirectionNet, PoseWeights, read_pose_weights
+
+_DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
+"""What the network could not answer, and another method may; the rest is due to the input."""
 
 
 def network_directions(
@@ -107,6 +111,9 @@ class GeoPoseNet(PoseEstimator):
                 "DepthImageRegressor"
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
+        self._registration = (
+            Registration(weights.models, self.config) if self.config.register_refused else None
+        )
 
     @classmethod
     def load(
@@ -154,13 +161,32 @@ class GeoPoseNet(PoseEstimator):
         """Estimate many at once, of any objects: the network is called for all of them together.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums.
+        network's sums. What the network doubts is then registered, where the config wants it.
 
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
+        estimates = self._try_many(inputs)
+        if self._registration is None:
+            return estimates
+        return [
+            self._registered(given, found) if found.status in _DOUBTED else found
+            for given, found in zip(inputs, estimates, strict=True)
+        ]
+
+    @torch.no_grad()
+    def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         estimates = {k: found for k, found, _ in self._each(inputs)}
         return [estimates[k] for k in range(len(inputs))]
+
+    def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
+        """Answer by the model alone, else as the network did."""
+        assert self._registration is not None
+        start = time.perf_counter()
+        (found,) = self._registration.estimate_many([given])
+        spent_s = time.perf_counter() - start
+        best = found if found.is_ok else doubted
+        return replace(best, seconds={**doubted.seconds, "registration": spent_s})
 
     @torch.no_grad()
     def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:

@@ -19,7 +19,7 @@ from depthpose.pose.types import Alternative, PoseEstimate, Status, Tracking
 POSES = "poses.json"
 PICTURE, CLOUD = "pose.png", "pose.ply"
 """What follows ``NAME.`` in the names of the files that show a pose."""
-STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check")
+STAGES = ("segmentation", "cloud", "network", "voting", "svd", "icp", "check", "registration")
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
 _ROTATION_SLACK = 1e-4
