@@ -132,6 +132,21 @@ def test_the_match_says_where_the_sky_is() -> None:
         assert bool(other.is_sky.any())
 
 
+@pytest.mark.parametrize(("confidence", "with_sky"), [(0.0, True), (1.0, False)])
+def test_what_is_surely_matched_is_not_the_sky(
+    confidence: float, with_sky: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = partly_sky().eval()
+    left, right = torch.randn(2, 1, 3, 64, 96, generator=torch.Generator().manual_seed(1)).unbind()
+    monkeypatch.setattr(
+        network, "_confidence", lambda _, quarter_px: torch.full_like(quarter_px, confidence)
+    )
+    with torch.no_grad():
+        read = network.read(left, right, SMALL.max_disparity_px, with_confidence=True)
+    assert read.sky is not None
+    assert bool((read.sky > 0.5).any()) == with_sky
+
+
 def test_another_size_has_the_same_sky() -> None:
     left = torch.rand(3, 20, 30)
     found = resized_match(UpperHalf().match(left, left), 40, 90)

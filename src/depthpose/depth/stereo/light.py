@@ -234,10 +234,11 @@ class LightStereo(StereoNetwork):
         scores, seen = self.scores(left, right, max_disparity_px)
         quarter_px = mean_of_best(scores, self.config.candidates)
         quarters = [quarter_px]
-        if with_confidence:
-            quarters.append(self._confidence(scores, quarter_px))
+        if with_confidence or self.sky_head is not None:
+            with torch.no_grad():
+                quarters.append(self._confidence(scores, quarter_px))
         if self.sky_head is not None:
-            quarters.append(self.sky_head(seen.left.levels, scores, quarter_px))
+            quarters.append(self.sky_head(seen.left.levels, *quarters))
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
         found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
@@ -247,10 +248,14 @@ class LightStereo(StereoNetwork):
         else:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
             heads = (wide_px, *heads)
-        sky = rest.pop() if self.sky_head is not None else None
-        confidence = rest.pop() if with_confidence else None
-        if sky is not None and confidence is not None:
-            confidence = torch.where(sky > 0.5, sky, confidence * (1 - sky))
+        confidence = rest[0] if with_confidence else None
+        if self.sky_head is None:
+            return Reading(heads, confidence, None)
+        sure, sky = rest
+        if not self.training:
+            sky = torch.where(sky > sure, sky, sky.clamp(max=0.5))
+        if confidence is not None:
+            confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
         return Reading(heads, confidence, sky)
 
     def _confidence(self, scores: Scores, quarter_px: Quarter) -> Quarter:

@@ -63,9 +63,10 @@ class SkyHead(nn.Module):
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
         quarter, *coarser = widths
-        above = [_SKY_WIDTH] * len(coarser)
+        deepest = len(coarser) - 1
         self.coarse = nn.ModuleList(
-            conv_norm_2d(w + a, _SKY_WIDTH) for w, a in zip(coarser, [*above[1:], 0], strict=True)
+            conv_norm_2d(w if k == deepest else w + _SKY_WIDTH, _SKY_WIDTH)
+            for k, w in enumerate(coarser)
         )
         self.hidden = conv_norm_2d(quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
         self.logit = nn.Conv2d(_SKY_WIDTH, 1, 1)
@@ -73,17 +74,21 @@ class SkyHead(nn.Module):
         assert self.logit.bias is not None
         nn.init.constant_(self.logit.bias, -2.0)
 
-    def forward(self, levels: tuple[Features, ...], scores: Scores, quarter_px: Quarter) -> Quarter:
-        """Tell the sky by features of the left view, and by its match, which learns nothing."""
+    def forward(
+        self, levels: tuple[Features, ...], quarter_px: Quarter, confidence: Quarter
+    ) -> Quarter:
+        """Tell the sky by features of the left view, and by its match, which learns nothing.
+
+        What is surely matched near by is not the sky.
+        """
         quarter, *coarser = levels
         found: list[Tensor] = []
         for layer, level in zip(reversed(self.coarse), reversed(coarser), strict=True):
             x = F.relu(layer(torch.cat([level, *found], 1)))
             found = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
-        sharpness = scores.detach().softmax(1).amax(1)
-        match = torch.stack([sharpness, quarter_px.detach() / _USUAL_PX], 1)
+        match = torch.stack([confidence, quarter_px / _USUAL_PX], 1).detach()
         hidden = F.relu(self.hidden(torch.cat([quarter, *found, match.to(quarter)], 1)))
-        return self.logit(hidden)[:, 0].to(scores).sigmoid()
+        return self.logit(hidden)[:, 0].to(confidence).sigmoid()
 
 
 class Reading(NamedTuple):
@@ -94,7 +99,8 @@ class Reading(NamedTuple):
             without the image, that before the refinement, and that after it; in eval mode the last
             alone. What it says in the sky means nothing where the network has that class.
         confidence: 0..1, in the sky its probability; None where it was not asked for.
-        sky: probability of the sky, or None where the network has no such class.
+        sky: probability of the sky, or None where the network has no such class. In eval mode at
+            most a half where the match is surer than the sky: white walls look like it.
     """
 
     heads: tuple[Maps, ...]
