@@ -21,6 +21,7 @@ cloud: {max_points: 200}
 objects: {views: 2}
 held_out: {number: 2, occlusions: [0.0]}
 calibration: {number: 0}
+adam: {warmup_steps: 0}
 loop: {steps: 2, batch_size: 2, device: cpu}
 """
 
@@ -189,7 +190,7 @@ def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_
     config.write_text(
         "images: {folder: nowhere}\nheld_out: {folder: nowhere}\n"
         "network: {widths: [8, 8, 8, 8], long_side_px: 160}\naugment: {crop_px: [96, 128]}\n"
-        "loop: {steps: 1, batch_size: 1, validate_every_steps: 1}\n"
+        "adam: {warmup_steps: 0}\nloop: {steps: 1, batch_size: 1, validate_every_steps: 1}\n"
     )
     words = ["pose", "train", "--what", "segmentation", "--config", str(config), "--device", "cpu"]
     assert main([*words, "--data", str(made), "--out", str(run)]) == 0
