@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions
+from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions, refuse_ignored
 from depthpose.cli.help import group
 from depthpose.cli.options import refuse_below
 from depthpose.core.errors import InputError
@@ -112,6 +112,7 @@ def reproduce(
     refuse_below(0, "--pictures", pictures, "3")
     rows.refuse_unusable(published)
     reproducing.refuse_wrong_count(published, rows.weights, rows.matcher)
+    refuse_ignored(rows.weights, matching)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
     chosen = rows.methods(published, matching.config)
     order = reproducing.TableSpec(
