@@ -220,7 +220,7 @@ def evaluate(
     comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = evaluating.open_frames(data, split)
-    chosen = evaluating.choose_methods(methods, matching.config)
+    chosen = evaluating.choose_methods(methods, matching.config, dataset)
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     is_url = re.match(r"\w+:/", str(data)) is not None
