@@ -424,6 +424,8 @@ def test_packing_writes_the_card_and_halves_the_file(
     assert main(["weights", "pack", str(home / "w.safetensors"), "--out", str(out), "--half",
                  *words]) == 0  # fmt: skip
     assert read_checkpoint(out).facts["terms"] == "research only"
+    card = "# packed-nc\n\n- **Licence**: CC BY-NC-SA 3.0\n- **Terms**: research only\n"
+    assert (tmp_path / "packed-nc.md").read_text() == f"{card}- **Trained on**: drives\n"
     again = ["weights", "pack", str(out), "--out", str(tmp_path / "again.safetensors")]
     with pytest.warns(UserWarning, match="research only"):
         assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 0
@@ -436,7 +438,11 @@ def test_packing_writes_the_card_and_halves_the_file(
     assert read_checkpoint(named).facts["terms"] == f"research only {theirs}"
     assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 2
     assert "again.safetensors: is there already; delete it" in capsys.readouterr().err
+    (tmp_path / "new.md").touch()
     new = str(tmp_path / "new.safetensors")
+    assert main(["weights", "pack", "kitti-nc", "--out", new, *words]) == 2
+    assert "new.md: is there already; delete it" in capsys.readouterr().err
+    (tmp_path / "new.md").unlink()
     assert main(["weights", "pack", "kiti-nc", "--out", new, *words]) == 2
     assert "neither a file nor the name of weights" in capsys.readouterr().err
     assert out.stat().st_size < (home / "w.safetensors").stat().st_size
