@@ -97,6 +97,10 @@ def import_weights(
     """
     from depthpose.core.run import refuse_to_replace
 
+    own = {"psmnet": ("--align-corners", align_corners), "fcgf": ("--classes", classes)}
+    for other, (option, value) in own.items():
+        if value is not None and kind != other:
+            raise InputError(f"{option} {value}: is for {other}, and {kind} ignores it; omit it")
     refuse_to_replace(out)
     if kind == "psmnet":
         _import_psmnet(file, out, align_corners)
