@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -149,6 +150,17 @@ def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     assert "sensor.kinds = ['structured light'], but now it is" in capsys.readouterr().err
     assert main([*words, "--number", "0"]) == 2
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
+
+
+def test_frames_are_not_made_of_two_objects_of_one_name(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other").mkdir()
+    for other in (part, shutil.copy(part, tmp_path / "other")):
+        words = ["data", "make", "objects", "--cad", str(part), str(other), "--out"]
+        assert main([*words, str(tmp_path / "made")]) == 2
+        assert "two models are called 'bracket' (numbers 1 and 2" in capsys.readouterr().err
+    assert not (tmp_path / "made").exists()
 
 
 def test_a_cad_file_begins_with_the_weights_that_ship(
