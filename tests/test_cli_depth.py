@@ -424,6 +424,8 @@ def test_packing_writes_the_card_and_halves_the_file(
     assert main(["weights", "pack", str(home / "w.safetensors"), "--out", str(out), "--half",
                  *words]) == 0  # fmt: skip
     assert read_checkpoint(out).facts["terms"] == "research only"
+    card = "# packed-nc\n\n- **Licence**: CC BY-NC-SA 3.0\n- **Terms**: research only\n"
+    assert (tmp_path / "packed-nc.md").read_text() == f"{card}- **Trained on**: drives\n"
     again = ["weights", "pack", str(out), "--out", str(tmp_path / "again.safetensors")]
     with pytest.warns(UserWarning, match="research only"):
         assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 0
@@ -436,7 +438,11 @@ def test_packing_writes_the_card_and_halves_the_file(
     assert read_checkpoint(named).facts["terms"] == f"research only {theirs}"
     assert main([*again, "--trained-on", "drives", "--licence", "MIT"]) == 2
     assert "again.safetensors: is there already; delete it" in capsys.readouterr().err
+    (tmp_path / "new.md").touch()
     new = str(tmp_path / "new.safetensors")
+    assert main(["weights", "pack", "kitti-nc", "--out", new, *words]) == 2
+    assert "new.md: is there already; delete it" in capsys.readouterr().err
+    (tmp_path / "new.md").unlink()
     assert main(["weights", "pack", "kiti-nc", "--out", new, *words]) == 2
     assert "neither a file nor the name of weights" in capsys.readouterr().err
     assert out.stat().st_size < (home / "w.safetensors").stat().st_size
@@ -476,6 +482,7 @@ generator: {encoder_width: 0.1, widths: [4, 4, 4, 4], planes: 6, disparity_px: [
   virtual_focal_px: 130.0}
 with_frozen_stem: false
 encoder_rate: 1.0
+adam: {learning_rate: 2.0e-5, warmup_steps: 2}
 pairs: {truth: disparity, augment: {crop_px: [32, 64]}}
 loop: {steps: 4, batch_size: 2, device: cpu}
 """
@@ -614,6 +621,32 @@ def test_a_misspelt_config_names_its_nearest_setting(
     words = ["depth", "train", "view", "--config", str(tmp_path / "c.yaml"), "--data", str(pairs)]
     assert main([*words, "--out", str(tmp_path / "run")]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "adam", "otherwise"),
+    [
+        (("depth", "train", "view"), "discriminator_adam", "there is nothing to train on"),
+        (("pose", "train"), "adam", "there is no object to learn"),
+    ],
+)
+def test_a_warm_up_longer_than_the_training_is_refused(
+    command: tuple[str, ...],
+    adam: str,
+    otherwise: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tmp_path / "c.yaml"
+    words = [*command, "--config", str(config), "--out", str(tmp_path / "run")]
+    config.write_text(f"{adam}: {{warmup_steps: 9}}\nloop: {{steps: 8}}\n")
+    assert main(words) == 2
+    assert f"{adam}.warmup_steps is 9, but loop.steps is 8, so" in capsys.readouterr().err
+    assert main([*words, "--resume"]) == 2
+    assert otherwise in capsys.readouterr().err, "the config of a run that goes on stays"
+    config.write_text(f"{adam}: {{warmup_steps: 8}}\nloop: {{steps: 8}}\n")
+    assert main([*words, "--steps", "4"]) == 2
+    assert otherwise in capsys.readouterr().err, "a try may be shorter"
 
 
 def test_words_of_another_stage_are_refused(

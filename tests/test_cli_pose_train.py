@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ cloud: {max_points: 200}
 objects: {views: 2}
 held_out: {number: 2, occlusions: [0.0]}
 calibration: {number: 0}
+adam: {warmup_steps: 0}
 loop: {steps: 2, batch_size: 2, device: cpu}
 """
 
@@ -150,6 +152,17 @@ def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     assert "--number 0: at least 1 frame" in capsys.readouterr().err
 
 
+def test_frames_are_not_made_of_two_objects_of_one_name(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other").mkdir()
+    for other in (part, shutil.copy(part, tmp_path / "other")):
+        words = ["data", "make", "objects", "--cad", str(part), str(other), "--out"]
+        assert main([*words, str(tmp_path / "made")]) == 2
+        assert "two models are called 'bracket' (numbers 1 and 2" in capsys.readouterr().err
+    assert not (tmp_path / "made").exists()
+
+
 def test_a_cad_file_begins_with_the_weights_that_ship(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,7 +202,7 @@ def test_a_data_set_takes_the_place_of_every_folder_of_a_config(part: Path, tmp_
     config.write_text(
         "images: {folder: nowhere}\nheld_out: {folder: nowhere}\n"
         "network: {widths: [8, 8, 8, 8], long_side_px: 160}\naugment: {crop_px: [96, 128]}\n"
-        "loop: {steps: 1, batch_size: 1, validate_every_steps: 1}\n"
+        "adam: {warmup_steps: 0}\nloop: {steps: 1, batch_size: 1, validate_every_steps: 1}\n"
     )
     words = ["pose", "train", "--what", "segmentation", "--config", str(config), "--device", "cpu"]
     assert main([*words, "--data", str(made), "--out", str(run)]) == 0

@@ -62,6 +62,12 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def trained(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same pairs in another folder, for baselines."""
+    return shutil.copytree(street, tmp_path_factory.mktemp("trained") / "pairs")
+
+
 def rows_of(folder: Path) -> list[dict[str, object]]:
     return json.loads((folder / "rows.json").read_text())
 
@@ -87,9 +93,9 @@ def mono(name: str, depth_m: float) -> Method:
 
 
 def test_table_2_2_is_made_by_one_command(
-    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    street: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    more = ("--matcher", "sgbm", "--train", str(street), "--train-without", "a")
+    more = ("--matcher", "sgbm", "--train", str(trained), "--train-without", "a")
     assert reproduce("2.2", street, tmp_path, *more) == 0
     printed = capsys.readouterr().out
     assert "| published | Luo et al. [73] |  | 80 | 0.0620 |" in printed
@@ -122,15 +128,40 @@ def test_rows_of_confidence_name_the_speed() -> None:
     assert [row.columns()["speed"] for row in found] == ["quick", "fine"]
 
 
-def test_the_old_name_of_the_option_baseline_still_works(street: Path, tmp_path: Path) -> None:
+def test_the_old_name_of_the_option_baseline_still_works(
+    street: Path, trained: Path, tmp_path: Path
+) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
-    assert main([*words, "--floor", "rows", "--train", str(street)]) == 0
+    assert main([*words, "--floor", "rows", "--train", str(trained)]) == 0
     assert {row["method"] for row in rows_of(tmp_path)} == {"baseline: rows"}
 
 
-def test_baselines_know_the_street_they_were_fitted_to(street: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("depth", "evaluate", "--baseline", "rows", "--data"),
+        ("reproduce", "2.2", "--matcher", "sgbm", "--split", "all", "--kitti"),
+    ],
+)
+def test_a_baseline_is_not_measured_on_the_frames_that_it_is_fitted_to(
+    words: tuple[str, ...],
+    street: Path,
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    train = ["--train", str(trained), f"{street}/../{street.name}", "--train-without", "a"]
+    assert main([*words, str(street), *CAMERA_Z, *train, "--out", str(tmp_path / "out")]) == 2
+    said = "3 of the frames to measure are trained on too, b first, so their error would be too"
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_baselines_know_the_street_they_were_fitted_to(
+    street: Path, trained: Path, tmp_path: Path
+) -> None:
     words = ["depth", "evaluate", "--data", str(street), "--out", str(tmp_path), *CAMERA_Z]
-    assert main([*words, "--baseline", "rows", "nearest", "--train", str(street)]) == 0
+    assert main([*words, "--baseline", "rows", "nearest", "--train", str(trained)]) == 0
     by_method = {row["method"]: row for row in rows_of(tmp_path) if row["cap_m"] == 80}
     assert set(by_method) == {"baseline: rows", "baseline: nearest"}
     nearest, rows = (
@@ -211,6 +242,7 @@ def test_a_rerun_measures_the_same_files_and_refuses_other_settings(
             "--beside kitti-nc: adds methods of one image, and table 2.2 is of pairs",
         ),
         (["2.2", "--matcher", "sgbm", "--train-without", "a"], "--train-without a: leaves frames"),
+        (["2.2", "--matcher", "sgbm", "--device", "cuda"], "with weights, and none is measured"),
         (["2.2", "--matcher", "sgbm", "--pictures", "-1"], "--pictures -1: give 0 or more"),
     ],
 )

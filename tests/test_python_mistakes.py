@@ -158,6 +158,7 @@ def test_every_mistake_is_named_with_its_remedy() -> None:
     "words",
     [
         ["depth", "predict", "x.png", "--focal-px", "50"],
+        ["depth", "predict", "x.png", "--focal-px", "50", "--precision", "bf16"],
         ["pose", "predict", "--cloud", "x.ply", "--object", "flange"],
     ],
     ids=" ".join,

@@ -1,8 +1,9 @@
+import re
 from pathlib import Path
 
 import pytest
 
-from depthpose.core.devices import usable_device
+from depthpose.core.devices import computes_bf16, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.run import (
     ProcessRank,
@@ -73,7 +74,7 @@ def test_a_new_setting_counts_as_another(tmp_path: Path) -> None:
 
 def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(InputError, match=r"out/run\.json: cannot be written"):
+    with pytest.raises(InputError, match="out: is a file, but a folder is needed there; choose"):
         claim_folder(tmp_path / "out", {"a": 1})
 
 
@@ -201,3 +202,18 @@ def test_a_nested_setting_is_named_by_its_path_and_a_new_one_may_be_off(tmp_path
 def test_a_device_that_cannot_compute_is_refused() -> None:
     with pytest.raises(InputError, match=r"device 'meta' cannot be used here .* take 'cpu'"):
         usable_device("meta")
+
+
+@pytest.mark.parametrize("name", ["foo", "cuda:x", ""])
+def test_what_is_no_device_is_refused_in_a_short_line(name: str) -> None:
+    said = f"device '{name}' cannot be used here (no such name); take cpu, cuda or cuda:1"
+    for use in (usable_device, computes_bf16):
+        with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
+            use(name)
+
+
+@pytest.mark.parametrize("name", ["vulkan", "hpu"])
+def test_the_reason_of_a_missing_device_is_one_sentence(name: str) -> None:
+    with pytest.raises(InputError, match="cannot be used here") as error:
+        usable_device(name)
+    assert len(str(error.value)) < 200

@@ -85,6 +85,35 @@ def test_the_command_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixt
     assert (tmp_path / "out/disp_occ/00.png").is_file()
 
 
+@pytest.mark.parametrize("keep", [0, 1000], ids=["no image", "cut off"])
+def test_a_pair_that_cannot_be_read_stops_no_other(
+    keep: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = write_pairs(tmp_path / "pairs", (0.2, 0.2)), tmp_path / "out"
+    damaged = folder / "left/00.png"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:keep])
+    words = ["data", "label", str(folder), "--out", str(out)]
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert said.err.count(f"depthpose: failed: {damaged}") == 1
+    assert "1 pairs labelled, " in said.out
+    assert "; 1 failed, the others were there" in said.out
+    assert [path.name for path in (out / "disp_occ").iterdir()] == ["01.png"]
+    damaged.write_bytes(whole)
+    assert main(words) == 0
+    assert [frame.name for frame in open_dataset(out).frames] == ["00", "01"]
+
+
+def test_where_no_pair_can_be_read_the_reason_is_said_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_pairs(tmp_path / "pairs", (0.1, 0.1))
+    (folder / "calib.txt").write_text("focal_px: none\n")
+    assert main(["data", "label", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("calib.txt") == 1
+
+
 @pytest.mark.parametrize(
     "changes", [{"largest_difference_px": -1.0}, {"largest_share": -0.1}, {"least_confidence": 1.0}]
 )

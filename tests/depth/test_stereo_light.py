@@ -11,6 +11,7 @@ from tests.depth.random_norms import with_random_norms
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
+from depthpose.core.config import read_config, write_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, Run
 from depthpose.depth.augment import TrainingPair
@@ -397,3 +398,14 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
             train_stereo(
                 StereoTraining(light=two_deep, sky_weight=0.5, pairs=pairs, loop=loop), run
             )
+
+
+def test_one_network_is_given(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("light: {width: 8}\n")
+    light = read_config(path, StereoTraining)
+    write_config(path, light)
+    assert read_config(path, StereoTraining) == light, "as a resumed run reads it"
+    path.write_text("light: {width: 8}\nmatcher: {width: 16}\n")
+    with pytest.raises(InputError, match="matcher and light are both given, and one network"):
+        read_config(path, StereoTraining)

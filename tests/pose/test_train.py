@@ -531,21 +531,24 @@ def test_models_come_from_one_source(tmp_path: Path) -> None:
         read_models(ModelsConfig())
     with pytest.raises(InputError, match="cad and parts are given; take the models from one"):
         read_models(ModelsConfig(cad=(file,), parts=("mug",)))
+    with pytest.raises(InputError, match=r"flange.stl'\] without models.unit, and no file says"):
+        read_models(ModelsConfig(cad=(file,)))
     with pytest.raises(InputError, match="two CAD files are called 'flange'"):
-        read_models(ModelsConfig(cad=(file, file)))
+        read_models(ModelsConfig(cad=(file, file), unit="mm"))
     four = ModelsConfig(parts=("mug", "spool"), mesh=MeshConfig(keypoints=4))
     assert [len(model.keypoints_m) for model in read_models(four)] == [4, 4]
 
 
 def test_symmetries_of_a_cad_file_are_reported_and_taken_on_request(tmp_path: Path) -> None:
     file, printed = str(write_part("flange", tmp_path)), []
-    (plain,) = read_models(ModelsConfig(cad=(file,)), printed.append)
+    (plain,) = read_models(ModelsConfig(cad=(file,), unit="mm"), printed.append)
     assert plain.symmetries.is_none
     assert "flange: looks the same after 5 turns, about 0 axes" in printed[0]
     assert "--symmetries found" in printed[0]
     (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", printed[0])
     assert float(certainty) > 0.5
-    (taken,) = read_models(ModelsConfig(cad=(file,), with_found_symmetries=True), printed.append)
+    taking = ModelsConfig(cad=(file,), unit="mm", with_found_symmetries=True)
+    (taken,) = read_models(taking, printed.append)
     assert taken.symmetries.discrete is not None
     assert len(taken.symmetries.discrete.R) == 5
 

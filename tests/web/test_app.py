@@ -123,6 +123,26 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
     assert ways[0] == ways[1] == ways[2]
 
 
+def test_the_field_says_the_baseline_where_the_camera_file_has_none(
+    page: TestClient, samples: Path
+) -> None:
+    rig = json.loads((samples / "camera.json").read_text())
+    baseline_m = str(rig.pop("baseline_m"))
+    (samples / "one.json").write_text(json.dumps(rig))
+    clouds = []
+    for name, fields in (
+        ("camera.json", {"baseline_m": "9"}),  # its own counts
+        ("one.json", {"baseline_m": baseline_m}),
+        ("one.json", {"baseline_m": baseline_m, "cx_right_minus_left_px": "20"}),
+    ):
+        found = ask(page, "depth", samples, {**PAIR, "camera": name}, **fields).json()
+        clouds.append(page.get("/" + found["folder"] + "left.cloud.ply").content)
+    assert clouds[0] == clouds[1] != clouds[2]
+    status, said = refusal(ask(page, "depth", samples, {**PAIR, "camera": "one.json"}))
+    assert status == 400
+    assert "baseline" in said
+
+
 def test_the_field_says_the_unit_where_the_camera_file_has_no_word_for_it(
     page: TestClient, samples: Path, truth: Rigid
 ) -> None:
@@ -389,6 +409,11 @@ def test_a_depth_image_without_a_mask_is_searched(
         (VIEW | {"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "mm"}, "choose one of"),
         ({"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "feet"}, "choose m or mm"),
         (VIEW, {"object": "cad", "cad_unit": "mm"}, "cad: no file; choose a model file"),
+        (
+            VIEW | {"cad": f"{PART}.stl"},
+            {"object": PART},
+            f"object '{PART}' and the CAD file {PART}.stl are both given; choose 'the CAD file",
+        ),
     ],
 )
 def test_pose_refuses_with_a_remedy(

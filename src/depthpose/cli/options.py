@@ -133,12 +133,30 @@ class TrainingOptions:
     view: str | None = None
     """live draws the losses in Rerun's viewer (an extra); FILE.rrd records them."""
 
-    def applied(self, loop: Any, **others: Any) -> Any:  # noqa: ANN401 - the loop's config
-        """Give the config of a loop with what was said here."""
-        loop = changed(loop, seed=self.seed, device=self.device, precision=self.precision, **others)
-        if self.steps is None:
-            return loop
-        return dataclasses.replace(loop, steps=self.steps, epochs=None)
+    def read(self, path: Path | None, kind: type, **others: Any) -> Any:  # noqa: ANN401
+        """Read the config of a training, or take its defaults, with what was said here.
+
+        Args:
+            path: of the config.
+            kind: its dataclass.
+            others: more settings of the loop.
+
+        Raises:
+            InputError: a value is refused, or a warm-up longer than the config's own steps. A try
+                (``--steps``) may be shorter, and a run that goes on keeps its config.
+        """
+        from depthpose.core.config import read_config
+        from depthpose.core.loop import refuse_long_warmup  # --help must not load torch
+
+        chosen: Any = kind() if path is None else read_config(path, kind)
+        if not (self.resume or self.finish):
+            refuse_long_warmup(chosen)
+        loop = changed(
+            chosen.loop, seed=self.seed, device=self.device, precision=self.precision, **others
+        )
+        if self.steps is not None:
+            loop = dataclasses.replace(loop, steps=self.steps, epochs=None)
+        return dataclasses.replace(chosen, loop=loop)
 
 
 def changed(config: Any, **values: Any) -> Any:  # noqa: ANN401 - any config

@@ -97,6 +97,10 @@ def import_weights(
     """
     from depthpose.core.run import refuse_to_replace
 
+    own = {"psmnet": ("--align-corners", align_corners), "fcgf": ("--classes", classes)}
+    for other, (option, value) in own.items():
+        if value is not None and kind != other:
+            raise InputError(f"{option} {value}: is for {other}, and {kind} ignores it; omit it")
     refuse_to_replace(out)
     if kind == "psmnet":
         _import_psmnet(file, out, align_corners)
@@ -135,7 +139,7 @@ def pack_weights(
     terms: str = "",
     half: bool = False,
 ) -> int:
-    """Write a generator and a matcher into one file, with a card for its users.
+    """Write a generator and a matcher into one file, and its card for users beside it (.md).
 
         depthpose weights pack runs/finetune/fakestereo.safetensors --out street.safetensors
             --trained-on 'my drives of 2026' --licence MIT --half
@@ -151,21 +155,28 @@ def pack_weights(
         half: store 16-bit floats: half the size.
     """
     from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
+    from depthpose.core.files import atomic_write
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
+    card = out.with_suffix(".md")
     refuse_to_replace(out)
+    refuse_to_replace(card)
     found = read_depth_weights(find_weights(weights))
     made_of = [weights] if matcher is None else [weights, matcher]
     warn_of_terms(bound_facts({}, made_of))
-    facts = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
+    given = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
+    facts = bound_facts(given, made_of)
     write_depth_weights(
         out,
         generator=found.generator,
         matcher=found.matcher if matcher is None else read_matcher(find_weights(matcher)),
-        facts=bound_facts(facts, made_of),
+        facts=facts,
         with_half=half,
     )
+    with atomic_write(card) as part:
+        part.write_text(_card(out, facts))
+    print(f"card: {card}")
     return show_weights(str(out))
 
 

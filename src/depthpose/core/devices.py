@@ -17,14 +17,24 @@ def usable_device(name: str | torch.device) -> torch.device:
     Raises:
         InputError: this machine has none of that name, or it computes no float64.
     """
+    device = _named_device(name)
     try:
-        device = torch.device(name)
         torch.ones(1, dtype=torch.float64, device=device).cpu()
-    except (RuntimeError, AssertionError, TypeError) as error:
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]
         raise InputError(
-            f"device {str(name)!r} cannot be used here ({str(error).splitlines()[0]}); take 'cpu'"
+            f"device {str(name)!r} cannot be used here ({said}); take 'cpu'"
         ) from error
     return device
+
+
+def _named_device(name: str | torch.device) -> torch.device:
+    try:
+        return torch.device(name)
+    except (RuntimeError, TypeError) as error:  # torch lists its 20 kinds
+        raise InputError(
+            f"device {str(name)!r} cannot be used here (no such name); take cpu, cuda or cuda:1"
+        ) from error
 
 
 def computes_bf16(device: str | torch.device) -> bool:
@@ -34,7 +44,7 @@ def computes_bf16(device: str | torch.device) -> bool:
     VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. Elsewhere oneDNN refuses bfloat16, or
     PyTorch computes it 20 to 30 times slower than float32.
     """
-    if torch.device(device).type != "cpu":
+    if _named_device(device).type != "cpu":
         return True
     supports = getattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", None)
     return supports is not None and bool(supports())

@@ -1,6 +1,6 @@
 """Truth for pairs that have none: what a matcher finds in both views, kept where they agree."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,13 +45,15 @@ class LabelConfig:
             )
 
 
-def label_pairs(
+def label_pairs(  # noqa: PLR0913  what is labelled, how and where
     net: FakestereoNet,
     dataset: Dataset,
     config: LabelConfig,
     folder: Path,
     settings: dict[str, object],
     numbers: Sequence[int] | None = None,
+    *,
+    failures: list[InputError] | None = None,
 ) -> Iterator[tuple[str, float]]:
     """Write a plain folder of pairs with pseudo-truth, and yield each name and what share is known.
 
@@ -66,10 +68,12 @@ def label_pairs(
         folder: where to write; refused if other settings made what it holds.
         settings: what decides the result.
         numbers: of the frames that are labelled; None: all.
+        failures: takes what is wrong with each pair that cannot be read or matched, and the others
+            are labelled; None: the first such pair is an error.
 
     Raises:
-        InputError: no frame has both, the folder holds a label of another image of that name, or
-            a frame that cannot be matched.
+        InputError: no frame has both, the folder holds a label of another image of that name, no
+            calibration can be read, or a pair that cannot be matched.
     """
     chosen = range(len(dataset)) if numbers is None else numbers
     frames = {n: dataset.frames[n] for n in chosen}
@@ -80,15 +84,20 @@ def label_pairs(
     sources = {frames[n].name: frames[n].seen_files() for n in usable}
     truth = folder / "disp_occ"
     claim_names(folder, sources, is_finished=lambda name: (truth / f"{name}.png").is_file())
-    _write_calibration(folder / "calib.txt", dataset, usable)
-    for number in usable:
-        name = dataset.frames[number].name
+    rigs = _read_rigs(dataset, usable, failures)
+    _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
+    for number in rigs:
+        name = frames[number].name
         path = folder / "disp_occ" / f"{name}.png"
         if path.is_file():
             continue
-        pair = dataset.read_input(number)
+        try:
+            pair = dataset.read_input(number)
+            known_px = label_pair(net, pair, config)
+        except InputError as error:
+            _take(error, failures)
+            continue
         assert pair.right is not None
-        known_px = label_pair(net, pair, config)
         write_image(folder / "left" / f"{name}.png", pair.left)
         write_image(folder / "right" / f"{name}.png", pair.right)
         write_disparity_png(path, known_px)
@@ -125,13 +134,34 @@ def is_consistent(
     return left_right_difference_px(left_px, right_px) <= limit_px
 
 
-def _write_calibration(path: Path, dataset: Dataset, usable: list[int]) -> None:
+def _take(error: InputError, failures: list[InputError] | None) -> None:
+    if failures is None:
+        raise error
+    failures.append(error)
+
+
+def _read_rigs(
+    dataset: Dataset, usable: Sequence[int], failures: list[InputError] | None
+) -> dict[int, StereoRig]:
+    rigs: dict[int, StereoRig] = {}
+    for number in usable:
+        try:
+            rig = dataset.read_rig(number)
+        except InputError as error:
+            _take(error, failures)
+            continue
+        assert isinstance(rig, StereoRig)
+        rigs[number] = rig
+    if failures and not rigs:
+        raise failures[0]
+    return rigs
+
+
+def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
     """Write a line for each pair, beside those of other pairs that are there."""
     there = path.read_text().splitlines() if path.is_file() else []
     lines = {line.rsplit(maxsplit=8)[0]: line for line in there}
-    for number in usable:
-        rig, name = dataset.read_rig(number), dataset.frames[number].name
-        assert isinstance(rig, StereoRig)
+    for name, rig in rigs.items():
         K, shift_px = rig.K, rig.cx_right_minus_left_px
         values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)

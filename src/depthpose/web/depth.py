@@ -3,6 +3,7 @@
 import math
 import time
 
+from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
@@ -73,12 +74,26 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
             "it"
         )
     is_guess = focal_px is None and "camera" not in form.files
-    camera = form.camera(_keys(form, width, height), (width, height))
+    camera = _with_baseline(form, form.camera(_keys(form, width, height), (width, height)))
     if has_right:
         small_size(form.file("right"))
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, is_guess
+
+
+def _with_baseline(form: Form, camera: Camera) -> Camera:
+    """Add the baseline of the fields to a camera whose file has none."""
+    baseline_m, doffs_px = form.number("baseline_m"), form.number("cx_right_minus_left_px")
+    if baseline_m is None or isinstance(camera, StereoRig):
+        return camera
+    return StereoRig(
+        width=camera.width,
+        height=camera.height,
+        K=camera.K,
+        baseline_m=baseline_m,
+        cx_right_minus_left_px=doffs_px or 0.0,
+    )
 
 
 def _keys(form: Form, width: int, height: int) -> dict[str, object]:

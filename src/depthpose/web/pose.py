@@ -108,6 +108,11 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
     """Find the object among those of the weights, or in a CAD file."""
     name, models = form.fields.get("object", ""), net.weights.models
     if name != OWN_CAD:
+        if "cad" in form.files:
+            raise InputError(
+                f"object {name!r} and the CAD file {form.files['cad'].name} are both given; choose "
+                "'the CAD file below' as the object, or take the file out"
+            )
         known = [model for model in models if model.name == name]
         if not known:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")

@@ -216,8 +216,8 @@ def label(
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
 
-    Writes a folder of pairs that every training takes. Such labels are no better than their
-    matcher; one that was trained on evaluation frames leaks them into the labels.
+    Writes a folder of pairs that every training takes; those that cannot be read are left out. Such
+    labels are no better than their matcher, and leak evaluation frames that it was trained on.
 
         depthpose data label my-pairs --out my-pairs-labelled
 
@@ -233,11 +233,20 @@ def label(
     dataset = open_dataset(path)
     sha256 = file_sha256(find_weights(labels.weights))
     settings = {"dataset": dataset.name, "weights_sha256": sha256, **asdict(config)}
-    labelled = label_pairs(labels.load(), dataset, config, out, settings)
+    failures: list[InputError] = []
+    noted = failures if len(dataset) > 1 else None
+    labelled = label_pairs(labels.load(), dataset, config, out, settings, failures=noted)
     shares = [share for _, share in _shown(labelled, None, "pairs")]
+    return _say_labelled(out, shares, failures)
+
+
+def _say_labelled(out: Path, shares: list[float], failures: list[InputError]) -> int:
+    for failure in failures:
+        print(f"depthpose: failed: {failure}", file=sys.stderr)
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
-    print(f"{out}: {len(shares)} pairs labelled{known}; the others were there")
-    return 0
+    failed = f"{len(failures)} failed, " if failures else ""
+    print(f"{out}: {len(shares)} pairs labelled{known}; {failed}the others were there")
+    return 1 if failures else 0
 
 
 def export_depth(

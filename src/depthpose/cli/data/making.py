@@ -166,10 +166,11 @@ def make_objects(
 def _read_models(cad: Sequence[Path], options: ObjectsOptions) -> "list[ObjectModel]":
     from tqdm import tqdm
 
-    from depthpose.pose.mesh import read_model, with_found_symmetries
+    from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 
     is_taken = options.symmetries == "found"
     read = [read_model(path, options.unit, number=i) for i, path in enumerate(cad, start=1)]
+    refuse_one_name(read)
     return [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in read]
 
 

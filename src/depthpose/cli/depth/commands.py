@@ -14,6 +14,7 @@ from depthpose.cli.depth.options import (
     PairOptions,
     PredictOutput,
     ProtocolOptions,
+    refuse_ignored,
 )
 from depthpose.cli.engine import EngineOptions, Weights
 from depthpose.core.errors import InputError
@@ -215,10 +216,11 @@ def evaluate(
 
     predictions = methods.predictions
     methods.refuse_none()
+    refuse_ignored(methods.weights, matching)
     comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = evaluating.open_frames(data, split)
-    chosen = evaluating.choose_methods(methods, matching.config)
+    chosen = evaluating.choose_methods(methods, matching.config, dataset)
     home = out / "predictions"
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     is_url = re.match(r"\w+:/", str(data)) is not None

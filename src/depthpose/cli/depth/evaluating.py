@@ -15,7 +15,7 @@ from depthpose.cli.depth.page import frame_sections
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.datasets import Dataset, join_datasets, open_dataset
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
 from depthpose.depth.evaluate import (
     PROTOCOLS,
     Evaluation,
@@ -78,25 +78,32 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
     return home
 
 
-def choose_methods(options: MethodOptions, config: MatcherConfig) -> list[Method]:
-    """Build what was named: SGBM, weights and baselines, in this order."""
+def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Dataset) -> list[Method]:
+    """Build what is measured on a dataset: SGBM, weights and baselines, in this order."""
     chosen: list[Method] = []
     if options.matcher == "sgbm":
         chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
     chosen += [named_method(name, config) for name in options.weights]
     if options.baseline:
-        training = open_training(options.train, options.train_without)
+        training = open_training(options.train, options.train_without, dataset)
         chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
 
 
-def open_training(folders: Sequence[Path], without: Sequence[str]) -> Dataset:
-    """Open the frames that a baseline is fitted to."""
+def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
+    """Open the frames that a baseline is fitted to, none of which may be measured.
+
+    Raises:
+        InputError: no folder, or frames of both.
+    """
     if not folders:
         raise InputError(
             "a baseline is fitted to training frames: give --train FOLDER, or several."
         )
-    return join_datasets([open_dataset(folder) for folder in folders], without)
+    training = join_datasets([open_dataset(folder) for folder in folders], without)
+    remedy = "give --train other folders, or name these in --train-without"
+    refuse_common(training.frames, measured.frames, "frames to measure", remedy)
+    return training
 
 
 def _read(dataset: Dataset, index: int, with_right: bool) -> StereoInput:

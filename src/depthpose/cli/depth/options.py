@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -224,6 +225,19 @@ class ProtocolOptions:
                 raise InputError(f"--cap {cap_m:g}: a distance in metres, above 0")
             if self.cap.count(cap_m) > 1:
                 raise InputError(f"--cap {cap_m:g} is given twice; each cap is a row: give it once")
+
+
+def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
+    """Refuse options of matchers with weights where no method has one.
+
+    Raises:
+        InputError: that is so.
+    """
+    if matching != type(matching)() and all(name.startswith("sgbm:") for name in weights):
+        raise InputError(
+            "--device, --speed, --precision and --max-memory are for matchers with weights, and "
+            "none is measured; leave them out"
+        )
 
 
 def parse_bytes(text: str | None) -> int | None:

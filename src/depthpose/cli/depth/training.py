@@ -110,14 +110,12 @@ def train(
         out: the run folder.
         config: YAML with what differs from the thesis's settings.
     """
-    from depthpose.core.config import read_config
     from depthpose.core.loop import Run
     from depthpose.core.run import find_rank
     from depthpose.depth.train import STAGES
 
     kind, run_stage = STAGES[stage]
-    chosen = kind() if config is None else read_config(config, kind)
-    chosen = dataclasses.replace(chosen, loop=training.applied(chosen.loop))
+    chosen = training.read(config, kind)
     chosen = beginning.applied(pairs.applied(chosen), stage)
     with progress_bar(training.view) as on_step:
         run = Run(folder=out, resume=training.resume, finish=training.finish, on_step=on_step)

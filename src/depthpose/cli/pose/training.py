@@ -89,16 +89,14 @@ def train(
         config: YAML with what differs from the defaults.
         workers: processes that render views beside the one that trains.
     """
-    from depthpose.core.config import read_config
     from depthpose.core.loop import Run
     from depthpose.core.run import find_rank
     from depthpose.pose.train import STAGES
 
     kind, run_stage = STAGES[learnt.what]
-    chosen = kind() if config is None else read_config(config, kind)
+    chosen = training.read(config, kind, workers=workers)
     if learnt.cad and learnt.unit is None:
         raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
-    chosen = dataclasses.replace(chosen, loop=training.applied(chosen.loop, workers=workers))
     chosen = learnt.applied(chosen, config)
     is_first = find_rank().rank == 0
     with progress_bar(training.view) as on_step:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions
+from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions, refuse_ignored
 from depthpose.cli.help import group
 from depthpose.cli.options import refuse_below
 from depthpose.core.errors import InputError
@@ -13,6 +13,7 @@ from depthpose.depth.config import MatcherConfig
 
 if TYPE_CHECKING:
     from depthpose.cli.depth.methods import Method
+    from depthpose.depth.datasets import Dataset
     from depthpose.thesis.depth_tables import PublishedTable
 
 TableNumber = Literal["2.1", "2.2", "2.3"]
@@ -52,8 +53,10 @@ class RowOptions:
                 "and none is given; give its folders, or leave this out"
             )
 
-    def methods(self, table: "PublishedTable", config: MatcherConfig) -> "list[tuple[str, Method]]":
-        """Build each method, with the thesis's own row that it stands for, if any."""
+    def methods(
+        self, table: "PublishedTable", config: MatcherConfig, dataset: "Dataset"
+    ) -> "list[tuple[str, Method]]":
+        """Build each method for a dataset, with the thesis's own row that it stands for, if any."""
         from depthpose.cli.depth import evaluating, methods
         from depthpose.cli.thesis.depth_tables import own_methods
 
@@ -64,7 +67,7 @@ class RowOptions:
             others = [methods.weights_method(n, config, with_right=False) for n in named]
             chosen += [("", other) for other in others if other.name not in names]
         if self.train:
-            training = evaluating.open_training(self.train, self.train_without)
+            training = evaluating.open_training(self.train, self.train_without, dataset)
             baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
             # A baseline uses no right image, but is measured on the frames of the other rows.
             chosen += [("", one._replace(with_right=table.with_right)) for one in baselines]
@@ -112,8 +115,9 @@ def reproduce(
     refuse_below(0, "--pictures", pictures, "3")
     rows.refuse_unusable(published)
     reproducing.refuse_wrong_count(published, rows.weights, rows.matcher)
+    refuse_ignored(rows.weights, matching)
     dataset = evaluating.open_frames(kitti, None if split == "all" else split)
-    chosen = rows.methods(published, matching.config)
+    chosen = rows.methods(published, matching.config, dataset)
     order = reproducing.TableSpec(
         table=published,
         dataset=dataset,

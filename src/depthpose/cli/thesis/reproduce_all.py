@@ -25,7 +25,8 @@ class Step(NamedTuple):
         words: arguments of ``depthpose``.
         makes: the file that it writes.
         of: files of earlier steps that it reads; it is done again if one is newer.
-        is_replaced: an older ``makes`` is deleted first, because the command replaces no file.
+        is_replaced: an older ``makes`` and its card are deleted first, because the command replaces
+            no file.
     """
 
     what: str
@@ -203,7 +204,8 @@ def walk(steps: Sequence[Step]) -> int:
             continue
         print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
         if step.is_replaced:
-            step.makes.unlink(missing_ok=True)
+            for path in (step.makes, step.makes.with_suffix(".md")):
+                path.unlink(missing_ok=True)
         found = main(step.words)
         if found > 1:
             return found

@@ -94,6 +94,11 @@ def refused_write(path: AnyPath) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        file = next((folder for folder in Path(path).parents if folder.is_file()), None)
+        if file is not None:
+            raise InputError(
+                f"{file}: is a file, but a folder is needed there; choose another place"
+            ) from error
         raise InputError(
             f"{path}: cannot be written: {error.strerror or error}; "
             "free the space, or choose another place"

@@ -1,6 +1,6 @@
 """The one training loop: a task in, trained weights and a run folder out."""
 
-from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam
+from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam, refuse_long_warmup
 from depthpose.core.loop.journal import (
     Journal,
     card_text,
@@ -35,6 +35,7 @@ __all__ = [
     "held_out_text",
     "make_adam",
     "read_metrics",
+    "refuse_long_warmup",
     "releases_folder",
     "run_files",
     "sample_generator",

@@ -156,6 +156,21 @@ class LoopConfig:
         )
 
 
+def refuse_long_warmup(config: Any) -> None:  # noqa: ANN401 - of any training
+    """Refuse a warm-up that is longer than the training: the learning rate would never arrive.
+
+    Raises:
+        InputError: the setting, its value and the steps. Of ``epochs`` the steps are not known yet.
+    """
+    steps: int | None = config.loop.steps
+    for name, adam in vars(config).items():
+        if isinstance(adam, AdamConfig) and steps is not None and adam.warmup_steps > steps:
+            raise InputError(
+                f"{name}.warmup_steps is {adam.warmup_steps}, but loop.steps is {steps}, so the "
+                f"learning rate would never be reached; take at most {steps}, or 0 for no warm-up"
+            )
+
+
 def make_adam(
     parameters: Iterable[nn.Parameter] | list[dict[str, Any]], config: AdamConfig
 ) -> torch.optim.Adam:

@@ -7,6 +7,7 @@ from depthpose.depth.datasets.dataset import Dataset as Dataset
 from depthpose.depth.datasets.dataset import join_datasets as join_datasets
 from depthpose.depth.datasets.dataset import open_dataset as open_dataset
 from depthpose.depth.datasets.dataset import read_known_depth as read_known_depth
+from depthpose.depth.datasets.dataset import refuse_common as refuse_common
 from depthpose.depth.datasets.duplicates import DUPLICATE_SIMILARITY as DUPLICATE_SIMILARITY
 from depthpose.depth.datasets.duplicates import Duplicate as Duplicate
 from depthpose.depth.datasets.duplicates import find_duplicates as find_duplicates

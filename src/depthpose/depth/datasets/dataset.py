@@ -1,6 +1,6 @@
 """A folder of stereo frames, opened."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -103,6 +103,29 @@ def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> D
         layout=" + ".join(dict.fromkeys(dataset.layout for dataset in datasets)),
         frames=[frame for frame in frames if frame.name not in without],
     )
+
+
+def refuse_common(
+    trained: Iterable[Frame], measured: Iterable[Frame], what: str, remedy: str
+) -> None:
+    """Refuse to measure by what is trained on.
+
+    Args:
+        trained: frames of the training.
+        measured: frames that the result is measured on.
+        what: these are, for the error.
+        remedy: for the error.
+
+    Raises:
+        InputError: a left image is in both.
+    """
+    seen = {frame.left.resolve() for frame in trained}
+    common = [frame.name for frame in measured if frame.left.resolve() in seen]
+    if common:
+        raise InputError(
+            f"{len(common)} of the {what} are trained on too, {common[0]} first, so their error "
+            f"would be too good; {remedy}"
+        )
 
 
 def read_known_depth(dataset: Dataset, index: int) -> Float[Tensor, "h w"] | None:

@@ -192,7 +192,13 @@ class StereoTraining:
     """How long."""
 
     def __post_init__(self) -> None:
-        """Refuse a share that is none."""
+        """Refuse a share that is none, and two networks."""
+        # A config that a run has written holds the defaults of ``matcher`` beside ``light``.
+        if self.light is not None and self.matcher != PSMNetConfig():
+            raise InputError(
+                "matcher and light are both given, and one network is trained; leave matcher out "
+                "for the light network, or light for PSMNet"
+            )
         for name in ("encoder_rate", "sky_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} must be from 0 to 1, got {getattr(self, name)}")

@@ -39,21 +39,6 @@ def name_frames(frames: Iterable[Frame]) -> str:
     return digest.hexdigest()
 
 
-def refuse_common(trained: Iterable[Frame], held_out: Iterable[Frame]) -> None:
-    """Refuse to hold out what is trained on.
-
-    Raises:
-        InputError: a left image is in both.
-    """
-    seen = {frame.left.resolve() for frame in trained}
-    common = [frame.name for frame in held_out if frame.left.resolve() in seen]
-    if common:
-        raise InputError(
-            f"{len(common)} of the pairs held out are trained on too, {common[0]} first, so their "
-            "error would be too good; give --held-out other pairs, or exclude these in the config"
-        )
-
-
 class TrainingPairs:
     """Frames of several folders, each sample a random one, randomly changed.
 

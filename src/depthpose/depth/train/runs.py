@@ -20,6 +20,7 @@ from depthpose.core.loop import (
 )
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
+from depthpose.depth.datasets import refuse_common
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
@@ -43,7 +44,7 @@ from depthpose.depth.train.config import (
     StereoTraining,
     ViewTraining,
 )
-from depthpose.depth.train.pairs import TrainingPairs, name_frames, refuse_common
+from depthpose.depth.train.pairs import TrainingPairs, name_frames
 from depthpose.depth.train.select import SelectionSamples, SelectTask
 from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
@@ -210,7 +211,8 @@ def _run_stage(
         more["frames_sha256"] = name_frames(frames)
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
-        refuse_common(frames, held_out.frames)
+        remedy = "give --held-out other pairs, or exclude these in the config"
+        refuse_common(frames, held_out.frames, "pairs held out", remedy)
     facts = _facts(config, pairs.truths, tuple(named.values()))
     warn_of_terms(facts)
     run.claim(config, ("generator", "matcher", "fakestereo"), more, ("held_out",))

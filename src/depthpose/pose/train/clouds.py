@@ -244,7 +244,8 @@ def read_models(
         on_message: called with symmetries that were found and are not declared, taken or not.
 
     Raises:
-        InputError: none is named, or of two kinds, two have one name, or a file is damaged.
+        InputError: none is named, or of two kinds, CAD files without their unit, two have one name,
+            or a file is damaged.
     """
     given = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
     if len(given) > 1:
@@ -266,6 +267,11 @@ def read_models(
 
 
 def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
+    if config.unit is None:
+        raise InputError(
+            f"models.cad is {list(config.cad)} without models.unit, and no file says its unit; "
+            "write unit: mm, or m"
+        )
     models = tuple(
         read_model(path, config.unit, number=number, config=config.mesh)
         for number, path in enumerate(config.cad, start=1)

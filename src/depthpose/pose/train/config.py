@@ -19,8 +19,8 @@ class ModelsConfig:
     cad: tuple[str, ...] = ()
     """Model files; each object is called as its file."""
 
-    unit: Unit = "mm"
-    """Of the numbers in the CAD files."""
+    unit: Unit | None = None
+    """Of the numbers in the CAD files, which do not say it themselves."""
 
     bop: str | None = None
     """Folder of a data set, whose models are taken in place of CAD files."""
