@@ -37,6 +37,7 @@ def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry 
 
     Raises:
         MissingExtraError: it is not installed.
+        InputError: it is installed and does not load.
     """
     return _import("cv2", ("opencv-python-headless", "opencv"), purpose)
 
@@ -46,6 +47,7 @@ def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry 
 
     Raises:
         MissingExtraError: it is not installed.
+        InputError: it is installed and does not load.
     """
     return _import("open3d", ("open3d", "open3d"), purpose)
 
@@ -54,7 +56,12 @@ def _import(module: str, package_and_extra: tuple[str, str], purpose: str) -> An
     try:
         return import_module(module)
     except ImportError as error:
-        raise MissingExtraError(*package_and_extra, purpose) from error
+        if error.name == module:
+            raise MissingExtraError(*package_and_extra, purpose) from error
+        raise InputError(
+            f"{purpose} needs {package_and_extra[0]}, which is installed and does not load: "
+            f"{error}; a library of the system is missing, or the package is damaged"
+        ) from error
 
 
 def refuse_seed(seed: int) -> None:
