@@ -129,6 +129,8 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
     words = parser.parse_args()
+    if words.save and words.method == "both":
+        parser.error("--save opens one refusal, and both methods have their own; save each alone")
     torch.set_num_threads(1)
     for name in words.weights:
         config = EstimateConfig(register_refused=words.method == "both")

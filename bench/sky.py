@@ -16,7 +16,7 @@ from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
 from depthpose.report.tables import markdown_table
 
-SEED = 9
+SEED = 90
 """No weights were trained on streets of this seed."""
 CAP_M = 80.0
 

@@ -33,7 +33,7 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
         import_open3d("registration")
 
     (tmp_path / "open3d.py").write_text(
-        'raise ImportError("libusb-1.0.so.0: cannot open shared object file")\n'
+        'raise ImportError("libusb-1.0.so.0: cannot open shared object file", name="open3d")\n'
     )
     monkeypatch.delitem(sys.modules, "open3d")
     monkeypatch.syspath_prepend(tmp_path)

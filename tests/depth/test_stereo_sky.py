@@ -132,18 +132,26 @@ def test_the_match_says_where_the_sky_is() -> None:
         assert bool(other.is_sky.any())
 
 
-@pytest.mark.parametrize(("confidence", "with_sky"), [(0.0, True), (1.0, False)])
+@pytest.mark.parametrize(
+    ("confidence", "is_training", "with_sky"),
+    [(0.5, False, True), (0.98, False, False), (0.98, True, True)],
+)
 def test_what_is_surely_matched_is_not_the_sky(
-    confidence: float, with_sky: bool, monkeypatch: pytest.MonkeyPatch
+    confidence: float, is_training: bool, with_sky: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    network = partly_sky().eval()
-    left, right = torch.randn(2, 1, 3, 64, 96, generator=torch.Generator().manual_seed(1)).unbind()
-    monkeypatch.setattr(
-        network, "_confidence", lambda _, quarter_px: torch.full_like(quarter_px, confidence)
-    )
+    network = partly_sky().train(is_training)
+    left, right = torch.randn(2, 2, 3, 64, 96, generator=torch.Generator().manual_seed(1)).unbind()
+    for where, name, value in (
+        (network, "_confidence", confidence),
+        (network.sky, "forward", 0.97),
+    ):
+        monkeypatch.setattr(
+            where, name, lambda *given, value=value: torch.full_like(given[1], value)
+        )
     with torch.no_grad():
         read = network.read(left, right, SMALL.max_disparity_px, with_confidence=True)
     assert read.sky is not None
+    assert bool((read.sky > 0.5).all()) == with_sky
     assert bool((read.sky > 0.5).any()) == with_sky
 
 

@@ -150,7 +150,8 @@ class TrainingOptions:
 
         chosen: Any = kind() if path is None else read_config(path, kind)
         if not (self.resume or self.finish):
-            refuse_long_warmup(chosen)
+            own = chosen.loop.steps
+            refuse_long_warmup(chosen, None if own is None else max(own, self.steps or 0))
         loop = changed(
             chosen.loop, seed=self.seed, device=self.device, precision=self.precision, **others
         )

@@ -55,8 +55,8 @@ def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry 
 def _import(module: str, package_and_extra: tuple[str, str], purpose: str) -> Any:  # noqa: ANN401
     try:
         return import_module(module)
-    except ImportError as error:
-        if error.name == module:
+    except (ImportError, OSError) as error:  # OSError: of a library that ctypes loads
+        if isinstance(error, ModuleNotFoundError) and error.name == module:
             raise MissingExtraError(*package_and_extra, purpose) from error
         raise InputError(
             f"{purpose} needs {package_and_extra[0]}, which is installed and does not load: "

@@ -235,8 +235,8 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
     """
     if matching != type(matching)() and all(name.startswith("sgbm:") for name in weights):
         raise InputError(
-            "--device, --speed, --precision and --max-memory are for matchers with weights, and "
-            "none is measured; leave them out"
+            "--device, --precision and --max-memory (and --speed) are for matchers with weights, "
+            "and none is measured; leave them out"
         )
 
 

@@ -42,9 +42,15 @@ def find_all(
     entry, NAME, that says so. A rerun goes on where it was, and reads again what could not be read.
 
     Raises:
-        InputError: weights that take no clouds, several processes, or two images of one name.
+        InputError: weights that take no clouds, several processes, ``--register-refused``, or two
+            images of one name.
     """
     _refuse_unable(method)
+    if method.settings["estimate"]["register_refused"]:
+        raise InputError(
+            "--register-refused: without a mask the object is searched for and may not be there, "
+            "and nothing is registered then; omit it, or give --mask"
+        )
     jobs = frame_jobs(depth, camera, objects[0], unit, out)
     _refuse_numbered(jobs)
     facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})

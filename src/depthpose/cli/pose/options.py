@@ -58,7 +58,8 @@ class EstimateOptions:
     up_to_symmetry: bool = False
     """copies of an object that look nearly alike are one answer, not alternatives."""
     register_refused: bool = False
-    """what a network doubts is registered by its model alone, some tenths of a second each."""
+    """what a network doubts is registered by its model alone, some tenths of a second each. For
+    clouds and masked images."""
     batch: int = 16
     """inputs in one call of the network."""
     device: Device = "cpu"
@@ -88,7 +89,7 @@ class RegisterOptions:
     """Poses by a CAD file alone, without training."""
 
     method: Literal["network", "register"] = "network"
-    """network: trained weights. register: the CAD file alone, after a few seconds for each part."""
+    """network: trained weights. register: the CAD file alone, after about a second for each part."""
     cad: tuple[str, ...] = ()
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
     own models."""

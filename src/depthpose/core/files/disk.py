@@ -94,7 +94,7 @@ def refused_write(path: AnyPath) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        file = next((folder for folder in Path(path).parents if folder.is_file()), None)
+        file = next((folder for folder in Path(path).parents if os.path.isfile(folder)), None)  # noqa: PTH113 - which never raises
         if file is not None:
             raise InputError(
                 f"{file}: is a file, but a folder is needed there; choose another place"

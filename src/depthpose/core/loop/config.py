@@ -156,13 +156,16 @@ class LoopConfig:
         )
 
 
-def refuse_long_warmup(config: Any) -> None:  # noqa: ANN401 - of any training
+def refuse_long_warmup(config: Any, steps: int | None) -> None:  # noqa: ANN401 - of any training
     """Refuse a warm-up that is longer than the training: the learning rate would never arrive.
 
+    Args:
+        config: of the training.
+        steps: of the training; None, of ``epochs``: they are not known yet.
+
     Raises:
-        InputError: the setting, its value and the steps. Of ``epochs`` the steps are not known yet.
+        InputError: the setting, its value and the steps.
     """
-    steps: int | None = config.loop.steps
     for name, adam in vars(config).items():
         if isinstance(adam, AdamConfig) and steps is not None and adam.warmup_steps > steps:
             raise InputError(

@@ -79,7 +79,7 @@ class SkyHead(nn.Module):
     ) -> Quarter:
         """Tell the sky by features of the left view, and by its match, which learns nothing.
 
-        What is surely matched near by is not the sky.
+        Where the match is near and its confidence high, there is no sky.
         """
         quarter, *coarser = levels
         found: list[Tensor] = []
@@ -100,7 +100,7 @@ class Reading(NamedTuple):
             alone. What it says in the sky means nothing where the network has that class.
         confidence: 0..1, in the sky its probability; None where it was not asked for.
         sky: probability of the sky, or None where the network has no such class. In eval mode at
-            most a half where the match is surer than the sky: white walls look like it.
+            most a half where the confidence of the match is higher: white walls look like the sky.
     """
 
     heads: tuple[Maps, ...]

@@ -92,7 +92,9 @@ class EstimateConfig:
 
     register_refused: bool = False
     """Whether what a network doubts is registered by its model alone: tenths of a second for each,
-    and more answers where much is occluded. Not where the object is not known to be there."""
+    and more answers where much is occluded. An answer whose ``seconds`` name registration is
+    registration's, and so is its risk; it has no keypoints. Not used where an object is searched
+    for, as in ``find``, because it may not be there."""
 
     rough_rigidity_diameters: float = 0.3
     """In place of ``voting.rigidity_diameters`` where a calibrated risk decides: ICP
@@ -117,8 +119,8 @@ class EstimateConfig:
             )
         if self.register_refused and not self.with_icp:
             raise InputError(
-                "register_refused is true and with_icp false, but registration refines by ICP; "
-                "leave one of them as it is by default"
+                "registration refines by ICP; omit --no-icp (with_icp=False) or "
+                "--register-refused (register_refused=True)"
             )
         if self.max_cloud_points < 100 or self.batch_voxels < 1:
             raise InputError(

@@ -255,7 +255,7 @@ class PoseEstimator(ABC):
     def _look(self, given: AnyInput, object: str) -> PoseEstimate:
         """Find the object in a frame of which nothing else is known."""
         if isinstance(given, CloudInput):
-            return self.estimate_many([given])[0]
+            return self._try_many([given])[0]
         began = time.perf_counter()
         found = self.find_in(given, [object])
         if found:

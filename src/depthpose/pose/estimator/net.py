@@ -96,7 +96,8 @@ class GeoPoseNet(PoseEstimator):
         config: voting, ICP, limits, device.
 
     Raises:
-        InputError: weights that cast no votes, or a device that is not there.
+        InputError: weights that cast no votes, a device that is not there, or models without a
+            surface that ``register_refused`` is to register.
     """
 
     name = ""
@@ -112,7 +113,9 @@ class GeoPoseNet(PoseEstimator):
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._registration = (
-            Registration(weights.models, self.config) if self.config.register_refused else None
+            Registration(weights.models, replace(self.config, register_refused=False))
+            if self.config.register_refused
+            else None
         )
 
     @classmethod
@@ -191,6 +194,8 @@ class GeoPoseNet(PoseEstimator):
     @torch.no_grad()
     def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
+
+        What the network doubts is not registered here.
 
         Returns:
             The estimate, and the cloud with the outputs in the camera frame; None for them where

@@ -99,6 +99,11 @@ class Registration(PoseEstimator):
         _refuse_no_surface(models)
         if config is not None and not config.with_icp:
             raise InputError("registration refines by ICP; omit --no-icp (with_icp=False)")
+        if config is not None and config.register_refused:
+            raise InputError(
+                "registration has no network whose refusals it could register; omit "
+                "--register-refused (register_refused=True)"
+            )
         super().__init__(models, config)
         self._models, self._refusal = tuple(models), refusal or _REFUSAL
         self._tables: dict[int, PairTable] = {}
@@ -131,7 +136,7 @@ class Registration(PoseEstimator):
         return self._refusal
 
     def prepare(self) -> None:
-        """Prepare every model now, a few seconds each; else it is done when first asked for."""
+        """Prepare every model now, about a second each; else it is done when first asked for."""
         for number in range(len(self.models)):
             self._copies_of(number)
             self._table(number)

@@ -28,7 +28,7 @@ class DepthImageRegressor:
         config: whether ICP follows, and the device; the rest is of voting.
 
     Raises:
-        InputError: the weights are of another kind.
+        InputError: the weights are of another kind, or ``register_refused`` is set.
     """
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
@@ -37,6 +37,11 @@ class DepthImageRegressor:
                 "these weights cast votes and regress no depth image; load them as GeoPoseNet"
             )
         self.config = EstimateConfig() if config is None else config
+        if self.config.register_refused:
+            raise InputError(
+                "a regressed depth image refuses nothing that could be registered; omit "
+                "--register-refused (register_refused=True)"
+            )
         self.weights = weights
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._numbers = {model.name: k for k, model in enumerate(weights.models)}
