@@ -139,7 +139,7 @@ def test_help_lists_the_stages_and_sets_the_thesis_apart(
           "--out", "o"],
          "are for matchers with weights, and none is measured; leave them out"),
         (["depth", "evaluate", "--data", ".", "--weights", "sgbm:default", "--speed", "quick",
-          "--out", "o"], "--device, --speed, --precision and --max-memory are for matchers"),
+          "--out", "o"], "--device, --precision and --max-memory"),
         (["weights", "list", "--folder", "nowhere"], "nowhere: there is no such file or folder"),
         (["data", "check", "x" * 300], "File name too long"),
     ],

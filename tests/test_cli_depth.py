@@ -647,6 +647,9 @@ def test_a_warm_up_longer_than_the_training_is_refused(
     config.write_text(f"{adam}: {{warmup_steps: 8}}\nloop: {{steps: 8}}\n")
     assert main([*words, "--steps", "4"]) == 2
     assert otherwise in capsys.readouterr().err, "a try may be shorter"
+    config.write_text(f"{adam}: {{warmup_steps: 9}}\nloop: {{steps: 8}}\n")
+    assert main([*words, "--steps", "9"]) == 2
+    assert otherwise in capsys.readouterr().err, "or longer than the config says"
 
 
 def test_words_of_another_stage_are_refused(

@@ -249,6 +249,17 @@ def frames(folder: Path) -> list[str]:
     return [*words, "--camera", str(folder / "camera.json"), "--object", "bracket"]
 
 
+def test_a_search_without_masks_registers_nothing(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth, _, *rest = frames(tmp_path)[1:]
+    words = ["--depth", depth, *rest[1:], "--weights", str(weights), "--register-refused"]
+    assert main(["pose", "predict", *words, "--out", str(tmp_path / "out")]) == 2
+    assert "--register-refused: without a mask the object is searched for" in (
+        capsys.readouterr().err
+    )
+
+
 def test_a_folder_of_depth_images_is_done_once(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

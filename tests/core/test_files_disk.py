@@ -86,6 +86,11 @@ def test_a_file_in_the_way_of_a_folder_is_named(tmp_path: Path) -> None:
             write_json(tmp_path / "file" / below, {})
 
 
+def test_a_name_that_no_disk_takes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be written: .*long"):
+        write_json(tmp_path / ("x" * 300) / "x.json", {})
+
+
 def test_a_written_file_has_the_rights_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     write_json(tmp_path / "x.json", {})

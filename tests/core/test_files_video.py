@@ -1,9 +1,9 @@
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from depthpose.core import errors
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.core.files import read_video, write_image, write_video
 
@@ -68,9 +68,6 @@ def test_what_cannot_be_written_leaves_nothing(
 
 
 def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> object:
-        raise ImportError(name)
-
-    monkeypatch.setattr(errors, "import_module", refuse)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"reading a video.*pip install -e '.\[opencv"):
         read_video("v.mp4")

@@ -158,6 +158,11 @@ def test_regions_that_may_show_anything_are_not_registered() -> None:
     assert "registration" not in found.seconds
 
 
+def test_what_a_network_refuses_is_registered_by_networks_that_vote() -> None:
+    with pytest.raises(InputError, match="no network whose refusals it could register; omit"):
+        Registration([part()], EstimateConfig(register_refused=True))
+
+
 def test_registration_of_what_is_refused_needs_icp() -> None:
     with pytest.raises(InputError, match="registration refines by ICP"):
         EstimateConfig(register_refused=True, with_icp=False)

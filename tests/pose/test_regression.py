@@ -6,6 +6,7 @@ import pytest
 import torch
 from tests.pose.synthetic_objects import FACTS, K, bracket, pose_at, view_of
 
+from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
@@ -47,6 +48,11 @@ def test_the_refinement_is_ours_from_several_starts(
         errors_m.append(float(error_m))
     assert errors_m[0] < 0.0005
     assert errors_m[1] > 0.01
+
+
+def test_a_regressed_depth_image_has_no_refusals_to_register(weights: PoseWeights) -> None:
+    with pytest.raises(InputError, match="refuses nothing that could be registered; omit"):
+        DepthImageRegressor(weights, EstimateConfig(register_refused=True))
 
 
 def test_blobs_far_from_their_middle_are_refused_and_stop_no_other(weights: PoseWeights) -> None:

@@ -46,11 +46,6 @@ def find_all(
             images of one name.
     """
     _refuse_unable(method)
-    if method.settings["estimate"]["register_refused"]:
-        raise InputError(
-            "--register-refused: without a mask the object is searched for and may not be there, "
-            "and nothing is registered then; omit it, or give --mask"
-        )
     jobs = frame_jobs(depth, camera, objects[0], unit, out)
     _refuse_numbered(jobs)
     facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})
@@ -90,6 +85,11 @@ def _refuse_numbered(jobs: Sequence[Job[Any]]) -> None:
 def _refuse_unable(method: PoseMethod) -> None:
     if method.find is None:
         raise InputError("--depth without --mask: these weights need masked views; give --mask")
+    if method.settings["estimate"]["register_refused"]:
+        raise InputError(
+            "--register-refused: without a mask the object is searched for and may not be there, "
+            "and nothing is registered then; omit it, or give --mask"
+        )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
 
