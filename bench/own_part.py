@@ -2,16 +2,32 @@
 
     python bench/own_part.py valve.stl
     depthpose pose train --cad valve.stl --unit mm --out my_part
+    python bench/own_part.py valve.stl --weights my_part/pose.safetensors
 
-Overlapping solids, as in many CAD files; 125 mm across, without symmetry.
+Overlapping solids, as in many CAD files; 125 mm across, without symmetry. With ``--weights`` the
+part is posed in the held-out views of the training: by the network, without it (registration), and
+by registration where the network refuses.
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
+
+from depthpose.core.config import read_config
+from depthpose.pose.config import EstimateConfig
+from depthpose.pose.estimator import GeoPoseNet, Registration
+from depthpose.pose.metrics import is_within_diameter
+from depthpose.pose.train.config import PoseTraining
+from depthpose.pose.train.held_out import held_out_objects, pose_error
+from depthpose.pose.weights import PoseWeights, read_pose_weights
+from depthpose.report.tables import markdown_table
+
+CONFIG = Path(__file__).parents[1] / "configs/pose/own-part.yaml"
 
 
 def valve() -> Any:  # noqa: ANN401 - a Trimesh, which trimesh types as Geometry
@@ -41,15 +57,50 @@ def valve() -> Any:  # noqa: ANN401 - a Trimesh, which trimesh types as Geometry
     ])  # fmt: skip
 
 
+def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
+    """Pose the held-out views by each method, and count answers."""
+    config = read_config(CONFIG, PoseTraining)
+    methods = {
+        "network": GeoPoseNet(weights),
+        "registration": Registration(weights.models),
+        "both": GeoPoseNet(weights, EstimateConfig(register_refused=True)),
+    }
+    rows = []
+    for share in (0.0, 0.3):
+        held_out = dataclasses.replace(config.held_out, number=number)
+        views = held_out_objects(weights.models, config.objects, weights.cloud, held_out, share)
+        samples = [views.view(index) for index in range(len(views))]
+        for name, method in methods.items():
+            found = method.estimate_many([sample.input for sample in samples])
+            errors = [
+                pose_error(one, sample.truth, weights.models[0])
+                for one, sample in zip(found, samples, strict=True)
+                if one.is_ok
+            ]
+            right = int(is_within_diameter(torch.tensor(errors)).sum())
+            rows.append({
+                "occluded": share, "method": name, "views": len(views),
+                "right": right / len(views), "wrong": (len(errors) - right) / len(views),
+                "refused": 1 - len(errors) / len(views),
+            })  # fmt: skip
+    return rows
+
+
 def main() -> None:
-    """Write the part."""
+    """Write the part, or measure weights of it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("file", type=Path)
-    file = parser.parse_args().file
-    file.parent.mkdir(parents=True, exist_ok=True)
+    parser.add_argument("--weights", help="of the part, trained by configs/pose/own-part.yaml")
+    parser.add_argument("--number", type=int, default=500, help="of views at each occlusion")
+    words = parser.parse_args()
+    if words.weights:
+        torch.set_num_threads(1)
+        print(markdown_table(measure(read_pose_weights(words.weights), words.number)))
+        return
+    words.file.parent.mkdir(parents=True, exist_ok=True)
     mesh = valve()
-    mesh.export(file)
-    print(f"{file}: {len(mesh.faces)} faces, {np.round(mesh.extents, 1)} mm")
+    mesh.export(words.file)
+    print(f"{words.file}: {len(mesh.faces)} faces, {np.round(mesh.extents, 1)} mm")
 
 
 if __name__ == "__main__":
