@@ -89,7 +89,7 @@ class RegisterOptions:
     """Poses by a CAD file alone, without training."""
 
     method: Literal["network", "register"] = "network"
-    """network: trained weights. register: the CAD file alone, after seconds for each part."""
+    """network: trained weights. register: the CAD file alone, a second or two for each part."""
     cad: tuple[str, ...] = ()
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
     own models."""
