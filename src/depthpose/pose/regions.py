@@ -35,8 +35,9 @@ def find_regions(
 ) -> tuple[list[Float[Tensor, "_ 3"]], Bool[Tensor, "h w"]]:
     """Take dominant planes away and part what is left where its depth jumps.
 
-    Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted. One that
-    is hardly wider than the largest object is kept: it may be a side of it.
+    Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted. One is
+    kept whose largest connected piece is hardly wider than the largest object, because it may be a
+    side of it, or a cut through several objects.
 
     Args:
         depth_m: along the optical axis; NaN where there is no reading.
@@ -49,19 +50,21 @@ def find_regions(
     """
     points_m = back_project(depth_m.double(), K.double())
     is_left = points_m.isfinite().all(-1) & (depth_m > 0)
-    is_plane = torch.zeros_like(is_left)
-    total = int(is_left.sum())
+    is_plane, is_searched = torch.zeros_like(is_left), is_left.clone()
+    least = _LEAST_SHARE * int(is_left.sum())
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
-        plane = _largest_plane(points_m[is_left], generator)
+        plane = _largest_plane(points_m[is_searched], generator)
         if plane is None:
             break
         near = _is_on(points_m, plane) & is_left
-        on_m = points_m[near]
-        if len(on_m) < _LEAST_SHARE * total or _width_m(on_m) < _WIDER * largest_m:
+        if int((near & is_searched).sum()) < least:
             break
-        is_left &= ~near
-        is_plane |= near
+        piece = _largest_piece(depth_m, near)
+        if int(piece.sum()) >= least and _width_m(points_m[piece]) >= _WIDER * largest_m:
+            is_left &= ~near
+            is_plane |= near
+        is_searched &= ~near
     label = label_regions(depth_m, is_left)
     pixels = torch.bincount(label[is_left], minlength=1) if bool(is_left.any()) else torch.zeros(1)
     order = pixels.argsort(descending=True, stable=True)[:_MOST_REGIONS]
@@ -96,6 +99,11 @@ def label_regions(
         .long()
         .reshape(height, width)
     )
+
+
+def _largest_piece(depth_m: Float[Tensor, "h w"], near: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    label = label_regions(depth_m, near)
+    return near & (label == torch.bincount(label[near]).argmax())
 
 
 def part_cloud(points_m: Float[Tensor, "n 3"], count: int) -> list[Float[Tensor, "_ 3"]]:

@@ -1,5 +1,6 @@
 """The surface of a model: what of it lies near a point, and what of it a camera would see."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -28,6 +29,7 @@ _BOXES = 48
 """Boxes along the longest side of a model, for looking up what is near without searching."""
 _MARGIN = 0.15
 """Of the diameter: so far the boxes reach beyond the model."""
+_VIEWS = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,6 +91,21 @@ class Surface:
     ) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point near each point: searched, or looked up."""
         return self.nearest(points_m) if is_exact else self.boxes.look_up(points_m)
+
+    @cached_property
+    def least_silhouette_m2(self) -> float:
+        """Area of the smallest silhouette among 32 directions, without its border.
+
+        Counted in cells of 1/24 diameter; a part that is thinner than three of them adds nothing.
+        """
+        side_m, reach = _CELL * self.diameter_m, round(1 / _CELL) + 3
+        flat_m = (self.points_m - self.points_m.mean(0)) @ _across(_VIEWS)
+        column, row = ((flat_m / side_m).floor().long() + reach).unbind(-1)
+        filled = torch.zeros(_VIEWS, (2 * reach) ** 2)
+        filled.scatter_(1, column * 2 * reach + row, 1.0)
+        closed = max_pool2d(filled.reshape(_VIEWS, 1, 2 * reach, 2 * reach), 3, 1, 1)
+        inner = -max_pool2d(-closed, 5, 1, 2)
+        return float(inner.sum((1, 2, 3)).min()) * side_m**2
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
@@ -214,6 +231,19 @@ def compare_depths(
     agrees = is_posed & is_read & ~through & ~before
     total = int(is_posed.sum())
     return int(agrees.sum()) / total, int(through.sum()) / total, int(before.sum()) / total
+
+
+def _across(count: int) -> Float64[Tensor, "v 3 2"]:
+    """Give two axes across each of some directions that are even over a sphere.
+
+    A Fibonacci lattice (Gonzalez 2010) of half of it: opposite views have one silhouette.
+    """
+    k = torch.arange(count, dtype=torch.float64)
+    z, turn = (k + 0.5) / count, k * math.pi * (3 - math.sqrt(5))
+    ring = (1 - z.square()).sqrt()
+    along = torch.stack([ring * turn.cos(), ring * turn.sin(), z], -1)
+    side = torch.stack([-turn.sin(), turn.cos(), torch.zeros_like(z)], -1)
+    return torch.stack([side, torch.linalg.cross(along, side)], -1)
 
 
 def _boxes_about(points_m: Float64[Tensor, "m 3"], diameter_m: float, tree: KDTree) -> Boxes:

@@ -60,20 +60,23 @@ def find_refusal(
     if posed.cloud.view is not None:
         signals["through"] = seen_through(posed.cloud.view, posed.pose, posed.surface)
     least = {**signals, **dict.fromkeys(LATE, 0.0)}
-    found = _too_risky(least, signals, config) or _not_observable(posed, config)
+    found = refuse_risky(least, signals, config) or _not_observable(posed, config)
     if found is None and with_icp and config.max_scale_error < 1:
         found = _other_shape(posed, signals, config)
-    return found or _too_risky(signals, signals, config)
+    return found or refuse_risky(signals, signals, config)
 
 
-def _too_risky(
+def refuse_risky(
     signals: dict[str, float], named: dict[str, float], config: RefusalConfig
 ) -> Refusal | None:
-    """Refuse a risk above the limit; ``named`` are the signals that the reason is made of."""
+    """Refuse a risk above the limit; ``named`` are the signals that the reason is made of.
+
+    A signal that was not measured counts as is usual for right answers.
+    """
     risk, said = risk_of(signals, config), risk_of(named, config)
     if risk is None or said is None or risk <= config.max_risk:
         return None
-    return Refusal(status="doubtful", reason=reason_of(named, said, config))
+    return Refusal(status="doubtful", reason=reason_of(named, said, config), risk=risk)
 
 
 def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:

@@ -169,7 +169,8 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        estimates = self._try_many(inputs)
+        found = {k: one for k, one, _ in self._each(inputs)}
+        estimates = [found[k] for k in range(len(inputs))]
         if self._registration is None:
             return estimates
         return [
@@ -179,8 +180,8 @@ class GeoPoseNet(PoseEstimator):
 
     @torch.no_grad()
     def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        estimates = {k: found for k, found, _ in self._each(inputs)}
-        return [estimates[k] for k in range(len(inputs))]
+        found = {k: one for k, one, _ in self._each(inputs, is_likely=False)}
+        return [found[k] for k in range(len(inputs))]
 
     def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
         """Answer by the model alone, else as the network did."""
@@ -207,7 +208,9 @@ class GeoPoseNet(PoseEstimator):
         ((_, found, voted),) = self._each([given])
         return found, voted
 
-    def _each(self, inputs: Sequence[AnyInput]) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
+    def _each(
+        self, inputs: Sequence[AnyInput], *, is_likely: bool = True
+    ) -> Iterator[tuple[int, PoseEstimate, Voted | None]]:
         """Give each input's number, estimate and votes: first what is refused, then by batches."""
         ready: list[tuple[int, Prepared, float]] = []
         for k, given in enumerate(inputs):
@@ -229,7 +232,8 @@ class GeoPoseNet(PoseEstimator):
                 share_s = network_s * len(outputs) / total
                 seconds = {"cloud": spent_s, "network": share_s}
                 voted = Voted(prepared, outputs)
-                yield k, self._pose(inputs[k], number, voted, seconds), voted
+                found = self._pose(inputs[k], number, voted, is_likely)
+                yield k, replace(found, seconds={**seconds, **found.seconds}), voted
 
     def _directions(
         self, clouds: list[Prepared], numbers: list[int]
@@ -239,7 +243,7 @@ class GeoPoseNet(PoseEstimator):
         return found, time.perf_counter() - start
 
     def _pose(
-        self, given: AnyInput, number: int, voted: Voted, seconds: dict[str, float]
+        self, given: AnyInput, number: int, voted: Voted, is_likely: bool
     ) -> PoseEstimate:
         found = pose_from_directions(
             voted,
@@ -248,5 +252,6 @@ class GeoPoseNet(PoseEstimator):
             self._copies_of(number),
             self.weights.refusal,
             self.config,
+            is_likely=is_likely,
         )
-        return replace(found, name=given.name, seconds={**seconds, **found.seconds})
+        return replace(found, name=given.name)

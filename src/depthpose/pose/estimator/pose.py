@@ -14,7 +14,7 @@ from depthpose.pose.estimator.answer import (
     choose,
     withheld,
 )
-from depthpose.pose.estimator.doubt import Posed
+from depthpose.pose.estimator.doubt import Posed, refuse_risky
 from depthpose.pose.estimator.evidence import vote_signals
 from depthpose.pose.estimator.prepare import Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
@@ -34,6 +34,8 @@ def pose_from_directions(
     copies: PoseAmbiguities,
     refusal: RefusalConfig,
     config: EstimateConfig,
+    *,
+    is_likely: bool = True,
 ) -> PoseEstimate:
     """Vote for the keypoints, fit the pose, refine and check it.
 
@@ -45,6 +47,8 @@ def pose_from_directions(
         copies: of the same object, what it may be confused with.
         refusal: when the answer is withheld.
         config: voting and ICP.
+        is_likely: whether the cloud is likely to show the object; else the other poses that fit are
+            not compared where the best is too risky by itself.
     """
     clock = Clock()
     vote = cast_votes(voted, config.voting)
@@ -53,7 +57,10 @@ def pose_from_directions(
     if isinstance(fits, Refusal):
         return withheld(model.name, fits, clock)
     clock.note("svd")
-    found = _refine(voted, fits, (model, surface, copies), refusal, config)
+    found = _refine(voted, fits, (model, surface, copies), refusal, config, is_likely)
+    if isinstance(found, Refusal):
+        clock.note("icp")
+        return withheld(model.name, found, clock, risk=found.risk)
     if config.with_icp:
         clock.note("icp")
     answer = answer_of(model, found, vote)
@@ -109,11 +116,12 @@ def _fits(
 def _refine(
     voted: Voted,
     fits: PoseFit,
-    known: tuple[ObjectModel, Surface, PoseAmbiguities],
+    object: tuple[ObjectModel, Surface, PoseAmbiguities],
     refusal: RefusalConfig,
     config: EstimateConfig,
-) -> Found:
-    model, surface, copies = known
+    is_likely: bool,
+) -> Found | Refusal:
+    model, surface, copies = object
     cloud_m = voted.cloud.cloud_m
     fit, scatter, refined = _row(fits, 0), 0.0, None
     others = _none_of(fit.camera_from_model)
@@ -125,10 +133,16 @@ def _refine(
             others = best.others
     first = candidate_of(fit if refined is None else refined)
     icp = None if refined is None else config.icp
+    signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
+    if not is_likely:
+        (alone,) = evidence_of(voted, [first.pose], model, copies, surface)
+        known = {**signals, **alone}
+        refused = refuse_risky(known, known, refusal)
+        if refused is not None:
+            return refused
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     poses = [one.pose for one in candidates]
     evidence = evidence_of(voted, poses, model, copies, surface)
-    signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
     return choose(candidates, evidence, signals, copies, refusal)
 
 
