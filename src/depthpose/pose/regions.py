@@ -1,8 +1,11 @@
 """A depth image without masks to regions that may each be one object, its planes taken away."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
+from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -26,13 +29,35 @@ _WIDER = 1.3
 """A plane is wider than the largest object by so much, or it may be a side of one."""
 _LEAST_PIXELS = 60
 _MOST_REGIONS = 40
+_MOST_SIDE = 96
+"""Pixels of a region's longer side that are used for splitting it; of a larger one every n-th."""
+_NECKS = (1, 2, 3, 4, 6, 8, 12, 16)
+"""A region is split where it is narrower than twice this in such pixels."""
+_PIECE = (0.05, 0.85)
+"""Of a region: smaller pieces are bumps of its outline, and larger ones it itself."""
+_ALIKE = 0.8
+"""Intersection over union of pieces that are one."""
+
+
+class Regions(NamedTuple):
+    """What is left of a depth image without its planes.
+
+    Attributes:
+        clouds_m: the points of each region in the camera frame, the largest first, 40 at most.
+        pieces_m: those of parts of regions that are connected by a narrow neck.
+        is_plane: which pixels show a plane that was taken away.
+    """
+
+    clouds_m: list[Float[Tensor, "_ 3"]]
+    pieces_m: list[Float[Tensor, "_ 3"]]
+    is_plane: Bool[Tensor, "h w"]
 
 
 def find_regions(
     depth_m: Float[Tensor, "h w"],
     K: Float[Tensor, "3 3"],
     largest_m: float,
-) -> tuple[list[Float[Tensor, "_ 3"]], Bool[Tensor, "h w"]]:
+) -> Regions:
     """Take dominant planes away and part what is left where its depth jumps.
 
     Planes are found one after the other by RANSAC (Fischler and Bolles 1981) and refitted. One is
@@ -43,10 +68,6 @@ def find_regions(
         depth_m: along the optical axis; NaN where there is no reading.
         K: intrinsic matrix.
         largest_m: diameter of the largest object.
-
-    Returns:
-        The points of each region in the camera frame, the largest first, 40 at most; and which
-        pixels show a plane that was taken away.
     """
     points_m = back_project(depth_m.double(), K.double())
     is_left = points_m.isfinite().all(-1) & (depth_m > 0)
@@ -69,7 +90,10 @@ def find_regions(
     pixels = torch.bincount(label[is_left], minlength=1) if bool(is_left.any()) else torch.zeros(1)
     order = pixels.argsort(descending=True, stable=True)[:_MOST_REGIONS]
     wanted = [int(k) for k in order if int(pixels[k]) >= _LEAST_PIXELS]
-    return [points_m[is_left & (label == k)].float() for k in wanted], is_plane
+    masks = [is_left & (label == k) for k in wanted]
+    pieces = [piece for mask in masks for piece in split_at_necks(mask)]
+    points_m = points_m.float()
+    return Regions([points_m[mask] for mask in masks], [points_m[p] for p in pieces], is_plane)
 
 
 def label_regions(
@@ -99,6 +123,45 @@ def label_regions(
         .long()
         .reshape(height, width)
     )
+
+
+def split_at_necks(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
+    """Split a region where it is narrow: two things that touch are often one region.
+
+    What is left of it farther than some width from its outline is labelled, and each pixel belongs
+    to the label that is nearest. Several widths are tried, so pieces may overlap.
+    """
+    rows, columns = (mask.any(k).nonzero()[:, 0] for k in (1, 0))
+    box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+    own = mask[box].numpy()
+    step = -(-max(own.shape) // _MOST_SIDE)
+    small = np.pad(own[::step, ::step], 2)
+    inside = np.asarray(ndimage.distance_transform_edt(ndimage.binary_closing(small)))
+    cell = np.ix_(*(np.arange(size) // step + 2 for size in own.shape))
+    found = list[np.ndarray]()
+    for width in _NECKS:
+        label = np.zeros(small.shape, np.int32)
+        ndimage.label(inside > width, output=label)
+        if not label.any():
+            break
+        nearest = np.zeros((2, *small.shape), np.int32)
+        ndimage.distance_transform_edt(
+            label == 0, return_distances=False, return_indices=True, indices=nearest
+        )
+        label = np.where(own, label[tuple(nearest)][cell], 0)
+        pixels = np.bincount(label[own])
+        least, most = max(_LEAST_PIXELS, _PIECE[0] * own.sum()), _PIECE[1] * own.sum()
+        for k in np.flatnonzero((pixels >= least) & (pixels <= most)):
+            if not any(_is_alike(label == k, one) for one in found):
+                found.append(label == k)
+    pieces = [torch.zeros_like(mask) for _ in found]
+    for piece, one in zip(pieces, found, strict=True):
+        piece[box] = torch.from_numpy(one)
+    return pieces
+
+
+def _is_alike(piece: np.ndarray, other: np.ndarray) -> bool:
+    return bool((piece & other).sum() > _ALIKE * (piece | other).sum())
 
 
 def _largest_piece(depth_m: Float[Tensor, "h w"], near: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

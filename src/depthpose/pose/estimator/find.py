@@ -97,12 +97,12 @@ class _Answer:
 def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """Pose every known object that a depth image shows, the surest first; what is none is left out.
 
-    Regions are tried for every object whose size they may have; so are pairs of them that may be
-    parts of one object, and parts of one that is too long. Where several objects answer they share
-    the probability of one by the evidence against each. What an answer leaves unexplained of its
-    region is tried once more. An answer is left out through whose surface the camera saw, or that
-    lies behind a plane that was seen, or that explains not quite all of its region; of answers that
-    explain the same points the best stays.
+    Regions are tried for every object whose size they may have; so are their pieces beside narrow
+    necks, pairs of them that may be parts of one object, and parts of one that is too long. Where
+    several objects answer they share the probability of one by the evidence against each. What an
+    answer leaves unexplained of its region is tried once more. An answer is left out through whose
+    surface the camera saw, or that lies behind a plane that was seen, or that explains not quite
+    all of its region; of answers that explain the same points the best stays.
 
     Args:
         view: depth and camera; its mask limits where is looked.
@@ -110,9 +110,10 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
     """
     largest_m = max(model.diameter_m for model in known.models.values())
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
-    regions, is_plane = find_regions(depth_m, view.K, largest_m)
-    clouds = [*regions, *_pairs(regions, largest_m), *_parts(regions, largest_m)]
-    scene = _Scene(view=view, is_plane=is_plane)
+    regions = find_regions(depth_m, view.K, largest_m)
+    whole = regions.clouds_m
+    clouds = [*whole, *regions.pieces_m, *_pairs(whole, largest_m), *_parts(whole, largest_m)]
+    scene = _Scene(view=view, is_plane=regions.is_plane)
     answers = _estimate_regions(clouds, scene, known)
     rest = [answer.points_m[~answer.explained] for answer in answers]
     again = [cloud for cloud, answer in zip(rest, answers, strict=True)

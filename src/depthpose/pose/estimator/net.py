@@ -242,9 +242,7 @@ class GeoPoseNet(PoseEstimator):
         found = network_directions(self._network, clouds, numbers, self.config.device)
         return found, time.perf_counter() - start
 
-    def _pose(
-        self, given: AnyInput, number: int, voted: Voted, is_likely: bool
-    ) -> PoseEstimate:
+    def _pose(self, given: AnyInput, number: int, voted: Voted, is_likely: bool) -> PoseEstimate:
         found = pose_from_directions(
             voted,
             self.weights.models[number],

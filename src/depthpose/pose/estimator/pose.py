@@ -27,7 +27,7 @@ _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
 
 
-def pose_from_directions(
+def pose_from_directions(  # noqa: PLR0913  what is known of an object is kept apart
     voted: Voted,
     model: ObjectModel,
     surface: Surface,
