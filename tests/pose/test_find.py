@@ -23,7 +23,7 @@ from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_necks
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
@@ -193,6 +193,21 @@ def test_a_cloud_of_none_of_several_objects_is_refused() -> None:
     assert found.camera_from_model is None
     assert found.reason is not None
     assert found.reason.startswith("none of bracket, bottle surely; ")
+
+
+def test_a_cloud_that_hardly_shows_its_object_is_refused_early_and_says_its_risk() -> None:
+    """What is likely to be there is compared in all its poses; what is not, in the best alone."""
+    generator = torch.Generator().manual_seed(0)
+    blob = 0.03 * torch.randn(2000, 3, generator=generator) + torch.tensor([0.0, 0.0, 0.8])
+    net = Oracle(tiny_weights(bracket(), refusal=REFUSAL), [pose_at()])
+    given = CloudInput(name="blob", points_m=blob, object="bracket")
+    (early,), (whole,) = net._try_many([given]), net.estimate_many([given])
+    for refused in (early, whole):
+        assert refused.status == "doubtful"
+        assert refused.risk is not None
+        assert refused.risk > REFUSAL.max_risk
+    assert "check" in whole.seconds
+    assert "check" not in early.seconds
 
 
 def test_two_objects_that_look_alike_are_named_and_refused() -> None:

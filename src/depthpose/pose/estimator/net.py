@@ -169,8 +169,7 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        found = {k: one for k, one, _ in self._each(inputs)}
-        estimates = [found[k] for k in range(len(inputs))]
+        estimates = self._in_order(inputs, is_likely=True)
         if self._registration is None:
             return estimates
         return [
@@ -180,7 +179,10 @@ class GeoPoseNet(PoseEstimator):
 
     @torch.no_grad()
     def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
-        found = {k: one for k, one, _ in self._each(inputs, is_likely=False)}
+        return self._in_order(inputs, is_likely=False)
+
+    def _in_order(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
+        found = {k: one for k, one, _ in self._each(inputs, is_likely=is_likely)}
         return [found[k] for k in range(len(inputs))]
 
     def _registered(self, given: AnyInput, doubted: PoseEstimate) -> PoseEstimate:
