@@ -1,6 +1,5 @@
 """The surface of a model: what of it lies near a point, and what of it a camera would see."""
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +13,7 @@ from torch.nn.functional import max_pool2d
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface
+from depthpose.pose.mesh.sampling import fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -99,7 +99,9 @@ class Surface:
         Counted in cells of 1/24 diameter; a part that is thinner than three of them adds nothing.
         """
         side_m, reach = _CELL * self.diameter_m, round(1 / _CELL) + 3
-        flat_m = (self.points_m - self.points_m.mean(0)) @ _across(_VIEWS)
+        # The last two rows of each frame are two axes across the direction.
+        _, _, frames = torch.linalg.svd(fibonacci_directions(_VIEWS)[:, None])
+        flat_m = (self.points_m - self.points_m.mean(0)) @ frames[:, 1:].mT
         column, row = ((flat_m / side_m).floor().long() + reach).unbind(-1)
         filled = torch.zeros(_VIEWS, (2 * reach) ** 2)
         filled.scatter_(1, column * 2 * reach + row, 1.0)
@@ -231,19 +233,6 @@ def compare_depths(
     agrees = is_posed & is_read & ~through & ~before
     total = int(is_posed.sum())
     return int(agrees.sum()) / total, int(through.sum()) / total, int(before.sum()) / total
-
-
-def _across(count: int) -> Float64[Tensor, "v 3 2"]:
-    """Give two axes across each of some directions that are even over a sphere.
-
-    A Fibonacci lattice (Gonzalez 2010) of half of it: opposite views have one silhouette.
-    """
-    k = torch.arange(count, dtype=torch.float64)
-    z, turn = (k + 0.5) / count, k * math.pi * (3 - math.sqrt(5))
-    ring = (1 - z.square()).sqrt()
-    along = torch.stack([ring * turn.cos(), ring * turn.sin(), z], -1)
-    side = torch.stack([-turn.sin(), turn.cos(), torch.zeros_like(z)], -1)
-    return torch.stack([side, torch.linalg.cross(along, side)], -1)
 
 
 def _boxes_about(points_m: Float64[Tensor, "m 3"], diameter_m: float, tree: KDTree) -> Boxes:

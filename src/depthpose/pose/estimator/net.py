@@ -245,13 +245,8 @@ class GeoPoseNet(PoseEstimator):
         return found, time.perf_counter() - start
 
     def _pose(self, given: AnyInput, number: int, voted: Voted, is_likely: bool) -> PoseEstimate:
+        known = (self.weights.models[number], self._surface(number), self._copies_of(number))
         found = pose_from_directions(
-            voted,
-            self.weights.models[number],
-            self._surface(number),
-            self._copies_of(number),
-            self.weights.refusal,
-            self.config,
-            is_likely=is_likely,
+            voted, known, self.weights.refusal, self.config, is_likely=is_likely
         )
         return replace(found, name=given.name)

@@ -27,11 +27,9 @@ _LEAST = 4
 """Keypoints that must agree: three fix a pose with nothing left to contradict it."""
 
 
-def pose_from_directions(  # noqa: PLR0913  what is known of an object is kept apart
+def pose_from_directions(
     voted: Voted,
-    model: ObjectModel,
-    surface: Surface,
-    copies: PoseAmbiguities,
+    known: tuple[ObjectModel, Surface, PoseAmbiguities],
     refusal: RefusalConfig,
     config: EstimateConfig,
     *,
@@ -42,14 +40,13 @@ def pose_from_directions(  # noqa: PLR0913  what is known of an object is kept a
     Args:
         voted: the cloud and the network's directions (a fourth component is the logit of how far
             to trust each).
-        model: the object.
-        surface: of the same object.
-        copies: of the same object, what it may be confused with.
+        known: the object, its surface and what it may be confused with.
         refusal: when the answer is withheld.
         config: voting and ICP.
         is_likely: whether the cloud is likely to show the object; else the other poses that fit are
             not compared where the best is too risky by itself.
     """
+    model, surface, _ = known
     clock = Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")
@@ -57,7 +54,7 @@ def pose_from_directions(  # noqa: PLR0913  what is known of an object is kept a
     if isinstance(fits, Refusal):
         return withheld(model.name, fits, clock)
     clock.note("svd")
-    found = _refine(voted, fits, (model, surface, copies), refusal, config, is_likely)
+    found = _refine(voted, fits, known, refusal, config, is_likely)
     if isinstance(found, Refusal):
         clock.note("icp")
         return withheld(model.name, found, clock, risk=found.risk)
@@ -116,12 +113,12 @@ def _fits(
 def _refine(
     voted: Voted,
     fits: PoseFit,
-    object: tuple[ObjectModel, Surface, PoseAmbiguities],
+    known: tuple[ObjectModel, Surface, PoseAmbiguities],
     refusal: RefusalConfig,
     config: EstimateConfig,
     is_likely: bool,
 ) -> Found | Refusal:
-    model, surface, copies = object
+    model, surface, copies = known
     cloud_m = voted.cloud.cloud_m
     fit, scatter, refined = _row(fits, 0), 0.0, None
     others = _none_of(fit.camera_from_model)
@@ -135,9 +132,9 @@ def _refine(
     icp = None if refined is None else config.icp
     signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
     if not is_likely:
-        (alone,) = evidence_of(voted, [first.pose], model, copies, surface)
-        known = {**signals, **alone}
-        refused = refuse_risky(known, known, refusal)
+        (own,) = evidence_of(voted, [first.pose], model, copies, surface)
+        measured = {**signals, **own}
+        refused = refuse_risky(measured, measured, refusal)
         if refused is not None:
             return refused
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
