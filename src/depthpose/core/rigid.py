@@ -24,8 +24,8 @@ class Rigid:
     R: Float[Tensor, "*batch 3 3"]
     t_m: Float[Tensor, "*batch 3"]
 
-    def apply(self, points_m: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
-        """Move points from the source frame to the target frame."""
+    def apply(self, points_m: Float[Tensor, "*points n 3"]) -> Float[Tensor, "*moved n 3"]:
+        """Move points from the source frame to the target frame; batch axes are broadcast."""
         return points_m @ self.R.mT + self.t_m[..., None, :]
 
     def __matmul__(self, other: "Rigid") -> "Rigid":
@@ -45,8 +45,10 @@ class Rigid:
         """Give it in float32."""
         return Rigid(self.R.float(), self.t_m.float())
 
-    def __getitem__(self, index: int | list[int] | Tensor | None) -> "Rigid":
-        """Give one of a batch or several as a batch; of None a batch of one."""
+    def __getitem__(
+        self, index: int | list[int] | Tensor | tuple[slice | None, ...] | None
+    ) -> "Rigid":
+        """Give one of a batch or several as a batch; each None is a new axis of one."""
         return Rigid(self.R[index], self.t_m[index])
 
     @classmethod

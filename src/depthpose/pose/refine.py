@@ -189,19 +189,22 @@ def _iterated(
     *,
     is_exact: bool,
 ) -> Rigid:
-    """Step by step to where the cloud lies on the surface, until nothing moves any more."""
+    """Step by step to where the cloud lies on the surface, each until it moves no more."""
     if serves(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.icp import refined
 
         steps = (limits_m, _CONVERGED, surface.diameter_m)
         return refined(cloud, pose, surface.target, steps, is_exact=is_exact)
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
+    moves = torch.ones_like(pose.t_m[..., :1])
     for limit_m in limits_m:
         H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m, is_exact=is_exact)
-        motion = torch.linalg.solve(H, pull)
+        motion = torch.linalg.solve(H, pull) * moves
         pose = _moved(pose, motion, _middle(cloud))
-        if limit_m <= limits_m[-1] and bool(((motion / scale).abs() < _CONVERGED).all()):
-            break
+        if limit_m <= limits_m[-1]:
+            moves = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
+            if not bool(moves.any()):
+                break
     return pose
 
 

@@ -93,7 +93,7 @@ def _move(turn, motion, middle, R, t):
 
 @compiled
 def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact):
-    """Move poses in place, step by step, until none of them moves any more.
+    """Move poses in place, step by step, each until it moves no more.
 
     Args:
         cloud: (n, 3), in the camera frame.
@@ -109,22 +109,23 @@ def _refine(cloud, Rs, ts, limits, scale, converged, target, is_exact):
     for i in range(len(cloud)):
         middle += cloud[i]
     middle /= len(cloud)
-    places = np.full((len(ts), len(cloud)), -1)
+    places = np.empty(len(cloud), np.int64)
     points, normals = target[0][0], target[1]
     local, turn = np.empty_like(cloud), np.empty((3, 3))
     H, b, motion = np.empty((6, 6)), np.empty(6), np.empty(6)
-    for limit in limits:
-        most = 0.0
-        for p in range(len(ts)):
-            R, t = Rs[p], ts[p]
+    for p in range(len(ts)):
+        R, t = Rs[p], ts[p]
+        places[:] = -1
+        for limit in limits:
             _localise(cloud, R, t, local)
-            find_places(local, limit, target, is_exact, places[p])
-            _add_equations(local, places[p], R, t - middle, limit, points, normals, H, b)
+            find_places(local, limit, target, is_exact, places)
+            _add_equations(local, places, R, t - middle, limit, points, normals, H, b)
             damp(H, 1e-6)
             solve(H, b, motion)
             rotation(motion[0], motion[1], motion[2], turn)
             _move(turn, motion, middle, R, t)
+            most = 0.0
             for k in range(6):
                 most = max(most, abs(motion[k]) / (1.0 if k < 3 else scale))
-        if limit <= limits[-1] and most < converged:
-            break
+            if limit <= limits[-1] and most < converged:
+                break

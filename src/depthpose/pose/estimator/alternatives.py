@@ -12,12 +12,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.estimator.evidence import (
-    cloud_normals,
-    disagreement,
-    log_signal,
-    surface_signals,
-)
+from depthpose.pose.estimator.evidence import disagreement, log_signal, surface_signals
 from depthpose.pose.estimator.prepare import Voted
 from depthpose.pose.mesh import near_symmetries, sample_surface, symmetry_transforms
 from depthpose.pose.mesh import true_symmetries as find_true
@@ -145,7 +140,7 @@ def find_candidates(
     if len(starts.R) == 0:
         return kept
     for one in _refined(cloud_m, starts, best, surface, config):
-        if not any(is_same_pose(one.pose, other.pose, copies) for other in kept):
+        if not _is_any_same(one.pose, Rigid.stack([other.pose for other in kept]), copies):
             kept.append(one)
     return kept
 
@@ -175,36 +170,29 @@ def _refined(
     ]
 
 
-def is_same_pose(first: Rigid, second: Rigid, copies: PoseAmbiguities) -> bool:
-    """Whether two poses, or a copy of one that counts as it, carry the model to one place."""
-    every = second @ copies.same
-    gap_m = first.apply(copies.points_m) - every.apply(copies.points_m.expand(len(every.R), -1, -1))
+def _is_any_same(pose: Rigid, others: Rigid, copies: PoseAmbiguities) -> bool:
+    """Whether one of others, or a copy that counts as it, carries the model where a pose does."""
+    every = others[:, None] @ copies.same
+    gap_m = pose.apply(copies.points_m) - every.apply(copies.points_m)
     return float(gap_m.norm(dim=-1).mean(-1).min()) < _SAME * copies.diameter_m
 
 
 def evidence_of(
     voted: Voted,
-    poses: Sequence[Rigid],
+    poses: Rigid,
     model: ObjectModel,
     copies: PoseAmbiguities,
     surface: Surface,
 ) -> list[dict[str, float]]:
-    """Give the signals by which candidates are compared, for the pose of each.
+    """Give the signals by which candidates are compared, for each pose of a batch.
 
     The directions are compared with those to one of the copies that the network could not learn to
     distinguish from the pose. Which of them it points at is chance, so the best one counts.
     """
-    keypoints_m = model.keypoints_m.double().expand(len(copies.trained.R), -1, -1)
-    normals = cloud_normals(voted.cloud.cloud_m)
-
-    def signals(pose: Rigid) -> dict[str, float]:
-        every_m = (pose @ copies.trained).apply(keypoints_m)
-        return {
-            **surface_signals(voted.cloud.cloud_m, pose, surface, normals),
-            "disagree": disagreement(voted.cloud, voted.outputs, every_m),
-        }
-
-    return [signals(pose) for pose in poses]
+    every_m = (poses[:, None] @ copies.trained).apply(model.keypoints_m.double())
+    disagree = disagreement(voted.cloud, voted.outputs, every_m).tolist()
+    signals = surface_signals(voted.cloud.cloud_m, poses, surface)
+    return [{**one, "disagree": angle} for one, angle in zip(signals, disagree, strict=True)]
 
 
 def share_out(

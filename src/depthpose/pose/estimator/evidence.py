@@ -70,26 +70,29 @@ def vote_signals(cloud: Prepared, fit: PoseFit) -> dict[str, float]:
 
 
 def disagreement(
-    cloud: Prepared, outputs: Float[Tensor, "n k c"], copies_m: Float[Tensor, "b k 3"]
-) -> float:
-    """Mean angle between the network's directions and those to the posed keypoints [rad].
+    cloud: Prepared, outputs: Float[Tensor, "n k c"], copies_m: Float[Tensor, "b m k 3"]
+) -> Float64[Tensor, " b"]:
+    """Mean angle between the network's directions and those to the keypoints of each pose [rad].
 
     Args:
         cloud: what the network saw.
         outputs: its directions.
-        copies_m: keypoints of each pose that the network could not distinguish; the one counts at
-            which the directions point best, by their mean cosine.
+        copies_m: for each pose the keypoints of the copies that the network could not distinguish
+            from it; the copy counts at which the directions point best, by their mean cosine.
     """
     directions = normalize(outputs[..., :3].double(), dim=-1)
     points_m = cloud.points_m.double()
 
-    def cosines(some_m: Tensor, few: int) -> Float64[Tensor, "b m k"]:
-        way = normalize(some_m[:, None] - points_m[None, ::few, None], dim=-1)
+    def cosines(some_m: Tensor, few: int) -> Float64[Tensor, "*batch m k"]:
+        way = normalize(some_m[..., None, :, :] - points_m[::few, None], dim=-1)
         return (directions[::few] * way).sum(-1)
 
-    few = max(1, len(points_m) // _COMPARED)
-    best = int(cosines(copies_m, few).mean((1, 2)).argmax()) if len(copies_m) > 1 else 0
-    return float(cosines(copies_m[[best]], 1).clamp(-1, 1).arccos().mean())
+    best = torch.zeros(len(copies_m), dtype=torch.long)
+    if copies_m.shape[1] > 1:
+        few = max(1, len(points_m) // _COMPARED)
+        best = cosines(copies_m, few).mean((-2, -1)).argmax(-1)
+    chosen_m = copies_m[torch.arange(len(copies_m)), best]
+    return cosines(chosen_m, 1).clamp(-1, 1).arccos().mean((-2, -1))
 
 
 def log_signal(signal: float) -> float:
@@ -122,37 +125,38 @@ def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
 
 def surface_signals(
     cloud_m: Float[Tensor, "n 3"],
-    pose: Rigid,
+    poses: Rigid,
     surface: Surface,
     normals: CloudNormals | None = None,
-) -> dict[str, float]:
-    """Say how well the posed surface explains the cloud, and the cloud the surface.
+) -> list[dict[str, float]]:
+    """Say for each pose how well its surface explains the cloud, and the cloud the surface.
 
     A point seen through the posed surface contradicts the pose; surface that nobody saw may merely
     be occluded by something else.
 
     Args:
         cloud_m: of the object, in the camera frame.
-        pose: of the object.
+        poses: of the object, a batch.
         surface: of its model.
         normals: of the cloud; None: they are computed.
     """
     normals = cloud_normals(cloud_m) if normals is None else normals
     limit_m = NEAR * surface.diameter_m
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
-    distance_m, _ = _nearest(points_m, pose, surface)
-    near_m = distance_m[distance_m < limit_m]
-    gap_m = float(near_m.square().mean().sqrt()) if len(near_m) else limit_m
-    alone = pose[None]
-    front, unseen = look_along_rays(cloud_m.double(), alone, surface)
-    return {
-        "tilt": tilt_of(normals, pose, surface),
-        "rough": normals.rough,
-        "gap": gap_m / surface.diameter_m,
-        "far": 1 - len(near_m) / len(distance_m),
-        "front": float(front),
-        "unseen": float(unseen),
+    distance_m, _ = _nearest(points_m, poses, surface)
+    is_near = distance_m < limit_m
+    number = is_near.sum(-1)
+    near_m2 = torch.where(is_near, distance_m.square(), 0.0).sum(-1) / number.clamp(min=1)
+    front, unseen = look_along_rays(cloud_m.double(), poses, surface)
+    columns = {
+        "tilt": tilt_of(normals, poses, surface),
+        "gap": torch.where(number > 0, near_m2.sqrt(), limit_m) / surface.diameter_m,
+        "far": 1 - number / len(points_m),
+        "front": front,
+        "unseen": unseen,
     }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [{**dict(zip(columns, row, strict=True)), "rough": normals.rough} for row in rows]
 
 
 def observability(
@@ -204,20 +208,18 @@ def without_motions(
     return (basis @ inner @ basis.T).to(covariance)
 
 
-def tilt_of(cloud: CloudNormals, pose: Rigid, surface: Surface) -> float:
-    """Mean of 1 - |cosine| between normals of the cloud and of the posed surface near it."""
-    distance_m, index = _nearest(cloud.points_m, pose, surface)
-    near = distance_m < NEAR * surface.diameter_m
-    if not bool(near.any()):
-        return 1.0
-    cosine = (cloud.normals[near] * (surface.normals[index[near]] @ pose.R.mT)).sum(-1)
-    return float(1 - cosine.abs().mean())
+def tilt_of(cloud: CloudNormals, poses: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
+    """Mean of 1 - |cosine| between normals of the cloud and of each posed surface near it."""
+    distance_m, index = _nearest(cloud.points_m, poses, surface)
+    is_near = distance_m < NEAR * surface.diameter_m
+    cosine = (cloud.normals * (surface.normals[index] @ poses.R.mT)).sum(-1).abs()
+    return 1 - torch.where(is_near, cosine, 0.0).sum(-1) / is_near.sum(-1).clamp(min=1)
 
 
 def _nearest(
     points_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
-) -> tuple[Float64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Distance of each point to the posed surface, and the number of the point of it there."""
+) -> tuple[Float64[Tensor, "*batch n"], Int64[Tensor, "*batch n"]]:
+    """Distance of each point to a posed surface, and the number of the point of it there."""
     local_m = pose.inverse().apply(points_m)
     index = surface.nearest(local_m)
     return (local_m - surface.points_m[index]).norm(dim=-1), index

@@ -132,13 +132,13 @@ def _refine(
     icp = None if refined is None else config.icp
     signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
     if not is_likely:
-        (own,) = evidence_of(voted, [first.pose], model, copies, surface)
+        (own,) = evidence_of(voted, first.pose[None], model, copies, surface)
         measured = {**signals, **own}
         refused = refuse_risky(measured, measured, refusal)
         if refused is not None:
             return refused
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
-    poses = [one.pose for one in candidates]
+    poses = Rigid.stack([one.pose for one in candidates])
     evidence = evidence_of(voted, poses, model, copies, surface)
     return choose(candidates, evidence, signals, copies, refusal)
 

@@ -128,8 +128,8 @@ def _place_refusal(
     model: ObjectModel,
 ) -> Refusal | None:
     """Refuse what is not before the camera; a cloud about the origin is in no other axes."""
-    fits = unit_advice(model.diameter_m, _sized(points_m, kept_m)) is None
-    if fits and isinstance(given, CloudInput) and _is_centred(points_m, model):
+    is_centred = isinstance(given, CloudInput) and _is_centred(points_m, model)
+    if is_centred and unit_advice(model.diameter_m, _sized(points_m, kept_m)) is None:
         return Refusal(
             status="unusable input",
             reason="the cloud lies about the origin, where the camera is: it was centred, or is in "

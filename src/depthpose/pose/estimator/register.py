@@ -222,10 +222,10 @@ def _evidence_of(
     The plane through neighbours is tilted where a part has edges and thin features too, whatever
     the pose: so it is on the cloud moved onto the posed surface, which is subtracted.
     """
-    signals = surface_signals(cloud_m, pose, surface, normals)
+    (signals,) = surface_signals(cloud_m, pose[None], surface, normals)
     local_m = pose.inverse().apply(cloud_m.double())
     ideal_m = pose.apply(surface.points_m[surface.nearest(local_m)])
-    own = tilt_of(cloud_normals(ideal_m), pose, surface)
+    own = float(tilt_of(cloud_normals(ideal_m), pose[None], surface))
     return {**signals, "tilt": max(0.0, signals["tilt"] - own)}
 
 

@@ -168,7 +168,8 @@ def _accepted(
             f"{observable:.1%})",
         )
     _, through, before = shares
-    signals = {**surface_signals(own_m, pose, surface), "through": through, "before": before}
+    (signals,) = surface_signals(own_m, pose[None], surface)
+    signals |= {"through": through, "before": before}
     return _answer(refined, free, signals, known, last)
 
 

@@ -25,8 +25,8 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     """
     if len(points_m) < 2:
         return None
-    distance = (points_m - points_m.median(0).values).norm(dim=-1).sort().values
-    size_m = 2 * float(distance[int(0.95 * (len(distance) - 1))])
+    distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    size_m = 2 * float(distance_m.kthvalue(1 + int(0.95 * (len(distance_m) - 1))).values)
     if size_m <= 0:
         return None
     share = size_m / model_diameter_m
