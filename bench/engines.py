@@ -95,7 +95,8 @@ def quantised(path: Path) -> Path:
 
 def torch_run(weights: str, *, precision: str = "fp32", **options: Any) -> Run:  # noqa: ANN401
     """Make the estimator itself."""
-    config = MatcherConfig(precision=precision)  # pyright: ignore[reportArgumentType]
+    # As exported graphs are.
+    config = MatcherConfig(precision=precision, speed="quick")  # pyright: ignore[reportArgumentType]
     net = FakestereoNet.load(weights, config=config, allow_ood=True, **options)
     return lambda given: net.estimate_pair(given).disparity_px.numpy()
 

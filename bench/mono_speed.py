@@ -2,7 +2,8 @@
 
     python bench/mono_speed.py [--weights default] [--precision fp32 bf16] [--device cpu]
 
-The shipped weights and those of full width (random weights: time does not depend on them).
+The shipped weights and those of full width (random weights: time does not depend on them). Stages,
+memory and operations are of the quick speed, ``fine_s`` is the whole at the fine one.
 Each runs in a separate process, so that peak memory is measured separately.
 """
 
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from stereo_memory import resident_bytes
@@ -21,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
-from depthpose.depth.config import GeneratorConfig, MatcherConfig
+from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
 from depthpose.depth.disparity import focal_size, resize_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import MATCHERS, NetworkMatcher, PSMNet, PSMNetMatcher
@@ -92,7 +94,8 @@ def uses_matcher(net: FakestereoNet) -> bool:
 
 def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     """Measure one set in this process."""
-    config = MatcherConfig(precision=precision, device=device)  # pyright: ignore[reportArgumentType]
+    run: Any = {"precision": precision, "device": device}
+    config = MatcherConfig(**run, speed="quick")
     net, image = make_net(weights, config), street()
     before = resident_bytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
@@ -109,6 +112,8 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     left = resize_image(image.left, *size)
     right = draw(left[None]).right[0]
     whole_s = seconds(lambda: net.estimate_pair(image), device)
+    fine = make_net(weights, MatcherConfig(**run))
+    fine_s = seconds(lambda: fine.estimate_pair(image), device)
     drawing = count_flops(lambda: draw(left[None]))
     matching = matcher_flops(net, *size) if uses_matcher(net) else 0
     peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
@@ -120,6 +125,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
         "set": weights,
         "precision": precision,
         "seconds": whole_s,
+        "fine_s": fine_s,
         "first_s": first,
         "draw_s": seconds(lambda: draw(left[None]), device),
         "match_s": match_s,
@@ -134,14 +140,22 @@ def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
     """Alternate in one process, one thread; processor time is valid on a busy machine too."""
     torch.set_num_threads(1)
     image = street()
-    nets = {name: make_net(name, MatcherConfig()) for name in names}
-    times: dict[str, list[float]] = {name: [] for name in names}
+    speeds: tuple[Speed, ...] = ("quick", "fine")
+    nets = {
+        (name, speed): make_net(name, MatcherConfig(speed=speed))
+        for name in names
+        for speed in speeds
+    }
+    times: dict[tuple[str, str], list[float]] = {each: [] for each in nets}
     for _ in range(runs):
-        for name, net in nets.items():
+        for each, net in nets.items():
             begin = time.process_time()
             net.estimate_pair(image)
-            times[name].append(time.process_time() - begin)
-    return [{"set": Path(name).stem, "processor_s": min(times[name])} for name in names]
+            times[each].append(time.process_time() - begin)
+    return [
+        {"set": Path(name).stem, "speed": speed, "processor_s": min(found)}
+        for (name, speed), found in times.items()
+    ]
 
 
 def main() -> None:

@@ -11,7 +11,6 @@ from depthpose.cli.depth.options import (
     MatchOptions,
     MethodOptions,
     PairNetworks,
-    PairOptions,
     PredictOutput,
     ProtocolOptions,
     refuse_ignored,
@@ -188,7 +187,7 @@ def evaluate(
     split: str | None = None,
     methods: MethodOptions = MethodOptions(),
     comparison: ProtocolOptions = ProtocolOptions(),
-    matching: PairOptions = PairOptions(),
+    matching: MatcherOptions = MatcherOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Measure depth on a dataset by a named protocol, and write rows, a table and a page.

@@ -234,7 +234,7 @@ def describe_source(name: str, settings: dict[str, Any] | None) -> Source:
     return Source(
         method=settings.get("matcher", "") + suffix,
         input=settings.get("input", "both views"),
-        speed=settings.get("speed", "") if settings.get("input") != "left view" else "",
+        speed=settings.get("speed", ""),
         weights=settings.get("weights", ""),
         weights_sha256=settings.get("weights_sha256", "")[:12],
     )

@@ -19,41 +19,36 @@ _UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
 
 @group
 class MatcherOptions:
-    """How the matcher of the weights runs."""
+    """How the weights run."""
 
     device: Device = "cpu"
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
     max_memory: str | None = None
-    """limit on the memory of activations, such as 1GB or 800MB; the result stays exact."""
+    """limit on the memory of a matcher's activations, such as 1GB or 800MB; the result stays
+    exact."""
+    speed: Speed = "fine"
+    """quick: at the size that the weights were trained at; fine: one image is looked at in a larger
+    size too, a pair matched at up to 280,000 pixels (PSMNet) or 650,000 (light), for KITTI in about
+    3 times the time."""
 
     @property
     def config(self) -> MatcherConfig:
-        """Settings of the matcher.
+        """Settings of the networks.
 
         Raises:
             InputError: a size that is none.
         """
-        memory = parse_bytes(self.max_memory)
-        return MatcherConfig(device=self.device, precision=self.precision, max_memory_bytes=memory)
+        return MatcherConfig(
+            device=self.device,
+            precision=self.precision,
+            max_memory_bytes=parse_bytes(self.max_memory),
+            speed=self.speed,
+        )
 
 
 @group
-class PairOptions(MatcherOptions):
-    """How the matcher of the weights runs on real pairs."""
-
-    speed: Speed = "fine"
-    """quick: at the focal length that the weights were trained at; fine: at up to 280,000 pixels
-    (PSMNet) or 650,000 (light), for KITTI in about 3 times the time."""
-
-    @property
-    def config(self) -> MatcherConfig:
-        """Settings of the matcher."""
-        return replace(super().config, speed=self.speed)
-
-
-@group
-class MatchOptions(PairOptions):
+class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 
     tile: tuple[int, int] | None = None
@@ -130,8 +125,8 @@ class ImageNetworks:
             )
         if self.matcher == "sgbm" and matching != MatcherOptions():
             raise InputError(
-                "--device, --precision and --max-memory are for matchers with weights; sgbm takes "
-                "none."
+                "--device, --precision, --max-memory and --speed are for matchers with weights; "
+                "sgbm takes none."
             )
 
 
@@ -235,8 +230,8 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
     """
     if matching != type(matching)() and all(name.startswith("sgbm:") for name in weights):
         raise InputError(
-            "--device, --precision and --max-memory (and --speed) are for matchers with weights, "
-            "and none is measured; leave them out"
+            "--device, --precision, --max-memory and --speed are for networks, and none is "
+            "measured; leave them out"
         )
 
 

@@ -100,6 +100,10 @@ class SelectionConfig:
     virtual_baseline_m: float = 0.5327
     """Baseline of the imitated rig [m]."""
 
+    scales: tuple[float, ...] = (1.0, 1.4)
+    """Sizes at which the fine speed looks at an image, as shares of that at the virtual focal
+    length, 1 the first; it averages. The quick speed looks once."""
+
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
         if not 0 < self.encoder_width <= 4:
@@ -120,6 +124,10 @@ class SelectionConfig:
         if not 0 <= self.least_confidence < 1:
             raise InputError(
                 f"least_confidence must be from 0 to below 1, got {self.least_confidence}"
+            )
+        if self.scales[:1] != (1.0,) or not all(0 < scale <= 4 for scale in self.scales):
+            raise InputError(
+                f"scales must begin with 1 and be above 0, at most 4; got {self.scales}"
             )
         _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
 

@@ -165,7 +165,7 @@ class FakestereoNet:
         generator = found.generator
         if engine == "openvino":
             generator = openvino_generator(generator, run.device, run.precision)
-        synthesiser = make_synthesiser(generator, run.device)
+        synthesiser = make_synthesiser(generator, run.device, run.speed)
         return cls(chosen, synthesiser, terms=terms, weights=said, allow_ood=allow_ood)
 
     from_pretrained = load
@@ -247,28 +247,33 @@ class FakestereoNet:
         """
         found: list[DepthEstimate] = []
         inputs = as_inputs(images, choose_lens(camera, focal_px))
-        for size, group in groupby(inputs, self._size_alone):
+        for sizes, group in groupby(inputs, self._sizes_alone):
             alike = list(group)
-            is_alone = size is not None
+            is_alone = sizes is not None
             found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
         return found
 
-    def _size_alone(self, image: StereoInput) -> tuple[int, int] | None:
-        """Size at the virtual rig; None for a pair."""
-        return self._virtual_size(image) if image.right is None else None
+    def _sizes_alone(self, image: StereoInput) -> list[tuple[int, int]] | None:
+        """Sizes at which an image is looked at; None for a pair."""
+        return self._virtual_sizes(image) if image.right is None else None
 
-    def _virtual_size(self, image: StereoInput) -> tuple[int, int]:
+    def _virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
+        """Size at the virtual rig, and those larger ones for which the image has the pixels."""
         synthesiser, camera = self._usable_alone(image)
-        return focal_size(camera, synthesiser.config.virtual_focal_px)
+        focal_px, own_px = synthesiser.config.virtual_focal_px, float(camera.K[0, 0])
+        used = [s for s in synthesiser.scales if s == 1 or s * focal_px <= own_px]
+        return [focal_size(camera, scale * focal_px) for scale in used]
 
     def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
         synthesiser, _ = self._usable_alone(images[0])
         rig = synthesiser.config
-        size = self._virtual_size(images[0])
-        left = torch.stack([resize_image(image.left, *size) for image in images])
-        drawn = synthesiser.draw(left)
-        matches = self._disparities(left, drawn, square_camera(size, rig.virtual_focal_px))
+        sizes = self._virtual_sizes(images[0])
+        left, *larger = (
+            torch.stack([resize_image(image.left, *size) for image in images]) for size in sizes
+        )
+        drawn = synthesiser.draw(left, *larger)
+        matches = self._disparities(left, drawn, square_camera(sizes[0], rig.virtual_focal_px))
         skies = [m.is_sky for m in matches] if drawn.is_sky is None else drawn.is_sky
         parts = zip(images, matches, drawn.right, skies, strict=True)
         found = [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]

@@ -120,7 +120,8 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     assert weights.generator is not None
     matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
     # The scenes of the proof need not be like the images that the weights were trained on.
-    net = FakestereoNet(matcher, make_synthesiser(weights.generator), allow_ood=True)
+    synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
+    net = FakestereoNet(matcher, synthesiser, allow_ood=True)
     selects = isinstance(weights.generator, SelectionGenerator)
     sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
     for size in _SIZES:

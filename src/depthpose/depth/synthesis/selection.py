@@ -6,6 +6,7 @@ which is depth already. Class 0 is the sky, whose disparity is zero.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,8 @@ Images = Float[Tensor, "b 3 h w"]
 Logits = Float[Tensor, "b classes rows columns"]
 Planes = Float[Tensor, " planes"]
 
+_NEAR_LIMIT = 0.8
+"""Share of the largest disparity from which an expectation is drawn to the far."""
 _SURE_RATIO = 1.15
 """Disparities within this ratio of the answer count as the answer."""
 
@@ -113,6 +116,34 @@ def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
         for part in read_logits(logits, planes)
     )
     return Selected(log_px.exp(), sky, torch.where(sky > 0.5, sky, sure * (1 - sky)))
+
+
+def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
+    """Give the mean of what was found in one view at several sizes, with the first's confidence.
+
+    The means over sizes err less. The confidence of the first, at whose size the network was
+    trained, ranks their errors better than the mean of all (AUSE 0.34 and 0.41 of chance).
+
+    Args:
+        views: at one size; where the disparity of the first comes near the limit of another, that
+            one does not count.
+        limits_px: the largest disparity that each can have.
+    """
+    first = views[0]
+    if len(views) == 1:
+        return first
+    shares = torch.stack([first.disparity_px < _NEAR_LIMIT * limit_px for limit_px in limits_px])
+    shares[0] = True
+    shares = shares / shares.sum(0)
+
+    def mean(parts: list[Tensor]) -> Tensor:
+        return (shares * torch.stack(parts)).sum(0)
+
+    return Selected(
+        mean([view.disparity_px.log() for view in views]).exp(),
+        mean([view.sky for view in views]),
+        first.confidence,
+    )
 
 
 def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:

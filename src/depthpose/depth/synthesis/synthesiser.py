@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from depthpose.core.arrays import check_image
 from depthpose.core.devices import usable_device
-from depthpose.depth.config import GeneratorConfig, SelectionConfig
+from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
 from depthpose.depth.synthesis.generator import UNetGenerator
 from depthpose.depth.synthesis.selection import (
     Selected,
     SelectionGenerator,
+    average,
     select,
     shift_left,
 )
@@ -56,37 +57,65 @@ class Synthesiser(Protocol):
         """The network's settings, and its rig."""
         ...
 
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
-        """Draw right views; images are RGB in [0, 1]."""
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Sizes at which it looks at an image, as shares of the first, which is the rig's."""
+        ...
+
+    def draw(
+        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
+    ) -> SynthesisedViews:
+        """Draw right views; images are RGB in [0, 1], and perhaps the same at other sizes."""
         ...
 
 
-def make_synthesiser(generator: Generator, device: torch.device | str = "cpu") -> Synthesiser:
-    """Put a generator of either kind to use."""
+def make_synthesiser(
+    generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
+) -> Synthesiser:
+    """Put a generator of either kind to use; one that generates colours has one speed."""
     if isinstance(generator, SelectionGenerator):
-        return SelectionSynthesiser(generator, device)
+        return SelectionSynthesiser(generator, device, speed)
     return UNetSynthesiser(generator, device)
 
 
 class SelectionSynthesiser:
-    """Looks the right view up in the left one, and answers the left view's disparity too."""
+    """Looks the right view up in the left one, and answers the left view's disparity too.
 
-    def __init__(self, generator: SelectionGenerator, device: torch.device | str = "cpu") -> None:
+    At the fine speed it looks at an image at all ``config.scales``, and averages.
+    """
+
+    def __init__(
+        self,
+        generator: SelectionGenerator,
+        device: torch.device | str = "cpu",
+        speed: Speed = "fine",
+    ) -> None:
         self.device = usable_device(device)
         self.generator = generator.to(self.device).eval()
         self.config = generator.config
+        self.scales = self.config.scales if speed == "fine" else self.config.scales[:1]
 
     @torch.no_grad()
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
+    def draw(
+        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
+    ) -> SynthesisedViews:
         """Draw right views; images are RGB in [0, 1].
+
+        Args:
+            left: images at the virtual focal length, of whose size the answer is.
+            larger: the same images, larger; disparity and sky are means over all sizes.
 
         Raises:
             InputError: an image is no such.
         """
-        given = _checked(left, self.device)
-        seen, other = select_views(self.generator, given)
+        given = [_checked(images, self.device) for images in (left, *larger)]
+        size = (left.shape[-2], left.shape[-1])
+        views = [select_views(self.generator, images, size) for images in given]
+        most_px = float(self.generator.planes[-1])
+        limits_px = [most_px * size[1] / images.shape[-1] for images in given]
+        seen, other = (average(list(each), limits_px) for each in zip(*views, strict=True))
         parts = {
-            "right": shift_left(given, other.shift_px),
+            "right": shift_left(given[0], other.shift_px),
             "disparity_px": seen.disparity_px,
             "confidence": seen.confidence,
             "is_sky": seen.is_sky,
@@ -102,6 +131,8 @@ class UNetSynthesiser:
     with dropout on.
     """
 
+    scales = (1.0,)
+
     def __init__(self, generator: UNetGenerator, device: torch.device | str = "cpu") -> None:
         self.device = usable_device(device)
         self.generator = generator.to(self.device).eval()
@@ -110,12 +141,15 @@ class UNetSynthesiser:
             _keep_training(self.generator)
 
     @torch.no_grad()
-    def draw(self, left: Float[Tensor, "b 3 h w"]) -> SynthesisedViews:
-        """Draw right views; images are RGB in [0, 1].
+    def draw(
+        self, left: Float[Tensor, "b 3 h w"], *larger: Float[Tensor, "b 3 _ _"]
+    ) -> SynthesisedViews:
+        """Draw right views; images are RGB in [0, 1], at one size.
 
         Raises:
             InputError: an image is no such.
         """
+        assert not larger, "it has one scale"
         given = _checked(left, self.device)
         # The statistics of test mode 'batch' are those of one image: a batch would change them.
         groups = given.split(1) if self.config.test_mode == "batch" else [given]
@@ -130,23 +164,27 @@ def _checked(left: Float[Tensor, "b 3 h w"], device: torch.device) -> Float[Tens
 
 
 def select_views(
-    generator: SelectionGenerator, left: Float[Tensor, "b 3 h w"]
+    generator: SelectionGenerator,
+    left: Float[Tensor, "b 3 h w"],
+    size: tuple[int, int] | None = None,
 ) -> tuple[Selected, Selected]:
     """Answer disparity, sky and confidence of the left and of the right view, with gradients.
 
     Args:
         generator: the network.
         left: images of any size, RGB in [0, 1].
+        size: rows and columns of the answer, in whose pixels disparities are; None: the images'.
     """
     height, width = left.shape[-2:]
+    size = (height, width) if size is None else size
     multiple = generator.config.side_multiple_px
     # Even, since logits stand for two rows and two columns.
     rows = _even(_near_multiple(height, multiple, ROWS_SHARE))
     columns = _even(_near_multiple(width, multiple, COLUMNS_SHARE))
     padded = pad_to_multiple(_resized(left, rows, columns), multiple)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator(padded))
-    scale = width / columns
-    first, second = (select(part, generator.planes * scale, (height, width)) for part in kept)
+    scale = size[1] / columns
+    first, second = (select(part, generator.planes * scale, size) for part in kept)
     return first, second
 
 
