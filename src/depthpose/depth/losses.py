@@ -136,6 +136,8 @@ def plane_loss(
 ) -> Float[Tensor, ""]:
     """Cross entropy of the classes sky (0) and planes (1, 2, ...), shared between two neighbours.
 
+    Each image with truth counts the same, however sparse its truth is.
+
     Args:
         logits: class 0 is the sky.
         truth_px: disparity; 0 in the sky, NaN where unknown.
@@ -152,7 +154,9 @@ def plane_loss(
     scores = logits.float().log_softmax(1)
     near, far = scores.gather(1, first)[:, 0], scores.gather(1, first + 1)[:, 0]
     loss = -(near * (1 - share) + far * share)
-    return torch.where(is_known, loss, 0.0).sum() / is_known.sum().clamp(min=1)
+    counts = is_known.sum((1, 2))
+    means = torch.where(is_known, loss, 0.0).sum((1, 2)) / counts.clamp(min=1)
+    return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
 def photometric_error(
