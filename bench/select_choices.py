@@ -99,7 +99,7 @@ ARMS = (
 class MixingSynthesiser(SelectionSynthesiser):
     """Renders the right view as a mixture of shifts instead of by one shift per pixel."""
 
-    def draw(self, left: torch.Tensor) -> SynthesisedViews:
+    def draw(self, left: torch.Tensor, *larger: torch.Tensor) -> SynthesisedViews:
         """Synthesise right views; images are RGB in [0, 1]."""
         height, width = left.shape[-2:]
         size = (round(height / 32) * 32, round(width / 32) * 32)
@@ -110,7 +110,7 @@ class MixingSynthesiser(SelectionSynthesiser):
             small = torch.nn.functional.avg_pool2d(given, 2)
             drawn = mix_shifts(small, logits, planes)
         right = torch.nn.functional.interpolate(drawn, (height, width), mode="bilinear")
-        return replace(super().draw(left), right=right.clamp(0, 1))
+        return replace(super().draw(left, *larger), right=right.clamp(0, 1))
 
 
 class Bench:
