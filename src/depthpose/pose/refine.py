@@ -239,7 +239,7 @@ def _worth(
 def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
     """Mean distance to the best in diameters, where what looks alike is the same."""
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
-    moved_m = (best.inverse() @ poses).apply(own_m.expand(len(poses.R), -1, -1))
+    moved_m = (best.inverse() @ poses).apply(own_m)
     if surface.is_symmetric:
         own_m = surface.points_m[surface.boxes.look_up(moved_m)]
     return (moved_m - own_m).norm(dim=-1).mean(-1) / surface.diameter_m

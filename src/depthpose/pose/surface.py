@@ -165,7 +165,7 @@ def look_along_rays(
 
         rays = (scale, *middle.tolist(), _REACH)
         return compare_rays(cloud_m, poses, surface.points_m[::every], rays, limit_m)
-    posed_m = poses.apply(surface.points_m[::every].expand(len(poses.R), -1, -1))
+    posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]
     posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
     width = 2 * _REACH + 1

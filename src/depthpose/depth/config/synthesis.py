@@ -125,9 +125,10 @@ class SelectionConfig:
             raise InputError(
                 f"least_confidence must be from 0 to below 1, got {self.least_confidence}"
             )
-        if self.scales[:1] != (1.0,) or not all(0 < scale <= 4 for scale in self.scales):
+        if self.scales[:1] != (1.0,) or not all(1 <= scale <= 4 for scale in self.scales):
             raise InputError(
-                f"scales must begin with 1 and be above 0, at most 4; got {self.scales}"
+                "scales must begin with 1, the others from 1 to 4; take (1.0, 1.4), got "
+                f"{self.scales}"
             )
         _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
 

@@ -23,7 +23,7 @@ Logits = Float[Tensor, "b classes rows columns"]
 Planes = Float[Tensor, " planes"]
 
 _NEAR_LIMIT = 0.8
-"""Share of the largest disparity from which an expectation is drawn to the far."""
+"""Share of the largest disparity above which an expectation comes out too small."""
 _SURE_RATIO = 1.15
 """Disparities within this ratio of the answer count as the answer."""
 

@@ -227,6 +227,6 @@ def _near(
     points_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, limit: float
 ) -> Float64[Tensor, "m 3"]:
     """Keep the points within a limit, in diameters, of the surface at one of several poses."""
-    local_m = poses.inverse().apply(points_m.expand(len(poses.R), -1, -1))
+    local_m = poses.inverse().apply(points_m)
     gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
     return points_m[(gap_m < limit * surface.diameter_m).any(0)]
