@@ -40,6 +40,11 @@ _BASELINES = {
     "best constant depth of each row": {"method": "baseline: rows"},
     "nearest training image's depth": {"method": "baseline: nearest"},
 }
+_ONE_IMAGE = {
+    f"one image, {name}, {speed}": {"weights": name, "speed": speed, "input": "left view"}
+    for name in ("default", "kitti-nc")
+    for speed in ("fine", "quick")
+}
 _STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}}
 
 
@@ -98,14 +103,16 @@ TABLES = (
             f"{_TRAIN} "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
             "fine:psmnet-compact quick:psmnet-compact --out OUT/mono",
+            f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives "
+            "--protocol eigen-raw-camera --weights default kitti-nc --speed quick "
+            "--out OUT/mono-quick",
         ),
-        files=("mono/rows.json",),
+        files=("mono/rows.json", "mono-quick/rows.json"),
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
             **_BASELINES,
-            "one image (default)": {"weights": "default", "input": "left view"},
-            "one image (kitti-nc)": {"weights": "kitti-nc", "input": "left view"},
+            **_ONE_IMAGE,
             **{
                 f"real stereo, {name}, {speed}": {"weights": name, "speed": speed}
                 for name in ("default", "kitti-nc", "psmnet-compact")
@@ -121,14 +128,16 @@ TABLES = (
             f"{_EVALUATE}/kitti_raw/2011_09_26/2011_09_26_drive_0052_sync "
             f"--protocol eigen-raw-camera --baseline rows nearest {_TRAIN} "
             "--weights default kitti-nc --out OUT/mono-0052",
+            f"{_EVALUATE}/kitti_raw/2011_09_26/2011_09_26_drive_0052_sync "
+            "--protocol eigen-raw-camera --weights default kitti-nc --speed quick "
+            "--out OUT/mono-0052-quick",
         ),
-        files=("mono-0052/rows.json",),
+        files=("mono-0052/rows.json", "mono-0052-quick/rows.json"),
         numbers={**_DEPTH, **_DELTAS},
         key={"cap": "cap_m"},
         rows={
             **_BASELINES,
-            "one image, default": {"weights": "default"},
-            "one image, kitti-nc": {"weights": "kitti-nc"},
+            **_ONE_IMAGE,
         },
     ),
     Table(
@@ -138,12 +147,13 @@ TABLES = (
             f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
             "--weights default fine:default quick:default kitti-nc fine:kitti-nc quick:kitti-nc "
             "fine:psmnet-compact quick:psmnet-compact --matcher sgbm --out OUT/disparity",
+            f"depthpose depth evaluate --data {_PAIRS}/kitti2015_eval_drives --protocol kitti-2015 "
+            "--weights default kitti-nc --speed quick --out OUT/disparity-quick",
         ),
-        files=("disparity/rows.json",),
+        files=("disparity/rows.json", "disparity-quick/rows.json"),
         numbers={"EPE [px]": "epe_px", "D1": "d1_all"},
         rows={
-            "one image, default": {"weights": "default", "input": "left view"},
-            "one image, kitti-nc": {"weights": "kitti-nc", "input": "left view"},
+            **_ONE_IMAGE,
             **{
                 f"both views, {name}, {speed}": {"weights": name, "speed": speed}
                 for name in ("default", "kitti-nc", "psmnet-compact")

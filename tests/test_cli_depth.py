@@ -685,6 +685,18 @@ def test_an_evaluation_after_a_change_of_its_inputs_is_refused(
     assert f"{calibration}: has changed since its result" in capsys.readouterr().err
 
 
+def test_a_matcher_of_pairs_is_refused_on_frames_without_a_right_view(
+    home: Path, pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(pairs, data, ignore=shutil.ignore_patterns("right"))
+    words = ["depth", "evaluate", "--data", str(data), "--protocol", "kitti-2015"]
+    weights = ["--weights", str(home / "w.safetensors"), f"quick:{home / 'm.safetensors'}"]
+    assert main([*words, *weights, "--out", str(tmp_path / "out")]) == 2
+    assert "m-quick matches both views, and data has no right view" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "w").exists()  # before any work
+
+
 def test_confidence_of_an_earlier_method_does_not_stay(
     home: Path, pairs: Path, tmp_path: Path
 ) -> None:

@@ -40,7 +40,7 @@ def test_doctor_names_what_is_here_and_tries_depth_and_pose(
 def test_weights_without_a_matcher_are_tried_on_one_image(
     plane: int, code: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    net = FakestereoNet(None, make_synthesiser(sure_of(plane)))
+    net = FakestereoNet(None, make_synthesiser(sure_of(plane), speed="quick"))
     monkeypatch.setattr(FakestereoNet, "load", lambda _, **__: net)
     assert main(["doctor"]) == code
     said = capsys.readouterr()

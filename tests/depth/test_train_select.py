@@ -32,7 +32,7 @@ from depthpose.depth.train import (
 )
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining
 from depthpose.depth.train.select import SelectionSample, SelectionSamples
-from depthpose.depth.weights import read_depth_weights, write_depth_weights
+from depthpose.depth.weights import read_depth_weights, read_generator, write_depth_weights
 
 __all__ = ["folder", "held_folder", "pairs"]  # fixtures
 TINY = SelectionConfig(
@@ -197,6 +197,22 @@ def test_held_out_pairs_are_measured_at_the_focal_length_of_the_generator(
     other = dataclasses.replace(config, held_out=dataclasses.replace(held_out, focal_px=200.0))
     with pytest.raises(InputError, match=r"leave held_out\.focal_px out"):
         train_select(other, Run(folder=tmp_path / "other"))
+
+
+def test_pairs_may_be_trained_on_at_another_focal_length(
+    pairs: PairsConfig, tmp_path: Path
+) -> None:
+    crops = AugmentConfig(crop_px=(96, 128), scale=(0.5, 1.0), jitter=0.0)
+    larger = dataclasses.replace(pairs, focal_px=260.0, augment=crops)
+    config = SelectTraining(
+        generator=TINY,
+        with_frozen_stem=False,
+        pairs=larger,
+        loop=dataclasses.replace(LOOP, steps=1),
+    )
+    path = train_select(config, Run(folder=tmp_path))
+    assert "focal_px: 260.0" in (tmp_path / "config.yaml").read_text()
+    assert read_generator(path).config.virtual_focal_px == 130.0
 
 
 def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(

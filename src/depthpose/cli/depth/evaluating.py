@@ -79,7 +79,11 @@ def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) 
 
 
 def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Dataset) -> list[Method]:
-    """Build what is measured on a dataset: SGBM, weights and baselines, in this order."""
+    """Build what is measured on a dataset: SGBM, weights and baselines, in this order.
+
+    Raises:
+        InputError: one needs right views, and the dataset has none.
+    """
     chosen: list[Method] = []
     if options.matcher == "sgbm":
         chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
@@ -87,6 +91,12 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     if options.baseline:
         training = open_training(options.train, options.train_without, dataset)
         chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
+    if all(frame.right is None for frame in dataset.frames):
+        for method in (one for one in chosen if one.with_right):
+            raise InputError(
+                f"{method.name} matches both views, and {dataset.name} has no right view; leave it "
+                "out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
+            )
     return chosen
 
 

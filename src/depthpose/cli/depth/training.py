@@ -33,6 +33,7 @@ class PairsOptions:
             InputError: the stage takes no held-out pairs.
         """
         from depthpose.depth.config import PairsConfig
+        from depthpose.depth.train.config import StereoTraining
 
         pairs = changed(chosen.pairs, folders=self.data or None)
         if not self.held_out:
@@ -42,8 +43,10 @@ class PairsOptions:
                 "--held-out has no meaning for 'adapt', which holds out a share of the pairs "
                 "itself (validation_share in the config); leave it out."
             )
+        # A generator is measured at the focal length of its own rig, whatever it is trained on.
+        focal_px = pairs.focal_px if isinstance(chosen, StereoTraining) else None
         held_out = chosen.held_out or PairsConfig(
-            focal_px=pairs.focal_px, truth=pairs.truth, limit=_LOOKED_AT
+            focal_px=focal_px, truth=pairs.truth, limit=_LOOKED_AT
         )
         held_out = dataclasses.replace(held_out, folders=self.held_out)
         return dataclasses.replace(chosen, pairs=pairs, held_out=held_out)

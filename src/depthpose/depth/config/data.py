@@ -185,7 +185,9 @@ class PairsConfig:
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
 
     focal_px: float | None = None
-    """Bring every pair to this focal length [px]; None: leave sizes as they are."""
+    """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
+    are. Before ``augment.scale``: give the largest focal length that it is to make, and scales up
+    to 1, and no image is enlarged."""
 
     with_cache: bool = False
     """Keep decoded pairs in memory (8 bit): for sets that fit."""

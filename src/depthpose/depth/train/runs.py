@@ -266,27 +266,32 @@ def _at_virtual_focal(
 ) -> _OfGenerator:
     """Bring all pairs, those held out too, to the rig that the generator imitates.
 
-    The generator that selects may see them larger: it answers pixels of the image before it, and
-    these grow with the image. A U-Net works for its own rig only.
+    The generator that selects may be trained on other sizes too, by ``focal_px`` and
+    ``augment.scale``: it answers pixels of the image before it, and these grow with the image. A
+    U-Net works for its own rig only.
 
     Raises:
-        InputError: pairs are to have another focal length or size.
+        InputError: pairs of a U-Net, or pairs held out, are to have another focal length or size.
     """
     focal_px = generator.virtual_focal_px
     sources = ("pairs", "more", "held_out")
     there = {name: found for name in sources if (found := getattr(config, name, None)) is not None}
     for name, pairs in there.items():
+        if isinstance(generator, SelectionConfig) and name != "held_out":
+            continue
         if pairs.focal_px not in (None, focal_px):
             raise InputError(
                 f"{name}.focal_px is {pairs.focal_px}, but the generator imitates a rig of "
                 f"{focal_px} px (virtual_focal_px); leave {name}.focal_px out"
             )
-        if pairs.augment.scale != (1.0, 1.0) and not isinstance(generator, SelectionConfig):
+        if pairs.augment.scale != (1.0, 1.0):
             raise InputError(
                 f"augment.scale of {name} is {pairs.augment.scale}: another size is another focal "
                 "length, and the generator imitates one; leave it out"
             )
-    return replace(config, **{n: replace(p, focal_px=focal_px) for n, p in there.items()})
+    return replace(
+        config, **{n: replace(p, focal_px=p.focal_px or focal_px) for n, p in there.items()}
+    )
 
 
 def _refuse_wrong_gradients(config: StereoTraining) -> None:
