@@ -697,6 +697,17 @@ def test_a_matcher_of_pairs_is_refused_on_frames_without_a_right_view(
     assert not (tmp_path / "out" / "w").exists()  # before any work
 
 
+def test_methods_of_one_name_are_refused(
+    home: Path, pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other").mkdir()
+    other = shutil.copy(home / "m.safetensors", tmp_path / "other")
+    words = ["depth", "evaluate", "--data", str(pairs), "--protocol", "kitti-2015"]
+    weights = ["--weights", str(home / "m.safetensors"), other]
+    assert main([*words, *weights, "--out", str(tmp_path / "out")]) == 2
+    assert "two methods are called 'm'" in capsys.readouterr().err
+
+
 def test_confidence_of_an_earlier_method_does_not_stay(
     home: Path, pairs: Path, tmp_path: Path
 ) -> None:

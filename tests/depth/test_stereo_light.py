@@ -409,3 +409,6 @@ def test_one_network_is_given(tmp_path: Path) -> None:
     path.write_text("light: {width: 8}\nmatcher: {width: 16}\n")
     with pytest.raises(InputError, match="matcher and light are both given, and one network"):
         read_config(path, StereoTraining)
+    path.write_text("with_frozen_stem: false\n")
+    with pytest.raises(InputError, match="encoder of the light network, which PSMNet does not"):
+        read_config(path, StereoTraining)

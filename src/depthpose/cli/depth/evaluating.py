@@ -82,7 +82,7 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     """Build what is measured on a dataset: SGBM, weights and baselines, in this order.
 
     Raises:
-        InputError: one needs right views, and the dataset has none.
+        InputError: two have one name, or one needs right views and the dataset has none.
     """
     chosen: list[Method] = []
     if options.matcher == "sgbm":
@@ -91,6 +91,12 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     if options.baseline:
         training = open_training(options.train, options.train_without, dataset)
         chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
+    names = [method.name for method in chosen]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(
+            f"two methods are called {twice!r}, and their predictions need two folders; name each "
+            "method once, or give files of other names"
+        )
     if all(frame.right is None for frame in dataset.frames):
         for method in (one for one in chosen if one.with_right):
             raise InputError(

@@ -202,6 +202,11 @@ class StereoTraining:
         for name in ("encoder_rate", "sky_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        if self.light is None and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
+            raise InputError(
+                "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
+                "PSMNet does not have; leave them out, or give light"
+            )
         if self.light is not None and self.light.with_sky and self.sky_weight == 0:
             raise InputError(
                 "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "
