@@ -533,7 +533,7 @@ def test_models_come_from_one_source(tmp_path: Path) -> None:
         read_models(ModelsConfig(cad=(file,), parts=("mug",)))
     with pytest.raises(InputError, match=r"flange.stl'\] without models.unit, and no file says"):
         read_models(ModelsConfig(cad=(file,)))
-    with pytest.raises(InputError, match="two CAD files are called 'flange'"):
+    with pytest.raises(InputError, match="two models are called 'flange'"):
         read_models(ModelsConfig(cad=(file, file), unit="mm"))
     four = ModelsConfig(parts=("mug", "spool"), mesh=MeshConfig(keypoints=4))
     assert [len(model.keypoints_m) for model in read_models(four)] == [4, 4]

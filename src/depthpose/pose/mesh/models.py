@@ -4,7 +4,6 @@ What a file declares, or may grow to, is checked before it is read in full.
 """
 
 import json
-import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -22,7 +21,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, cloud_suffixes, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.pose.config import MeshConfig, Unit, metres_of
-from depthpose.pose.mesh.sampling import estimate_normals, farthest_points, sample_surface
+from depthpose.pose.mesh.sampling import (
+    estimate_normals,
+    farthest_points,
+    fibonacci_directions,
+    sample_surface,
+)
 from depthpose.pose.types import ObjectModel, Symmetries
 
 _MOST_TEXT = {".stl": 2**26, ".obj": 2**25, ".ply": 12 * 2**20}
@@ -209,10 +213,7 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
 
 def _farthest_each_way(points: Float64[Tensor, "n 3"]) -> Int64[Tensor, " m"]:
     """Number the points that lie farthest forwards or backwards in evenly spread directions."""
-    k = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
-    z, turn = 1 - k / _DIRECTIONS, k * math.pi * (3 - math.sqrt(5))  # a spiral over half a sphere
-    across = (1 - z.square()).sqrt()
-    directions = torch.stack([across * turn.cos(), across * turn.sin(), z])
+    directions = fibonacci_directions(_DIRECTIONS).T
     found = []
     for some in directions.split(256, dim=1):
         along = points @ some

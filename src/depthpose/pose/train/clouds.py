@@ -16,7 +16,7 @@ from depthpose.pose.cloud import refusal_of, sample_points, voxelise
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.models import models_folder, read_bop_models, read_models_info
-from depthpose.pose.mesh import read_model, with_found_symmetries
+from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
 from depthpose.pose.synthetic import Objects, make_part
 from depthpose.pose.train.config import FramesConfig, ModelsConfig
 from depthpose.pose.types import CloudInput, CloudSample, ObjectModel, PoseTruth, SeenPoints
@@ -276,12 +276,7 @@ def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
         read_model(path, config.unit, number=number, config=config.mesh)
         for number, path in enumerate(config.cad, start=1)
     )
-    names = [model.name for model in models]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(
-            f"two CAD files are called {twice[0]!r}, and an object is known by its name; rename one"
-        )
+    refuse_one_name(models)
     return models
 
 
