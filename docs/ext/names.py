@@ -11,6 +11,7 @@ from sphinx.environment import BuildEnvironment
 from sphinx.util.nodes import make_refnode
 
 HOMES = (
+    (re.compile(r"^(\.\./)?README\.md"), "index.md"),
     (re.compile(r"^(\.\./)?CONTRIBUTING\.md"), "contributing.md"),
     (re.compile(r"^(\.\./)?CHANGELOG\.md"), "changes.md"),
     (re.compile(r"^(\.\./)?src/depthpose/weights(/[\w-]+\.md)?"), "weights.md"),

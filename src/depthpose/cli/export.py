@@ -7,8 +7,8 @@ from typing import Any
 def export_depth(out: Path, weights: str = "default", what: str | None = None) -> int:
     """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
 
-    The graph does all that the estimator does, at any size: one image and its K to metres, sky and
-    the right view; or a pair to disparity and confidence. Its outputs are compared with PyTorch's
+    The graph does all that the estimator does at the quick speed, at any size: one image and its K
+    to metres, sky and the right view; or a pair to disparity and confidence. Its outputs are compared with PyTorch's
     at several sizes and the differences written to NAME.proof.json; beyond the limit nothing is
     written. Needs the extra export.
 

@@ -167,8 +167,8 @@ class MethodOptions:
     """files or names. Weights with a generator are given the left view alone; 'both:NAME' gives
     their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the synthesised one,
     'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the generator, from
-    the matcher on the synthesised view, or from both; 'quick:NAME' and 'fine:NAME' set the speed of
-    matching real pairs."""
+    the matcher on the synthesised view, or from both; 'quick:NAME' and 'fine:NAME' are 'both:NAME'
+    at that speed (for one image, give --speed)."""
     matcher: Literal["sgbm"] | None = None
     """sgbm measures OpenCV's StereoSGBM on both views, and no weights."""
     holes: Literal["fill", "leave"] = "fill"
