@@ -367,10 +367,11 @@ def test_one_broken_image_stops_no_other(
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
     good = str(home / "images" / "0.png")
-    words = (str(broken), good, "--focal-px", "70", "--batch", "2")
-    assert predict(home, tmp_path / "out", *words) == 1
-    assert "broken.png" in capsys.readouterr().err
-    assert (tmp_path / "out" / "0.depth_m.npy").is_file()
+    for out, lens in enumerate((("--focal-px", "70"), ("--camera", str(home / "cam.json")))):
+        words = (str(broken), good, *lens, "--batch", "2")
+        assert predict(home, tmp_path / str(out), *words) == 1
+        assert "broken.png" in capsys.readouterr().err
+        assert (tmp_path / str(out) / "0.depth_m.npy").is_file()
 
 
 def test_one_image_of_another_camera_stops_no_other_of_its_batch(
@@ -393,6 +394,10 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
         (["--focal-px", "0.5"], "not a focal length in pixels"),
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
         (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),
+        (
+            ["--focal-px", "70", "--weights", "default", "--precision", "bf16"],
+            "for a matcher with weights, and none runs here",
+        ),
     ],
 )
 def test_unusable_words_are_refused(

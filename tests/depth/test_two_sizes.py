@@ -12,14 +12,18 @@ from depthpose.depth.config import SelectionConfig, Speed
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import SelectionSynthesiser
 from depthpose.depth.synthesis.selection import Selected, average
+from depthpose.depth.types import StereoInput
+
+
+def two_sizes(plane: int, speed: Speed = "fine") -> FakestereoNet:
+    """A network that says the same disparity of every pixel, whatever the size."""
+    return FakestereoNet(None, SelectionSynthesiser(sure_of(plane), speed=speed))
 
 
 def depth_m(plane: int, speed: Speed, focal_px: float) -> torch.Tensor:
-    """Depth by a network that says the same disparity of every pixel, whatever the size."""
     K = torch.tensor([[focal_px, 0, 95.5], [0, focal_px, 63.5], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(width=192, height=128, K=K)
-    net = FakestereoNet(None, SelectionSynthesiser(sure_of(plane), speed=speed))
-    found = net.estimate(torch.rand(3, 128, 192), camera)
+    found = two_sizes(plane, speed).estimate(torch.rand(3, 128, 192), camera)
     assert found.depth_m is not None
     return found.depth_m
 
@@ -40,14 +44,16 @@ def test_what_both_sizes_say_is_averaged(
     torch.testing.assert_close(depth_m(plane, speed, focal_px), expected, rtol=0.01, atol=0)
 
 
-def test_an_average_keeps_the_confidence_of_the_first() -> None:
-    def seen(disparity_px: float, sky: float, confidence: float) -> Selected:
-        return Selected(*(torch.full((1, 2, 3), v) for v in (disparity_px, sky, confidence)))
+def test_an_average_is_as_sure_as_the_first() -> None:
+    def seen(disparity_px: float, sky: float, sure: float) -> Selected:
+        return Selected(*(torch.full((1, 2, 3), v) for v in (disparity_px, sky, sure)))
 
     found = average([seen(4.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(found.disparity_px, torch.full((1, 2, 3), 6.0))
     torch.testing.assert_close(found.sky, torch.full((1, 2, 3), 0.6))
-    torch.testing.assert_close(found.confidence, torch.full((1, 2, 3), 0.7))
+    torch.testing.assert_close(found.confidence, torch.full((1, 2, 3), 0.6))  # of the sky
+    ground = average([seen(4.0, 0.9, 0.7), seen(9.0, 0.0, 0.2)], [80.0, 40.0])
+    torch.testing.assert_close(ground.confidence, torch.full((1, 2, 3), 0.7 * 0.55))
     alone = average([seen(35.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(alone.disparity_px, torch.full((1, 2, 3), 35.0))
     torch.testing.assert_close(alone.sky, torch.full((1, 2, 3), 0.9))
@@ -57,3 +63,28 @@ def test_an_average_keeps_the_confidence_of_the_first() -> None:
 def test_scales_begin_with_the_size_of_the_training(scales: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="scales must begin with 1"):
         SelectionConfig(scales=scales)
+
+
+@pytest.mark.parametrize(
+    ("size", "focal_px", "sizes"),
+    [
+        ((192, 128), (240.0, 240.0), [(64, 96), (90, 134)]),
+        ((192, 128), (240.0, 150.0), [(102, 96)]),  # 150 px are fewer than 1.4 x 120
+    ],
+)
+def test_a_larger_size_needs_the_pixels_along_both_sides(
+    size: tuple[int, int], focal_px: tuple[float, float], sizes: list[tuple[int, int]]
+) -> None:
+    K = torch.diag(torch.tensor([*focal_px, 1.0], dtype=torch.float64))
+    camera = Camera(width=size[0], height=size[1], K=K)
+    image = StereoInput(name="a", left=torch.rand(3, size[1], size[0]), right=None, camera=camera)
+    assert two_sizes(3).virtual_sizes(image) == sizes
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+def test_an_image_of_other_numbers_is_taken(kind: torch.dtype) -> None:
+    camera = Camera(width=192, height=128, K=torch.diag(torch.tensor([240.0, 240.0, 1.0]).double()))
+    image = StereoInput(name="a", left=torch.rand(3, 128, 192).to(kind), right=None, camera=camera)
+    found = two_sizes(3).estimate_pair(image)
+    assert found.depth_m is not None
+    assert found.depth_m.dtype == torch.float32

@@ -64,11 +64,11 @@ class DepthImageNode(WorkNode):
     def __init__(self) -> None:
         super().__init__(
             "depth_image", weights="default", encoding="32FC1", engine="torch", device="cpu",
-            allow_ood=False,
+            speed="fine", allow_ood=False,
         )  # fmt: skip
         net = FakestereoNet.load(
             self.value("weights"),
-            config=MatcherConfig(device=self.value("device")),
+            config=MatcherConfig(device=self.value("device"), speed=self.value("speed")),
             engine=self.value("engine"),
             allow_ood=self.value("allow_ood"),
         )
@@ -83,10 +83,11 @@ class DepthPairNode(WorkNode):
 
     def __init__(self) -> None:
         super().__init__(
-            "depth_pair", weights="default", encoding="32FC1", device="cpu", slop_s=0.01
-        )
+            "depth_pair", weights="default", encoding="32FC1", device="cpu", speed="fine",
+            slop_s=0.01,
+        )  # fmt: skip
         weights = self.value("weights")
-        config = MatcherConfig(device=self.value("device"))
+        config = MatcherConfig(device=self.value("device"), speed=self.value("speed"))
         net = (
             FakestereoNet.load(matcher="sgbm")
             if weights == "sgbm"

@@ -8,9 +8,9 @@ def export_depth(out: Path, weights: str = "default", what: str | None = None) -
     """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
 
     The graph does all that the estimator does at the quick speed, at any size: one image and its K
-    to metres, sky and the right view; or a pair to disparity and confidence. Its outputs are compared with PyTorch's
-    at several sizes and the differences written to NAME.proof.json; beyond the limit nothing is
-    written. Needs the extra export.
+    to metres, sky and the right view; or a pair to disparity and confidence. Its outputs are
+    compared with PyTorch's at several sizes and the differences written to NAME.proof.json; beyond
+    the limit nothing is written. Needs the extra export.
 
         depthpose export depth --out depth.onnx
         depthpose export depth --weights psmnet.safetensors --out psmnet.onnx

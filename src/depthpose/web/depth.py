@@ -7,7 +7,6 @@ from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
-from depthpose.depth.disparity import focal_size
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.rig import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
@@ -126,13 +125,13 @@ def _range_m(form: Form) -> tuple[float, float]:
 
 def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
     """Refuse what is too large for the networks: a small focal length enlarges an image."""
-    camera = pair.camera
-    assert camera is not None
+    assert pair.camera is not None
+    camera, focal_px = pair.camera, float(pair.camera.K[0, 0])
     rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
     height, width = pair.left.shape[1:]
     sizes = []
     if rig is not None:
-        sizes.append(focal_size(camera, rig.virtual_focal_px))
+        sizes += net.virtual_sizes(pair)
         camera = square_camera(sizes[0], rig.virtual_focal_px)
     if rig is None or rig.answer != "own":
         own = (camera.height, camera.width)
@@ -147,8 +146,8 @@ def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:
         )
     if rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
-            f"a focal length of {float(camera.K[0, 0]):g} px for {camera.width}x{camera.height} "
-            f"pixels would be resized to {columns}x{rows}, more than this page computes; is it in "
+            f"a focal length of {focal_px:g} px for {width}x{height} pixels "
+            f"would be resized to {columns}x{rows}, more than this page computes; is it in "
             f"millimetres? A phone's is about {_PHONE} widths"
         )
 

@@ -60,7 +60,7 @@ def predict(
     if engine.is_ray:
         return _predict_on_ray(images, (camera, focal_px), networks, config, output, out, engine)
     sources = predicting.find_sources(images, Path(out))
-    lens = predicting.read_lens(camera, focal_px, sources[0])
+    lens = predicting.read_lens(camera, focal_px, sources)
     method = methods.weights_method(
         networks.weights,
         config,
@@ -69,6 +69,8 @@ def predict(
         allow_ood=networks.allow_ood,
         answer=networks.answer,
     )
+    if method.settings.get("answer") == "own":
+        matching.refuse_of_networks()
     return predicting.predict_all(sources, lens, method, Path(out), output)
 
 

@@ -131,7 +131,7 @@ def predict(
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, IMAGES)
     with inputs.first() as (image,):
-        lens = read_lens(*given, image)
+        lens = read_lens(*given, [image])
     settings = {
         **spec.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
     }  # fmt: skip

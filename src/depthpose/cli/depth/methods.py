@@ -17,7 +17,7 @@ from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConf
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import Estimator
-from depthpose.depth.stereo import MATCHERS, with_usable_precision
+from depthpose.depth.stereo import MATCHERS, SGBMMatcher, with_usable_precision
 
 
 class Method(NamedTuple):
@@ -80,9 +80,16 @@ def weights_method(
         )
     name = f"{path.stem}-both" if is_shown and not is_matcher else path.stem
     if answer is not None:
-        facts["answer"] = answer
         name += f"-{answer}"
-    return Method(name, net, {**facts, **config_to_dict(config)}, is_shown)
+    settings = {**facts, **_of_one_image(net, is_shown=is_shown), **config_to_dict(config)}
+    return Method(name, net, settings, is_shown)
+
+
+def _of_one_image(net: FakestereoNet, *, is_shown: bool) -> dict[str, Any]:
+    """Say where depth of one image comes from, and in which sizes the image is looked at."""
+    if is_shown or net.synthesiser is None:
+        return {}
+    return {"answer": net.synthesiser.config.answer, "scales": list(net.synthesiser.scales)}
 
 
 def _matched_by(
@@ -94,17 +101,21 @@ def _matched_by(
     allow_ood: bool,
 ) -> Method:
     """Build the network of a generator whose view is matched by OpenCV, or by other weights."""
+    config = replace(config, device=own_device(config.device))
+    settings = config_to_dict(config)
     if matcher == "sgbm":
-        name, other, used = "sgbm", "sgbm", SGBMConfig(with_filled_holes=True)
+        name, sgbm = "sgbm", SGBMConfig(with_filled_holes=True)
+        other, settings = SGBMMatcher(sgbm), {**settings, **config_to_dict(sgbm)}
     else:
         other = find_weights(matcher)
-        name, used = other.stem, replace(config, device=own_device(config.device))
+        name = other.stem
         facts["matcher_sha256"] = file_sha256(other)
     facts["matcher"] += f" with {name}"
     net = FakestereoNet.load(
-        path, matcher=other, config=used, answer="matched", allow_ood=allow_ood
+        path, matcher=other, config=config, answer="matched", allow_ood=allow_ood
     )
-    return Method(f"{path.stem}-{name}", net, {**facts, **config_to_dict(used)}, is_shown)
+    settings = {**facts, **_of_one_image(net, is_shown=is_shown), **settings}
+    return Method(f"{path.stem}-{name}", net, settings, is_shown)
 
 
 def named_method(word: str, config: MatcherConfig) -> Method:

@@ -32,6 +32,18 @@ class MatcherOptions:
     size too, a pair matched at up to 280,000 pixels (PSMNet) or 650,000 (light), for KITTI in about
     3 times the time."""
 
+    def refuse_of_networks(self) -> None:
+        """Refuse what is for a matcher with weights, where none runs.
+
+        Raises:
+            InputError: that is given.
+        """
+        if self.precision != "fp32" or self.max_memory is not None:
+            raise InputError(
+                "--precision and --max-memory are for a matcher with weights, and none runs here; "
+                "leave them out"
+            )
+
     @property
     def config(self) -> MatcherConfig:
         """Settings of the networks.
@@ -123,11 +135,8 @@ class ImageNetworks:
                 f"--answer {self.answer} and --matcher {self.matcher}: another matcher matches the "
                 "synthesised view; omit one."
             )
-        if self.matcher == "sgbm" and matching != MatcherOptions():
-            raise InputError(
-                "--device, --precision, --max-memory and --speed are for matchers with weights; "
-                "sgbm takes none."
-            )
+        if self.matcher == "sgbm":
+            matching.refuse_of_networks()
 
 
 @group
@@ -228,7 +237,9 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
     Raises:
         InputError: that is so.
     """
-    if matching != type(matching)() and all(name.startswith("sgbm:") for name in weights):
+    if weights and all(name.startswith("sgbm:") for name in weights):
+        matching.refuse_of_networks()
+    elif not weights and matching != type(matching)():
         raise InputError(
             "--device, --precision, --max-memory and --speed are for networks, and none is "
             "measured; leave them out"

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -62,8 +63,8 @@ class Lens:
         return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
 
 
-def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
-    """Read what the user knows of the camera; where its file says no size, that of an image.
+def read_lens(camera: Path | None, focal_px: float | None, sources: Sequence[Path]) -> Lens:
+    """Read what the user knows of the camera; where its file says no size, that of the images.
 
     Raises:
         InputError: neither of the two is given, or both.
@@ -75,7 +76,7 @@ def read_lens(camera: Path | None, focal_px: float | None, first: Path) -> Lens:
         )
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
-    read = None if camera is None else read_camera(camera, _size_of(first))
+    read = None if camera is None else read_camera(camera, _first_size(sources))
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
         read = Camera(width=read.width, height=read.height, K=read.K)
@@ -92,8 +93,8 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     found: list[Path] = []
     for word in words:
         found += [Path(word)] if _is_video(Path(word)) else list_images(word)
-    stems = [path.stem for path in found]
-    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    stems = Counter(path.stem for path in found)
+    twice = next((stem for stem, times in stems.items() if times > 1), None)
     if twice is not None:
         raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
     frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in found
@@ -226,6 +227,14 @@ class Predictor:
     def _is_finished(self, name: str) -> bool:
         is_drawn = not self.look.cloud or has_cloud(self.out, name)
         return is_drawn and is_finished(self.out, name)
+
+
+def _first_size(sources: Sequence[Path]) -> tuple[int, int] | None:
+    """Give width and height of the first image that can be read; the others fail by themselves."""
+    for source in sources:
+        with suppress(InputError):
+            return _size_of(source)
+    return None
 
 
 def _size_of(source: Path) -> tuple[int, int]:

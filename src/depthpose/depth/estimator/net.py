@@ -20,7 +20,7 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.disparity import focal_size, resize_image
+from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.far import match_to_infinity
 from depthpose.depth.estimator.inputs import (
     Picture,
@@ -255,12 +255,20 @@ class FakestereoNet:
 
     def _sizes_alone(self, image: StereoInput) -> list[tuple[int, int]] | None:
         """Sizes at which an image is looked at; None for a pair."""
-        return self._virtual_sizes(image) if image.right is None else None
+        return self.virtual_sizes(image) if image.right is None else None
 
-    def _virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
-        """Size at the virtual rig, and those larger ones for which the image has the pixels."""
+    def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
+        """Rows and columns at which one image is looked at.
+
+        The first is its size at the virtual focal length; larger ones follow where the image has
+        the pixels.
+
+        Raises:
+            InputError: there is no generator or no camera, or the focal length would make the image
+                too large.
+        """
         synthesiser, camera = self._usable_alone(image)
-        focal_px, own_px = synthesiser.config.virtual_focal_px, float(camera.K[0, 0])
+        focal_px, own_px = synthesiser.config.virtual_focal_px, smallest_focal_px(camera)
         used = [s for s in synthesiser.scales if s == 1 or s * focal_px <= own_px]
         return [focal_size(camera, scale * focal_px) for scale in used]
 
@@ -268,9 +276,10 @@ class FakestereoNet:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
         synthesiser, _ = self._usable_alone(images[0])
         rig = synthesiser.config
-        sizes = self._virtual_sizes(images[0])
+        sizes = self.virtual_sizes(images[0])
+        given = [image.left.float() for image in images]
         left, *larger = (
-            torch.stack([resize_image(image.left, *size) for image in images]) for size in sizes
+            torch.stack([resize_image(image, *size) for image in given]) for size in sizes
         )
         drawn = synthesiser.draw(left, *larger)
         matches = self._disparities(left, drawn, square_camera(sizes[0], rig.virtual_focal_px))

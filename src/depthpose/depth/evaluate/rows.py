@@ -33,7 +33,7 @@ class Source(Row):
     Attributes:
         method: its name.
         input: which images it was given.
-        speed: of a matcher of real pairs.
+        speed: at which networks ran.
         weights: name of the file.
         weights_sha256: the first 12 digits.
     """
@@ -52,7 +52,7 @@ class MeanRow(Row):
     Attributes:
         method: as in :class:`Source`, like the next four; None: not known.
         input: which images it was given.
-        speed: of a matcher of real pairs.
+        speed: at which networks ran.
         weights: name of the file.
         weights_sha256: the first 12 digits.
         protocol: by which the frames were measured.

@@ -90,13 +90,17 @@ class Selected:
     Attributes:
         disparity_px: the expectation in the logarithm, sky left out.
         sky: probability of the sky.
-        confidence: probability of what lies within 15 % of the disparity; where the sky is
-            likelier than not, the probability of the sky.
+        sure: probability of what lies within 15 % of the disparity, sky left out.
     """
 
     disparity_px: Float[Tensor, "b h w"]
     sky: Float[Tensor, "b h w"]
-    confidence: Float[Tensor, "b h w"]
+    sure: Float[Tensor, "b h w"]
+
+    @property
+    def confidence(self) -> Float[Tensor, "b h w"]:
+        """Probability of what lies within 15 % of the disparity, or of the sky where that is it."""
+        return torch.where(self.is_sky, self.sky, self.sure * (1 - self.sky))
 
     @property
     def shift_px(self) -> Float[Tensor, "b h w"]:
@@ -115,14 +119,14 @@ def select(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
         F.interpolate(part[:, None], size, mode="bilinear", align_corners=False)[:, 0]
         for part in read_logits(logits, planes)
     )
-    return Selected(log_px.exp(), sky, torch.where(sky > 0.5, sky, sure * (1 - sky)))
+    return Selected(log_px.exp(), sky, sure)
 
 
 def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
-    """Give the mean of what was found in one view at several sizes, with the first's confidence.
+    """Give the mean of what was found in one view at several sizes, as sure as the first.
 
-    The means over sizes err less. The confidence of the first, at whose size the network was
-    trained, ranks their errors better than the mean of all (AUSE 0.34 and 0.41 of chance).
+    The means over sizes err less. How sure the first is ranks their errors better than the mean of
+    all (AUSE 0.34 and 0.41 of chance).
 
     Args:
         views: at one size; where the disparity of the first comes near the limit of another, that
@@ -142,7 +146,7 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     return Selected(
         mean([view.disparity_px.log() for view in views]).exp(),
         mean([view.sky for view in views]),
-        first.confidence,
+        first.sure,
     )
 
 
