@@ -31,10 +31,10 @@ def depth_m(plane: int, speed: Speed, focal_px: float) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("plane", "speed", "focal_px", "disparity_px"),
     [
-        (3, "fine", 2 * FOCAL_PX, 4 / math.sqrt(1.4)),  # 4 px in both, so 4 / 1.4 in the larger
-        (3, "quick", 2 * FOCAL_PX, 4.0),
-        (3, "fine", 1.3 * FOCAL_PX, 4.0),  # the larger would have more pixels than the image
-        (4, "fine", 2 * FOCAL_PX, 8.0),  # the larger cannot say more than 8 / 1.4
+        (2, "fine", 2 * FOCAL_PX, 2 / math.sqrt(1.4)),  # 2 px in both, so 2 / 1.4 in the larger
+        (2, "quick", 2 * FOCAL_PX, 2.0),
+        (2, "fine", 1.3 * FOCAL_PX, 2.0),  # the larger would have more pixels than the image
+        (3, "fine", 2 * FOCAL_PX, 4.0),  # the larger cannot say much more: 8 / 1.4 at most
     ],
 )
 def test_what_both_sizes_say_is_averaged(

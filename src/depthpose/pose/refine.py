@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -65,7 +65,7 @@ class Best(NamedTuple):
         start: number of the given pose that it began from.
         scatter: share of all starts that ended at another pose: where many do, the cloud says
             little about which is right.
-        others: the best of those other poses, three at most, roughly refined.
+        others: the best poses beside it, three at most, roughly refined.
     """
 
     refined: Refined
@@ -151,9 +151,11 @@ def refine_best(
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
         refined = refine_pose(points_m, tried[best], surface, short)
-    away = _distances(tried, refined.camera_from_model.double(), surface) > _OTHER
+    found = refined.camera_from_model.double()
+    scatter = float((_distances(tried, found, surface) > _OTHER).double().mean())
+    away = _is_other(tried, found, surface)
     others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
-    return Best(refined, best % len(given.R), float(away.double().mean()), others)
+    return Best(refined, best % len(given.R), scatter, others)
 
 
 def refine_roughly(
@@ -237,12 +239,24 @@ def _worth(
 
 
 def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
-    """Mean distance to the best in diameters, where what looks alike is the same."""
+    """Mean distance to the best in diameters; of symmetric objects, to its nearest points.
+
+    Nearest points of many a symmetric object lie close at quite another pose: a share of starts by
+    this measure is what the risk was calibrated on, and :func:`_is_other` tells poses apart.
+    """
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
     moved_m = (best.inverse() @ poses).apply(own_m)
-    if surface.is_symmetric:
+    if len(surface.copies.R) > 1:
         own_m = surface.points_m[surface.boxes.look_up(moved_m)]
     return (moved_m - own_m).norm(dim=-1).mean(-1) / surface.diameter_m
+
+
+def _is_other(poses: Rigid, best: Rigid, surface: Surface) -> Bool[Tensor, " b"]:
+    """Whether poses carry the object elsewhere than the best does, by any of its symmetries."""
+    own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
+    moved_m = (best.inverse() @ poses).apply(own_m)
+    gap_m = (moved_m[:, None] - surface.copies.apply(own_m)).norm(dim=-1).mean(-1)
+    return gap_m.amin(-1) > _OTHER * surface.diameter_m
 
 
 def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> Rigid:
@@ -251,8 +265,7 @@ def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> R
     for k in worth.argsort(descending=True).tolist():
         if len(chosen) == _MOST_OTHERS or worth[k] == -torch.inf:
             break
-        if all(float(_distances(poses[[k]], poses[c], surface)) > _OTHER
-               for c in chosen):  # fmt: skip
+        if all(bool(_is_other(poses[[k]], poses[c], surface)) for c in chosen):
             chosen.append(k)
     return poses[chosen]
 

@@ -12,12 +12,14 @@ from torch.nn.functional import max_pool2d
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import serves
-from depthpose.pose.mesh import sample_surface
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.sampling import fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
 """Of the diameter: a point of the cloud within this distance lies on the posed surface."""
+_TURN_STEP = 0.1
+"""Half of the step between the turns about a continuous axis [rad]."""
 _CELL = 1 / 24
 """Side of a ray's cell at the object, in diameters: several samples of the surface in each."""
 _REACH = 72
@@ -66,7 +68,7 @@ class Surface:
         points_m: of the surface, in the model frame.
         normals: theirs; their side does not matter.
         diameter_m: of the object.
-        is_symmetric: whether several poses of it look alike.
+        copies: what leaves the object as it is, ``model_from_model``, the identity first.
         tree: finds the nearest of the points.
         boxes: find it nearly, some thirty times as fast.
     """
@@ -74,7 +76,7 @@ class Surface:
     points_m: Float64[Tensor, "m 3"]
     normals: Float64[Tensor, "m 3"]
     diameter_m: float
-    is_symmetric: bool
+    copies: Rigid
     tree: KDTree
     boxes: Boxes
 
@@ -127,7 +129,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         points_m=points_m,
         normals=normals,
         diameter_m=model.diameter_m,
-        is_symmetric=not model.symmetries.is_none,
+        copies=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
         tree=tree,
         boxes=_boxes_about(points_m, model.diameter_m, tree),
     )

@@ -76,7 +76,7 @@ def _found_alone(given: CloudInput | ViewInput, target: _Target) -> tuple[ViewIn
     assert isinstance(given, ViewInput)
     answers = target.net.find_in(given, [target.model.name])
     if not answers:
-        return given, nothing_found(given.name, target.model.name)
+        return given, nothing_found(given, target.model.name)
     best = replace(answers[0], name=given.name)
     assert best.camera_from_model is not None
     mask = explained_mask(given, best.camera_from_model, target.model)

@@ -53,7 +53,7 @@ def predict(
     from depthpose.cli.pose.inputs import object_named
     from depthpose.cli.pose.methods import source_of
 
-    refuse_mixture(inputs, dataset.bop)
+    refuse_mixture(inputs, dataset)
     config = estimates.config
     bop = None if dataset.bop is None else (dataset.bop, dataset.split)
     source = source_of(weights, register, inputs.unit, bop, config)

@@ -50,9 +50,9 @@ def find_all(
     _refuse_numbered(jobs)
     facts = camera_facts(camera) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
-    claim(out, settings, jobs, depth)
+    claim(out, settings, jobs, depth, is_result_of)
     found = _find_left(jobs, objects, method, out)
-    claim(out, settings, [job for _, job in found], depth)
+    claim(out, settings, [job for _, job in found], depth, is_result_of)
     return _write(found, method, out)
 
 
@@ -112,7 +112,7 @@ def _find(
     if isinstance(view, Unreadable):
         yield Prediction(estimate=unread(view)), job
         return
-    for one in method.find(view, objects) or [nothing_found(view.name, ", ".join(objects))]:
+    for one in method.find(view, objects) or [nothing_found(view, ", ".join(objects))]:
         yield Prediction(estimate=one), explained_job(job, one, method)
 
 

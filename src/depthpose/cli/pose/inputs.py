@@ -93,10 +93,11 @@ def view_jobs(
         raise InputError(
             f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
-    return [
+    jobs = [
         _file_job(p, object, view_input, masks[p.stem], camera, object, p.stem, unit)
         for p in depths
     ]
+    return [replace(job, source=(p, masks[p.stem])) for job, p in zip(jobs, depths, strict=True)]
 
 
 def frame_jobs(
@@ -179,7 +180,7 @@ def input_job(
     object: str,
     read: Any,  # noqa: ANN401  any reader
     place: Place | None = None,
-    source: Path | None = None,
+    source: Path | tuple[Path, ...] | None = None,
 ) -> Job[Any]:
     """Take one input; one that cannot be read stops no other."""
     return _safe(Job(name=name, read=read, place=place, source=source), object)

@@ -97,21 +97,26 @@ class RegisterOptions:
     """of the CAD files; as --unit by default."""
 
 
-def refuse_mixture(given: OneObjectOptions, bop: Path | None) -> None:
+def refuse_mixture(given: OneObjectOptions, dataset: DataSetOptions) -> None:
     """Refuse none of the three kinds of input, or several, and options of another kind.
 
     Raises:
         InputError: which, and the rule.
     """
-    count = sum(word is not None for word in (given.cloud, given.depth, bop))
+    count = sum(word is not None for word in (given.cloud, given.depth, dataset.bop))
     if count != 1:
         raise InputError(
             f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
             "with --mask and --camera, or a data set"
         )
     beside = {"mask": given.mask, "camera": given.camera}
-    if bop is not None:
+    if dataset.bop is not None:
         refuse_beside("--bop", {**beside, "unit": given.unit})
+    elif dataset != DataSetOptions():
+        raise InputError(
+            "--split and --masks are of a data set, and --bop names none; the mask of a depth "
+            "image is given by --mask"
+        )
     elif given.cloud is not None:
         refuse_beside("--cloud", beside)
 

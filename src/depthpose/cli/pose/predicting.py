@@ -1,10 +1,11 @@
 """The work behind ``depthpose pose predict``."""
 
+import operator
 import re
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,13 +54,27 @@ from depthpose.report.viewer import Viewer, open_viewer
 PAGE = "report.html"
 _MOST_SHOWN = 20
 """Of the answers, on the terminal; poses.json holds all."""
-_FRAME = "camera_from_model: x right, y down, z forward; risk: the chance that a pose is wrong"
+_FRAME = """camera_from_model: x right, y down, z forward
+certainty: the chance that the pose is right; risk: that neither it nor an alternative is"""
 _SAID = 5
 """Of so many inputs the alternatives are printed; of all they are in poses.json."""
 
 
-def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Path) -> None:
+def claim(
+    out: Path,
+    settings: dict[str, Any],
+    jobs: list[Job[Any]],
+    source: Path,
+    is_result: Callable[[str, str], bool] = operator.eq,
+) -> None:
     """Claim a folder for the poses of clouds or depth images.
+
+    Args:
+        out: the folder.
+        settings: that decide the results.
+        jobs: inputs.
+        source: of those that name none.
+        is_result: whether a result of the first name is of the input of the second.
 
     Raises:
         InputError: it is another run's, or holds a file of somebody else that would be written
@@ -70,7 +85,7 @@ def claim(out: Path, settings: dict[str, Any], jobs: list[Job[Any]], source: Pat
     done = _finished(out)
     sources = {job.name: job.source or source for job in jobs}
     claim_names(
-        out, sources, endings, is_finished=lambda name: any(is_result_of(n, name) for n in done)
+        out, sources, endings, is_finished=lambda name: any(is_result(n, name) for n in done)
     )
 
 
@@ -150,7 +165,8 @@ def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
         quaternion = Rotation.from_matrix(pose.R.double().numpy()).as_quat()
         row |= {"x, y, z [m]": numbers_text(pose.t_m.tolist())}
         row |= {"qx, qy, qz, qw": numbers_text(quaternion.tolist())}
-    row |= {"risk": None if estimate.risk is None else f"{estimate.risk:.3f}"}
+    for name, chance in (("certainty", estimate.certainty), ("risk", estimate.risk)):
+        row[name] = None if chance is None else f"{chance:.3f}"
     return row if estimate.tracking is None else row | {"tracking": estimate.tracking}
 
 

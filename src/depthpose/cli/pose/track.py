@@ -19,7 +19,7 @@ class SequenceOptions:
     """of the depth images; a JSON file, as for 'pose predict'."""
     cloud: Path | None = None
     """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of what is
-    about it too. A lost object is found in clouds of it alone."""
+    about it too. It is found, at first and when it is lost, in clouds of it alone."""
     bop: Path | None = None
     """folder of a data set in BOP's layout; every object of each scene is followed that the weights
     know (with --method register: that has a model there), or --object alone."""

@@ -260,7 +260,7 @@ class PoseEstimator(ABC):
         found = self.find_in(given, [object])
         if found:
             return found[0]
-        return nothing_found(given.name, object, time.perf_counter() - began)
+        return nothing_found(given, object, time.perf_counter() - began)
 
     def _object(self, name: str | None) -> str:
         if name is None and len(self._numbers) == 1:

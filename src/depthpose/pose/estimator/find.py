@@ -21,8 +21,9 @@ _SMALLEST, _LARGEST = 0.25, 1.25
 """Shares of an object's diameter between which the extent of a region may lie."""
 _AREA = 0.3
 """A region of less than this share of an object's smallest silhouette leaves most of it unseen."""
-_TOGETHER = 1.1
-"""Two regions may be parts of one object where together they are no longer than this."""
+_TOGETHER = 1.25
+"""Two regions may be parts of one object where together they are no longer than this: the length
+of a bent thing, measured from its median, comes out too long."""
 _MOST_PAIRS = 20
 _FRAGMENT = 0.03
 """A region of fewer points than this share of another adds nothing to it."""
@@ -99,7 +100,8 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
 
     Regions are tried for every object whose size they may have; so are their pieces beside narrow
     necks, pairs of them that may be parts of one object, and parts of one that is too long. Where
-    several objects answer they share the probability of one by the evidence against each. What an
+    several objects answer they share the probability of one by the evidence against each, and where
+    none has most of it none is answered. What an
     answer leaves unexplained of its region is tried once more. An answer is left out through whose
     surface the camera saw, or that lies behind a plane that was seen, or that explains not quite
     all of its region; of answers that explain the same points the best stays.
@@ -120,18 +122,27 @@ def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
              if len(cloud) >= max(_LEAST_POINTS, _REST * len(answer.points_m))]  # fmt: skip
     answers += _estimate_regions(again, scene, known)
     kept = _without_overlap([a for a in answers if a.is_whole], known)
+    kept = [answer for answer in kept if answer.share >= _ONE]  # the others may be another object
     return [replace(a.estimate, name=f"{view.name}_{k}") for k, a in enumerate(kept)]
 
 
-def nothing_found(name: str, object: str, spent_s: float = 0.0) -> PoseEstimate:
+def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEstimate:
     """Say that a depth image shows no object, or none of several, surely."""
+    read_m = view.depth_m[view.mask & (view.depth_m > 0)]
+    spent = {"check": spent_s}
+    if len(read_m) == 0:
+        reason = "the depth image has no reading at all: every pixel is 0 or NaN"
+        return PoseEstimate(
+            name=view.name, object=object, status="too few points", reason=reason, seconds=spent
+        )
     return PoseEstimate(
-        name=name,
+        name=view.name,
         object=object,
         status="doubtful",
-        reason=f"nothing beside the planes of the image is surely {object}; give a mask, or look "
-        "from nearer by",
-        seconds={"check": spent_s},
+        reason=f"nothing beside the planes of the image is surely {object}; its depths are "
+        f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "
+        "mask, or look from nearer by",
+        seconds=spent,
     )
 
 
@@ -230,7 +241,8 @@ def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEst
     share, estimate = float(shares[number]), some[number]
     certainty = None if estimate.certainty is None else share * estimate.certainty
     others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
-    return replace(estimate, certainty=certainty, alternatives=others), share
+    risk = None if estimate.risk is None else 1 - share * (1 - estimate.risk)
+    return replace(estimate, certainty=certainty, risk=risk, alternatives=others), share
 
 
 def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: SearchTargets) -> _Answer:

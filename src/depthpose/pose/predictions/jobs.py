@@ -36,14 +36,14 @@ class Job(Generic[Input]):
         read: gives the input; called only where the estimate is not there yet.
         place: as :class:`Prediction` has it.
         seconds: what was spent before, on its mask.
-        source: file that the input is read from.
+        source: file or files that the input is read from.
     """
 
     name: str
     read: Callable[[], Input]
     place: Place | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
-    source: Path | None = None
+    source: Path | tuple[Path, ...] | None = None
 
 
 def predict(
