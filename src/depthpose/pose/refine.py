@@ -153,8 +153,8 @@ def refine_best(
         refined = refine_pose(points_m, tried[best], surface, short)
     found = refined.camera_from_model.double()
     scatter = float((_distances(tried, found, surface) > _OTHER).double().mean())
-    away = _is_other(tried, found, surface)
-    others = _distinct(tried, worth.masked_fill(~away, -torch.inf), surface)
+    worth = worth.masked_fill(~_is_other(tried, found, surface), -torch.inf)
+    others = _distinct(tried, worth, surface)
     return Best(refined, best % len(given.R), scatter, others)
 
 
@@ -239,11 +239,8 @@ def _worth(
 
 
 def _distances(poses: Rigid, best: Rigid, surface: Surface) -> Float64[Tensor, " b"]:
-    """Mean distance to the best in diameters; of symmetric objects, to its nearest points.
-
-    Nearest points of many a symmetric object lie close at quite another pose: a share of starts by
-    this measure is what the risk was calibrated on, and :func:`_is_other` tells poses apart.
-    """
+    """Mean distance to the best in diameters, of symmetric objects to its nearest points."""
+    # The risk was calibrated on it. It can be small at another pose: _is_other tells.
     own_m = surface.points_m[:: max(1, len(surface.points_m) // 100)]
     moved_m = (best.inverse() @ poses).apply(own_m)
     if len(surface.copies.R) > 1:
