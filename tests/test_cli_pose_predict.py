@@ -249,6 +249,24 @@ def frames(folder: Path) -> list[str]:
     return [*words, "--camera", str(folder / "camera.json"), "--object", "bracket"]
 
 
+def test_a_changed_mask_is_noticed(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights)]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    shutil.copy(tmp_path / "mask" / "seen.png", tmp_path / "mask" / "hidden.png")
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert "hidden.png: has changed since its result 'hidden'" in capsys.readouterr().err
+
+
+def test_masks_of_a_data_set_are_refused_beside_a_depth_image(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--masks", "m.png"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert "--split and --masks are of a data set" in capsys.readouterr().err
+
+
 def test_a_search_without_masks_registers_nothing(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,10 +20,11 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.estimator.find import nothing_found
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.metrics import add_m
 from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_necks
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
@@ -217,3 +218,28 @@ def test_two_objects_that_look_alike_are_named_and_refused() -> None:
     found = net.estimate(cloud=cloud_of(bracket(), truth))
     assert found.status == "doubtful"
     assert found.reason == "it may be bracket (50%), twin (50%); say which by object"
+    two = Oracle(tiny_weights(bracket(), twin, refusal=REFUSAL), TRUTHS)
+    assert two.find(table(), CAMERA) == [], "without a mask neither is answered"
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "status", "said"),
+    [
+        (torch.nan, "too few points", "no reading at all: every pixel is 0 or NaN"),
+        (800.0, "doubtful", "its depths are 800 to 800 m: if they are right"),
+    ],
+)
+def test_an_image_in_which_nothing_is_found_says_what_it_shows(
+    depth_m: float, status: str, said: str
+) -> None:
+    view = ViewInput(
+        name="a",
+        depth_m=torch.full((24, 32), depth_m),
+        mask=torch.ones(24, 32).bool(),
+        K=K.float(),
+        object="bracket",
+    )
+    found = nothing_found(view, "bracket")
+    assert found.status == status
+    assert found.reason is not None
+    assert said in found.reason

@@ -13,10 +13,13 @@ from depthpose.core.rigid import Rigid, geodesic_rad, perturb
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.mesh import make_model, sample_surface
+from depthpose.pose.mesh.symmetry import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.refine import refine_best, refine_pose
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, Symmetries
+
+ORIGIN = torch.zeros(3).double()
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +140,30 @@ def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
     best = refine_best(face, batch, prepare_surface(plate))
     assert best.start == 1
     assert float(((best.refined.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
+
+
+def test_another_pose_of_a_symmetric_part_is_kept() -> None:
+    """A U of which one corner is seen: its leg and its bar may be exchanged."""
+    parts = [((100, 20, 20), (0, 0, 0)), ((20, 70, 20), (40, 45, 0)), ((20, 70, 20), (-40, 45, 0))]
+    boxes = [trimesh.creation.box(size).apply_translation(at) for size, at in parts]
+    mesh = trimesh.util.concatenate(boxes)
+    assert isinstance(mesh, trimesh.Trimesh)
+    half_turn = Rigid(torch.diag(torch.tensor([-1.0, 1.0, -1.0])).double()[None], ORIGIN[None])
+    vertices = torch.from_numpy(np.array(mesh.vertices)) / 1000
+    symmetries = Symmetries(discrete=half_turn)
+    faces = torch.from_numpy(np.array(mesh.faces))
+    model = make_model(vertices, faces, name="u", symmetries=symmetries)
+    corner_m = torch.tensor([-0.05, -0.01, 0.0]).double()
+    about = turn_about(torch.tensor([1.0, 1.0, 0.0]).double(), corner_m, torch.tensor(math.pi))
+    swapped = TRUE @ about
+    points_m = sample_surface(model, 4000)[0].double()
+    seen_m = points_m[(points_m[:, 0] < 0.01) & (points_m[:, 1] < 0.05)]
+    found = refine_best(TRUE.apply(seen_m), Rigid.stack([TRUE, swapped]), prepare_surface(model))
+    best = found.refined.camera_from_model.double()
+    other = swapped if float(geodesic_rad(best.R, TRUE.R)) < 0.1 else TRUE
+    copies = [other, other @ half_turn[0]]
+    gaps_m = [float(add_m(p, c, vertices)) for p in found.others for c in copies]
+    assert min(gaps_m) < 0.05 * model.diameter_m
 
 
 def test_what_a_start_won_is_not_lost_on_the_way() -> None:

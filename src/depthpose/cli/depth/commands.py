@@ -70,7 +70,7 @@ def predict(
         answer=networks.answer,
     )
     if method.settings.get("answer") == "own":
-        matching.refuse_of_networks()
+        matching.refuse_matcher_options()
     return predicting.predict_all(sources, lens, method, Path(out), output)
 
 

@@ -88,21 +88,21 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     if options.matcher == "sgbm":
         chosen.append(sgbm_method(with_filled_holes=options.holes == "fill"))
     chosen += [named_method(name, config) for name in options.weights]
-    if options.baseline:
-        training = open_training(options.train, options.train_without, dataset)
-        chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
     names = [method.name for method in chosen]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(
             f"two methods are called {twice!r}, and their predictions need two folders; name each "
             "method once, or give files of other names"
         )
-    if all(frame.right is None for frame in dataset.frames):
-        for method in (one for one in chosen if one.with_right):
-            raise InputError(
-                f"{method.name} matches both views, and {dataset.name} has no right view; leave it "
-                "out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
-            )
+    has_right = any(frame.right is not None for frame in dataset.frames)
+    if not has_right and (matching := next((one for one in chosen if one.with_right), None)):
+        raise InputError(
+            f"{matching.name} matches both views, and {dataset.name} has no right view; leave it "
+            "out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
+        )
+    if options.baseline:
+        training = open_training(options.train, options.train_without, dataset)
+        chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
 
 

@@ -32,7 +32,7 @@ class MatcherOptions:
     size too, a pair matched at up to 280,000 pixels (PSMNet) or 650,000 (light), for KITTI in about
     3 times the time."""
 
-    def refuse_of_networks(self) -> None:
+    def refuse_matcher_options(self) -> None:
         """Refuse what is for a matcher with weights, where none runs.
 
         Raises:
@@ -136,7 +136,7 @@ class ImageNetworks:
                 "synthesised view; omit one."
             )
         if self.matcher == "sgbm":
-            matching.refuse_of_networks()
+            matching.refuse_matcher_options()
 
 
 @group
@@ -238,7 +238,7 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
         InputError: that is so.
     """
     if weights and all(name.startswith("sgbm:") for name in weights):
-        matching.refuse_of_networks()
+        matching.refuse_matcher_options()
     elif not weights and matching != type(matching)():
         raise InputError(
             "--device, --precision, --max-memory and --speed are for networks, and none is "

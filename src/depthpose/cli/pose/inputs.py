@@ -93,11 +93,12 @@ def view_jobs(
         raise InputError(
             f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
-    jobs = [
-        _file_job(p, object, view_input, masks[p.stem], camera, object, p.stem, unit)
-        for p in depths
-    ]
-    return [replace(job, source=(p, masks[p.stem])) for job, p in zip(jobs, depths, strict=True)]
+    pairs = [(path, masks[path.stem]) for path in depths]
+    return [
+        input_job(p.stem, object, partial(view_input, p, m, camera, object, p.stem, unit),
+                  source=(p, m))
+        for p, m in pairs
+    ]  # fmt: skip
 
 
 def frame_jobs(

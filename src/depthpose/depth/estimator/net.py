@@ -19,7 +19,7 @@ from depthpose.core.camera import (
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
+from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.far import match_to_infinity
 from depthpose.depth.estimator.inputs import (
@@ -31,6 +31,7 @@ from depthpose.depth.estimator.inputs import (
     usable_right,
 )
 from depthpose.depth.estimator.rig import (
+    check_distribution,
     choose_matcher,
     from_pair,
     from_virtual,
@@ -253,10 +254,6 @@ class FakestereoNet:
             found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
         return found
 
-    def _sizes_alone(self, image: StereoInput) -> list[tuple[int, int]] | None:
-        """Sizes at which an image is looked at; None for a pair."""
-        return self.virtual_sizes(image) if image.right is None else None
-
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Rows and columns at which one image is looked at.
 
@@ -271,6 +268,10 @@ class FakestereoNet:
         focal_px, own_px = synthesiser.config.virtual_focal_px, smallest_focal_px(camera)
         used = [s for s in synthesiser.scales if s == 1 or s * focal_px <= own_px]
         return [focal_size(camera, scale * focal_px) for scale in used]
+
+    def _sizes_alone(self, image: StereoInput) -> list[tuple[int, int]] | None:
+        """Sizes at which an image is looked at; None for a pair."""
+        return self.virtual_sizes(image) if image.right is None else None
 
     def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
         """Bring images to the virtual rig, draw their right views, match, and come back."""
@@ -290,28 +291,11 @@ class FakestereoNet:
             return found
         known = [float(confidence.mean()) for confidence in drawn.confidence]
         return [
-            self._check_distribution(image.name, replace(one, image_confidence=image_confidence))
-            for image, one, image_confidence in zip(images, found, known, strict=True)
-        ]
-
-    def _check_distribution(self, name: str, found: DepthEstimate) -> DepthEstimate:
-        """Refuse an image that is unlike what the weights know, or warn of it."""
-        assert self.synthesiser is not None, "checked before"
-        assert found.image_confidence is not None
-        rig = self.synthesiser.config
-        least = rig.least_confidence if isinstance(rig, SelectionConfig) else 0.0
-        if found.image_confidence >= least:
-            return found
-        said = (
-            f"out of distribution for these weights (mean confidence {found.image_confidence:.2f}, "
-            f"below {least:.2f}), so its depth is a guess"
-        )
-        if not self.allow_ood:
-            raise InputError(
-                f"{name}: {said}. Check that it is upright and that the focal length is its own; "
-                "--allow-ood (in Python, allow_ood=True) answers it all the same."
+            check_distribution(
+                image.name, replace(one, image_confidence=mean), rig, allow_ood=self.allow_ood
             )
-        return replace(found, warning=said)
+            for image, one, mean in zip(images, found, known, strict=True)
+        ]
 
     def _disparities(
         self, left: Float[Tensor, "b 3 h w"], drawn: SynthesisedViews, camera: Camera

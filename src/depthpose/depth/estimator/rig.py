@@ -129,6 +129,36 @@ def set_answer(found: DepthWeights | None, answer: Answer) -> None:
         )
 
 
+def check_distribution(
+    name: str, found: DepthEstimate, config: GeneratorConfig | SelectionConfig, *, allow_ood: bool
+) -> DepthEstimate:
+    """Refuse an image that is unlike what the weights know, or warn of it.
+
+    Args:
+        name: of the image, for the error.
+        found: its estimate, with the mean confidence of the image (0..1).
+        config: of the generator, with the least of it.
+        allow_ood: add a ``warning`` in place of refusing.
+
+    Raises:
+        InputError: the image is such, and that is not allowed.
+    """
+    assert found.image_confidence is not None
+    least = config.least_confidence if isinstance(config, SelectionConfig) else 0.0
+    if found.image_confidence >= least:
+        return found
+    said = (
+        f"out of distribution for these weights (mean confidence {found.image_confidence:.2f}, "
+        f"below {least:.2f}), so its depth is a guess"
+    )
+    if not allow_ood:
+        raise InputError(
+            f"{name}: {said}. Check that it is upright and that the focal length is its own; "
+            "--allow-ood (in Python, allow_ood=True) answers it all the same."
+        )
+    return replace(found, warning=said)
+
+
 def choose_matcher(
     weights: str | Path | None,
     found: DepthWeights | None,

@@ -13,6 +13,7 @@ from depthpose.core.camera import back_project, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.estimator.alternatives import share_out
+from depthpose.pose.estimator.prepare import nothing_seen
 from depthpose.pose.regions import extent_m, find_regions, part_cloud
 from depthpose.pose.surface import NEAR, Surface, prepare_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
@@ -131,9 +132,12 @@ def nothing_found(view: ViewInput, object: str, spent_s: float = 0.0) -> PoseEst
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
     spent = {"check": spent_s}
     if len(read_m) == 0:
-        reason = "the depth image has no reading at all: every pixel is 0 or NaN"
         return PoseEstimate(
-            name=view.name, object=object, status="too few points", reason=reason, seconds=spent
+            name=view.name,
+            object=object,
+            status="too few points",
+            reason=nothing_seen(view),
+            seconds=spent,
         )
     return PoseEstimate(
         name=view.name,

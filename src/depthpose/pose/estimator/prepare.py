@@ -98,7 +98,7 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
     if isinstance(given, ViewInput):
         points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
         if len(points_m) == 0:
-            return Refusal(status="too few points", reason=_nothing_seen(given))
+            return Refusal(status="too few points", reason=nothing_seen(given))
     else:
         points_m = given.points_m.float()
     # Some sensors write the largest float where they have no reading; NaN is not below either.
@@ -112,7 +112,8 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
     return read_m
 
 
-def _nothing_seen(view: ViewInput) -> str:
+def nothing_seen(view: ViewInput) -> str:
+    """Say why no masked pixel of a view has a depth."""
     masked = int(view.mask.sum())
     if masked == 0:
         return "the mask is empty: no pixel of it is the object"
