@@ -110,6 +110,29 @@ def test_the_motion_goes_on_as_it_was() -> None:
     assert next(oracle(poses).track(frames[6:], CAMERA, first=poses[5])).tracking == "found"
 
 
+def test_what_rests_on_a_table_does_not_wander_over_it() -> None:
+    """The table's points lie around the part, as near to its surface as those of the part."""
+    up = torch.tensor([0.0, -0.6, -0.8])
+    table_m = -0.56
+    lying = rotation_by(torch.tensor([math.pi - math.atan2(0.6, 0.8), 0.0, 0.0]))
+    poses = []
+    for k in range(8):
+        R = rotation_by(math.radians(4 * k) * up) @ lying
+        t_m = torch.tensor([-0.03 + 0.008 * k, 0.0, 0.7])
+        lowest_m = ((bracket().vertices_m @ R.mT + t_m) @ up).min()
+        poses.append(Rigid(R, t_m + (table_m - lowest_m) * up))
+    rays = back_project(torch.ones(240, 320).double(), K).float()
+    frames = []
+    for k, pose in enumerate(poses):
+        seen, mask = view_of(bracket(), pose)
+        depth_m = torch.where(mask, seen.float(), table_m / (rays @ up))
+        noise = torch.randn(240, 320, generator=torch.Generator().manual_seed(k))
+        frames.append(depth_m + 0.001 * noise)
+    found = list(oracle([]).track(frames, CAMERA, first=poses[0]))
+    assert [e.tracking for e in found] == ["tracked"] * 8
+    assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.003
+
+
 def test_a_cloud_of_the_scene_is_followed_too() -> None:
     poses = moving(3)
     clouds = [back_project(frame(p, k).double(), K).reshape(-1, 3) for k, p in enumerate(poses)]

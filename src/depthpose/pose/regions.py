@@ -39,6 +39,10 @@ _ALIKE = 0.8
 """Intersection over union of pieces that are one."""
 
 
+Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
+"""Unit normal, and the distance [m] of the origin along it."""
+
+
 class Regions(NamedTuple):
     """What is left of a depth image without its planes.
 
@@ -75,10 +79,10 @@ def find_regions(
     least = _LEAST_SHARE * int(is_left.sum())
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
-        plane = _largest_plane(points_m[is_searched], generator)
+        plane = largest_plane(points_m[is_searched], generator)
         if plane is None:
             break
-        near = _is_on(points_m, plane) & is_left
+        near = is_on_plane(points_m, plane) & is_left
         if int((near & is_searched).sum()) < least:
             break
         piece = _largest_piece(depth_m, near)
@@ -203,10 +207,13 @@ def _beside(grid: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def _largest_plane(
-    points_m: Float64[Tensor, "n 3"], generator: torch.Generator
-) -> tuple[Tensor, Tensor] | None:
-    """Give normal and offset of the plane that most points lie on."""
+def largest_plane(points_m: Float64[Tensor, "n 3"], generator: torch.Generator) -> Plane | None:
+    """Give the plane that most points lie on; None for fewer than 60 points.
+
+    Args:
+        points_m: in the camera frame.
+        generator: of the hypotheses of RANSAC.
+    """
     some = take_evenly(points_m, _SAMPLE)
     if len(some) < _LEAST_PIXELS:
         return None
@@ -220,7 +227,7 @@ def _largest_plane(
     best = int(on.sum(0).argmax())
     plane = (normal[best], offset[best])
     for _ in range(3):
-        near = some[_is_on(some, plane)]
+        near = some[is_on_plane(some, plane)]
         if len(near) < 3:
             return None
         middle = near.mean(0)
@@ -233,7 +240,13 @@ def _tolerance_m(points_m: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*bat
     return _TOLERANCE_M + _TOLERANCE_PER_M * points_m[..., 2].square()
 
 
-def _is_on(points_m: Tensor, plane: tuple[Tensor, Tensor]) -> Tensor:
+def is_on_plane(points_m: Float64[Tensor, "*batch 3"], plane: Plane) -> Bool[Tensor, "*batch"]:
+    """Whether points lie on a plane, as far as a depth sensor measures it.
+
+    Args:
+        points_m: in the camera frame.
+        plane: as :func:`largest_plane` gives it.
+    """
     normal, offset = plane
     return (points_m @ normal - offset).abs() < _tolerance_m(points_m)
 

@@ -7,15 +7,18 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float64
+import torch
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import IcpConfig, RefusalConfig
 from depthpose.pose.estimator.evidence import observability, surface_signals, without_motions
 from depthpose.pose.estimator.prepare import AnyInput, Refusal
 from depthpose.pose.estimator.scene import MARGIN, scene_about
 from depthpose.pose.refine import Refined, refine_best
+from depthpose.pose.regions import is_on_plane, largest_plane
 from depthpose.pose.surface import NEAR, Surface, compare_depths
 from depthpose.pose.types import Alternative, CloudInput, ObjectModel, PoseEstimate
 from depthpose.pose.voting import free_motions
@@ -25,6 +28,12 @@ _THROUGH = 0.1
 """Where the camera saw through more of the posed surface, the object is not there."""
 _SEEN = 0.35
 """Where less of the posed surface was seen, it may be anywhere."""
+_SUPPORTS = 2
+"""Planes beside the object that are looked for: a table and a wall."""
+_BESIDE = 1000
+"""Points beside the object that show them."""
+_ON = 3.0
+"""Standard deviations of a plane's points: nearer ones are of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,25 +149,55 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
     surface = known.surface
     starts = _starts(last)
     scene_m = scene_about(given, starts, surface)
-    cloud_m = _near(scene_m, starts, surface, MARGIN)
+    near = _is_near(scene_m, starts, surface, MARGIN)
+    is_support = _is_support(scene_m, near)
+    cloud_m = scene_m[near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
             reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
         )
     refined = refine_best(cloud_m, starts, surface, replace(known.icp, starts=1)).refined
-    return _accepted(refined, scene_m, known, last)
+    return _accepted(refined, scene_m, is_support, known, last)
+
+
+def _is_support(scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Whether points are of a table or wall that goes on beside the object.
+
+    ICP would pull the surface onto them: they lie within its limit all around what rests there.
+    """
+    is_support = torch.zeros_like(near)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(_SUPPORTS):
+        beside_m = take_evenly(scene_m[~near & ~is_support], _BESIDE)
+        plane = largest_plane(beside_m, generator)
+        if plane is None:
+            break
+        normal, offset = plane
+        gap_m = (beside_m @ normal - offset)[is_on_plane(beside_m, plane)]
+        if len(gap_m) < _LEAST_POINTS:
+            break
+        limit_m = _ON * gap_m.square().mean().sqrt()
+        is_support |= (scene_m @ normal - offset).abs() < limit_m
+    # What is as flat as the noise cannot be parted from what it lies on.
+    few = int((near & ~is_support).sum()) < max(_LEAST_POINTS, 0.2 * int(near.sum()))
+    return torch.zeros_like(near) if few else is_support
 
 
 def _accepted(
-    refined: Refined, scene_m: Float64[Tensor, "n 3"], known: TrackedObject, last: _Last
+    refined: Refined,
+    scene_m: Float64[Tensor, "n 3"],
+    is_support: Bool[Tensor, " n"],
+    known: TrackedObject,
+    last: _Last,
 ) -> PoseEstimate | Refusal:
     """Accept a pose that the scene agrees with and that is observable."""
     surface, pose = known.surface, refined.camera_from_model.double()
     shares = compare_depths(scene_m, pose, surface)
     if (contradiction := _contradiction(shares)) is not None:
         return contradiction
-    own_m = _near(scene_m, Rigid.stack([pose]), surface, NEAR)
+    near = _is_near(scene_m, Rigid.stack([pose]), surface, NEAR)
+    own_m = scene_m[near & ~is_support]
     free = free_motions(known.model.symmetries.continuous, pose)
     observable, _ = observability(own_m, pose, surface, free)
     if observable < known.refusal.min_hold:
@@ -223,10 +262,10 @@ def _motion(before: Rigid, after: Rigid) -> Rigid:
     return Rigid(after.R @ before.R.mT, after.t_m - before.t_m)
 
 
-def _near(
+def _is_near(
     points_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, limit: float
-) -> Float64[Tensor, "m 3"]:
-    """Keep the points within a limit, in diameters, of the surface at one of several poses."""
+) -> Bool[Tensor, " n"]:
+    """Whether points are within a limit, in diameters, of the surface at one of several poses."""
     local_m = poses.inverse().apply(points_m)
     gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
-    return points_m[(gap_m < limit * surface.diameter_m).any(0)]
+    return (gap_m < limit * surface.diameter_m).any(0)
