@@ -183,18 +183,16 @@ def _predict_bop(
     view: str | None,
 ) -> int:
     from depthpose.cli.pose import inputs, predicting
-    from depthpose.cli.pose.masks import find_masks
+    from depthpose.cli.pose.masks import find_masks, of_dataset
     from depthpose.cli.pose.page import write_pose_page
     from depthpose.pose.datasets import open_bop
 
     assert given.bop is not None
-    split = given.split
-    dataset = inputs.chosen_objects(open_bop(given.bop, split), method, object)
+    dataset = inputs.chosen_objects(open_bop(given.bop, given.split), method, object)
     (masks,) = find_masks([given.masks], dataset, out, device)
-    settings = {"dataset": dataset.folder.resolve().name, "split": split, "masks": masks.name}
     jobs = inputs.bop_jobs(dataset, masks, method)
-    chosen = inputs.object_facts(dataset, object)
-    settings = {**method.settings, **settings, **chosen, **masks.settings}
+    chosen = {"masks": masks.name, **inputs.object_facts(dataset, object)}
+    settings = {**method.settings, **of_dataset(dataset), **chosen, **masks.settings}
     predicting.claim_bop(out, settings, dataset)
     predictions = predicting.predict_all(method, jobs, out, settings, batch, view)
     if predictions is None:

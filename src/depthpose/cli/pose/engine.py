@@ -19,7 +19,7 @@ from depthpose.cli.pose.inputs import (
     object_facts,
     object_named,
 )
-from depthpose.cli.pose.masks import find_masks
+from depthpose.cli.pose.masks import find_masks, of_dataset
 from depthpose.cli.pose.methods import MethodSource, PoseMethod
 from depthpose.cli.pose.page import write_pose_page
 from depthpose.cli.pose.predicting import claim_bop, estimate_jobs, say_result, write_bop_files
@@ -219,8 +219,7 @@ def predict_bop(
     )
     dataset, shown = work.open()
     jobs = bop_jobs(dataset, shown, method)
-    facts = {"dataset": folder.resolve().name, "split": split, "masks": shown.name}
-    facts |= object_facts(chosen, object)
+    facts = {**of_dataset(dataset), "masks": shown.name, **object_facts(chosen, object)}
     settings = {**method.settings, "estimate": config_to_dict(source.config), **facts}
     settings = {**settings, **shown.settings, "shards": options.shards}
     claim_bop(Path(out), settings, dataset)

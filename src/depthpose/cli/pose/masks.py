@@ -92,8 +92,12 @@ def named_file(path: Path) -> str:
 
 
 def of_dataset(dataset: BopDataset) -> dict[str, Any]:
-    """Settings that say which data set results are of."""
-    return {"dataset": dataset.folder.resolve().name, "split": dataset.split}
+    """Settings that say which data set results are of, wherever its folder lies."""
+    return {
+        "dataset": dataset.folder.resolve().name,
+        "split": dataset.split,
+        "annotations_sha256": dataset.sha256[:12],
+    }
 
 
 def _path_of(kind: str) -> Path | None:

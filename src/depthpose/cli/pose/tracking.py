@@ -12,6 +12,7 @@ from tqdm import tqdm
 from depthpose.cli.pose import inputs, predicting
 from depthpose.cli.pose.finding import explained_job
 from depthpose.cli.pose.inputs import Unreadable
+from depthpose.cli.pose.masks import of_dataset
 from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.cli.pose.page import write_pose_page
 from depthpose.core.files import read_depth_png
@@ -59,8 +60,7 @@ def track_bop(method: PoseMethod, given: tuple[Path, str, str | None], out: Path
     folder, split, object = given
     dataset = inputs.chosen_objects(open_bop(folder, split), method, object)
     names = match_names(dataset, method.models)
-    about = {"dataset": dataset.folder.resolve().name, "split": split}
-    settings = {**method.settings, **about, "track": sorted(names.values())}
+    settings = {**method.settings, **of_dataset(dataset), "track": sorted(names.values())}
     predicting.claim_bop(out, settings, dataset)
     sequences = list(_sequences(dataset, names))
     jobs = [job for _, own in sequences for job in own]

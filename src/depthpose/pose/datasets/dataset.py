@@ -1,10 +1,12 @@
 """A data set of any known layout as samples."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -42,6 +44,7 @@ class BopDataset:
         instances: what is annotated, in the order of scene, image and place.
         mesh_config: for its models.
         cloud_config: for its clouds.
+        sha256: of all annotations of the split: tells data sets of one name apart.
     """
 
     folder: Path
@@ -50,6 +53,7 @@ class BopDataset:
     instances: Sequence[Instance]
     mesh_config: MeshConfig
     cloud_config: CloudConfig
+    sha256: str
 
     def __len__(self) -> int:
         """How many instances."""
@@ -162,14 +166,25 @@ def open_bop(
     """
     folder = Path(folder)
     name, layout = layout_of(folder)
+    instances = list(layout.instances(folder, split))
     return BopDataset(
         folder=folder,
         split=split,
         layout=name,
-        instances=list(layout.instances(folder, split)),
+        instances=instances,
         mesh_config=MeshConfig() if mesh is None else mesh,
         cloud_config=CloudConfig() if cloud is None else cloud,
+        sha256=_annotations_sha256(instances),
     )
+
+
+def _annotations_sha256(instances: Sequence[Instance]) -> str:
+    said = hashlib.sha256()
+    for one in instances:
+        pose = one.camera_from_model
+        said.update(f"{one.name} {one.object_id} {one.depth_unit_m}".encode())
+        said.update(torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy())
+    return said.hexdigest()
 
 
 def is_bop(folder: str | Path) -> bool:
