@@ -7,7 +7,7 @@ if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.2 (``--number`` eac
 blobs, plates, boxes and cylinders, balls, and hands of capsules. The mirror image of
 an object that it deviates from by 3 % of the diameter at most is no negative: "mirror image alike".
 Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
-themselves, four times as many: right is an ADD (ADD-S where symmetries are declared) below 10 % of
+themselves, four times as many: right is an ADD (to the nearest symmetric pose) below 10 % of
 the diameter. ``--seed`` draws other views.
 Each is a depth image with a mask; ``--clouds`` gives the points in the mask alone.
 ``--method register`` registers the objects without a network, ``both`` what the network doubts.

@@ -17,6 +17,7 @@ from depthpose.pose.metrics import (
     VSD_DELTA_M,
     View,
     add_m,
+    add_of_nearest_m,
     adds_m,
     auc,
     average_recall,
@@ -99,6 +100,19 @@ def test_an_exact_pose_has_no_error_and_a_symmetric_one_neither() -> None:
     # BOP's steps are 0.02 rad: half a step at a radius below 0.15 m stays under 1.5 mm.
     assert float(mssd_m(turned, pose, points, turns)) < 0.0015
     assert float(mspd_px(turned, pose, points, turns, K)) < 1.5
+    assert float(add_of_nearest_m(turned, pose, points, turns)) < 0.001
+
+
+def test_add_s_forgives_what_no_symmetry_allows() -> None:
+    grid = torch.cartesian_prod(*[torch.linspace(-0.05, 0.05, 21)] * 2, torch.zeros(1)).double()
+    half = Rigid(torch.diag(torch.tensor([-1.0, -1, 1])).double()[None], torch.zeros(1, 3).double())
+    halves = symmetry_transforms(Symmetries(discrete=half))
+    true = Rigid(torch.eye(3).double(), torch.zeros(3).double())
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+    turned, back = (Rigid(R, torch.zeros(3).double()) for R in (quarter, half.R[0]))
+    assert float(adds_m(turned, true, grid)) < 1e-9
+    assert float(add_of_nearest_m(turned, true, grid, halves)) > 0.02
+    assert float(add_of_nearest_m(back, true, grid, halves)) < 1e-9
 
 
 def test_both_ways_of_add_s_differ_where_the_shape_is_uneven() -> None:

@@ -97,6 +97,28 @@ def add_share(
     return float(error_m(estimated, true, points_m)) / diameter_m
 
 
+def add_of_nearest_m(
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
+) -> Float[Tensor, ""]:
+    """ADD [m] for the most lenient symmetric truth.
+
+    ADD-S is lower: it forgives any pose that lays the surface near itself, such as a U turned by
+    90 degrees, and not only those that leave the object as it is.
+
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same, annotated.
+        points_m: of the model.
+        symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
+    """
+    found = _moved(estimated, points_m)
+    means = [
+        (_moved(copy, points_m) - found).norm(dim=-1).mean(-1)
+        for copy in _symmetric_copies(true, symmetries, len(points_m))
+    ]
+    return torch.cat(means).min()
+
+
 def mssd_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:

@@ -50,7 +50,8 @@ _SYMMETRY_STEP = 0.2
 that this network is left with."""
 _MEASURED = (
     "Synthetic views that no training saw, by occluded %, posed without ICP: the share with an "
-    "ADD(-S) below a tenth of the diameter (add_10), and the median ADD(-S) in diameters."
+    "ADD, to the nearest symmetric pose, below a tenth of the diameter (add_10), and its median in "
+    "diameters."
 )
 """What the numbers of validation are."""
 

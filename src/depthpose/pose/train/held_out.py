@@ -15,8 +15,8 @@ from depthpose.pose.cloud import refusal_of
 from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig, RefusalConfig
 from depthpose.pose.config.objects import MOST_NOISE
 from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
-from depthpose.pose.mesh import sample_surface
-from depthpose.pose.metrics import add_share, is_within_diameter
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import negative_kinds, negative_of
 from depthpose.pose.train.clouds import Cloud, collate_clouds, voxelised_cloud
@@ -58,7 +58,7 @@ class HeldOut:
 
     @torch.no_grad()
     def look(self, network: DirectionNet) -> ValidationResult:
-        """Share of ADD(-S) below a tenth of the diameter, and the median in percent of it."""
+        """Share of ADD below a tenth of the diameter, and its median; to the nearest symmetry."""
         numbers: dict[str, float] = {}
         for occlusion in self.config.occlusions:
             for method, errors in self._errors(network, occlusion).items():
@@ -83,7 +83,7 @@ class HeldOut:
         return self.config.number * len(self.models)
 
     def _error(self, vote: Vote, cloud: Cloud) -> float:
-        """ADD, or ADD-S of a symmetric object, in diameters."""
+        """ADD to the nearest symmetric pose, in diameters."""
         model = self.models[cloud.class_number]
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
         truth, points = Rigid(cloud.R, cloud.t_m), self._surfaces[cloud.class_number]
@@ -138,16 +138,16 @@ def held_out_objects(
 
 
 def pose_error(estimate: PoseEstimate, truth: PoseTruth, model: ObjectModel) -> float:
-    """ADD, or ADD-S of a symmetric object, in diameters; infinite where there is no answer."""
-    if estimate.camera_from_model is None:
+    """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
+    found = estimate.camera_from_model
+    if found is None:
         return math.inf
-    points = sample_surface(model, _SURFACE)[0]
-    return _share(estimate.camera_from_model, truth.camera_from_model, model, points)
+    return _share(found, truth.camera_from_model, model, sample_surface(model, _SURFACE)[0])
 
 
 def _share(found: Rigid, truth: Rigid, model: ObjectModel, points_m: Tensor) -> float:
-    is_adds = not model.symmetries.is_none
-    return add_share(found, truth, points_m, model.diameter_m, is_adds=is_adds)
+    copies = symmetry_transforms(model.symmetries)
+    return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
 
 
 _CALIBRATION_SEED = 0xCA11B
@@ -264,7 +264,7 @@ def table_text(table: Table) -> str:
     """Show what was counted, for people."""
     lines = [
         "Synthetic views that no training saw, posed with voting, ICP and refusal; right is an "
-        "ADD(-S) below a tenth of the diameter.",
+        "ADD, to the nearest symmetric pose, below a tenth of the diameter.",
         "",
         "| occluded % | right % | wrong % | refused % | median error, % of diameter |",
         "| --- | --- | --- | --- | --- |",
