@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tests.pages.read_page import read_page
@@ -13,7 +14,7 @@ from tests.pose.test_track import moving
 from depthpose.cli import main
 from depthpose.cli.pose import methods as pose_methods
 from depthpose.cli.pose.inputs import cloud_jobs
-from depthpose.core.camera import Camera, write_camera
+from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose.datasets.results import read_results
 from depthpose.pose.estimator import track as tracking_module
@@ -107,6 +108,37 @@ def test_clouds_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [job.name for job in jobs] == ["1", "2", "10"]
 
 
+def test_clouds_of_the_scene_are_followed_from_a_first_pose(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "clouds").mkdir()
+    for k, pose in enumerate(POSES):
+        seen, mask = view_of(bracket(), pose)
+        depth_m = torch.where(mask, seen.float(), torch.tensor(1.2))
+        points_m = back_project(depth_m.double(), K).reshape(-1, 3)
+        np.save(tmp_path / f"clouds/{k}.npy", points_m.numpy())
+    matrix = torch.eye(4).double()
+    matrix[:3, :3], matrix[:3, 3] = POSES[0].R, POSES[0].t_m
+    (tmp_path / "first.txt").write_text(str(matrix.tolist()))
+    words = ["--cloud", str(tmp_path / "clouds"), "--object", "bracket", "--weights", str(weights)]
+    words += ["--first", str(tmp_path / "first.txt"), "--out", str(tmp_path / "out")]
+    assert main(["pose", "track", *words]) == 0
+    found = read_predictions(tmp_path / "out")
+    assert [p.estimate.tracking for p in found] == ["tracked"] * 4
+    last = found[3].estimate.camera_from_model
+    assert last is not None
+    assert float(add_m(last, POSES[3], bracket().vertices_m)) < 0.003
+    # Another first pose is another sequence.
+    (tmp_path / "first.txt").write_text(str(torch.eye(4).tolist()))
+    assert main(["pose", "track", *words]) == 2
+    capsys.readouterr()
+    for text, said in (("1 2 3", "3 numbers"), ("a b", "cannot be read as numbers"),
+                       ("2 " * 16, "no rigid transform")):  # fmt: skip
+        (tmp_path / "first.txt").write_text(text)
+        assert main(["pose", "track", *words]) == 2
+        assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("word", ["bracket", "7"])
 def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word: str) -> None:
     synthetic = make_dataset(tmp_path / "made", frames=2)
@@ -126,6 +158,7 @@ def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word
         (["--depth", ".", "--cloud", "."], "give one of --depth with --camera"),
         (["--depth", "."], "--depth needs --camera beside it"),
         (["--bop", ".", "--camera", ".", "--unit", "m"], "leave --camera and --unit out"),
+        (["--bop", ".", "--first", "."], "--first beside --bop"),
         (["--cloud", ".", "--camera", "."], "--camera beside --cloud: a cloud is of"),
     ],
 )

@@ -1,5 +1,6 @@
 """What ``depthpose pose predict`` is given: clouds, depth images, data sets, as jobs."""
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,16 +8,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import cloud_suffixes, list_images
 from depthpose.core.files.names import natural_order
+from depthpose.core.rigid import Rigid
 from depthpose.core.run import refuse_among_inputs
 from depthpose.pose.config import Unit
 from depthpose.pose.datasets import BopDataset, object_names
-from depthpose.pose.estimator.given import cloud_input, view_input
+from depthpose.pose.estimator.given import cloud_input, rigid_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Place
 
@@ -44,6 +48,28 @@ def object_named(name: str | None, method: PoseMethod) -> str:
             f"--object {name}: the {method.holder} do not know it; {nearest_name(name, known)}"
         )
     return known[0] if name is None else name
+
+
+def read_pose(path: Path) -> Rigid:
+    """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm.
+
+    Raises:
+        InputError: it cannot be read, holds no 16 numbers, or they are no rigid transform.
+    """
+    try:
+        words = re.sub(r"[\[\],;]", " ", path.read_text()).split()
+        values = torch.tensor([float(word) for word in words], dtype=torch.float64)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--first {path}: cannot be read as numbers ({error}); give a text file with the 4x4 "
+            "matrix camera_from_model in metres"
+        ) from error
+    if len(values) != 16:
+        raise InputError(f"--first {path}: {len(values)} numbers; give the 16 of a 4x4 matrix")
+    try:
+        return rigid_input(values.reshape(4, 4))
+    except InputError as error:
+        raise InputError(f"--first {path}: {error}") from error
 
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]]:

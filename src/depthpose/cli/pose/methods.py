@@ -14,6 +14,7 @@ from depthpose.cli.pose.options import RegisterOptions
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
 from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.datasets import BopDataset, open_bop
@@ -54,7 +55,7 @@ class PoseMethod:
     models: Sequence[ObjectModel]
     settings: Mapping[str, Any]
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
-    track: Callable[[Iterable[AnyInput], str], Iterator[PoseEstimate]] | None = None
+    track: Callable[[Iterable[AnyInput], str, Rigid | None], Iterator[PoseEstimate]] | None = None
     holder: str = "weights"
 
 

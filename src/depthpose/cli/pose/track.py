@@ -19,7 +19,10 @@ class SequenceOptions:
     """of the depth images; a JSON file, as for 'pose predict'."""
     cloud: Path | None = None
     """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of what is
-    about it too. It is found, at first and when it is lost, in clouds of it alone."""
+    about it too, which needs --first: the object is found in clouds of it alone."""
+    first: Path | None = None
+    """text file with the pose in the first frame, as far as it is known: the 4x4 matrix
+    camera_from_model, in metres; without it the object is looked for."""
     bop: Path | None = None
     """folder of a data set in BOP's layout; every object of each scene is followed that the weights
     know (with --method register: that has a model there), or --object alone."""
@@ -45,6 +48,11 @@ class SequenceOptions:
             raise InputError("--depth needs --camera beside it")
         if self.bop is not None:
             refuse_beside("--bop", {"camera": self.camera, "unit": self.unit})
+            if self.first is not None:
+                raise InputError(
+                    "--first beside --bop: a data set has many sequences and one pose is given; "
+                    "leave --first out, or give the frames of one sequence by --depth"
+                )
         if self.cloud is not None:
             refuse_beside("--cloud", {"camera": self.camera})
         if find_rank().world > 1:
@@ -89,5 +97,5 @@ def track(
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     if frames.dataset is not None:
         return track_bop(method, (*frames.dataset, frames.object), out)
-    files = (frames.depth, frames.camera, frames.cloud)
+    files = (frames.depth, frames.camera, frames.cloud, frames.first)
     return track_folder(method, files, frames.object, frames.unit, out)

@@ -12,10 +12,11 @@ from tqdm import tqdm
 from depthpose.cli.pose import inputs, predicting
 from depthpose.cli.pose.finding import explained_job
 from depthpose.cli.pose.inputs import Unreadable
-from depthpose.cli.pose.masks import of_dataset
+from depthpose.cli.pose.masks import named_file, of_dataset
 from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.cli.pose.page import write_pose_page
 from depthpose.core.files import read_depth_png
+from depthpose.core.rigid import Rigid
 from depthpose.pose.config import Unit
 from depthpose.pose.datasets import BopDataset, Instance, open_bop
 from depthpose.pose.predictions import (
@@ -31,13 +32,14 @@ from depthpose.pose.types import PoseEstimate, ViewInput
 
 def track_folder(
     method: PoseMethod,
-    given: tuple[Path | None, Path | None, Path | None],
+    given: tuple[Path | None, Path | None, Path | None, Path | None],
     object: str | None,
     unit: Unit | None,
     out: Path,
 ) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
-    depth, camera, cloud = given
+    depth, camera, cloud, first = given
+    start = None if first is None else inputs.read_pose(first)
     name = inputs.object_named(object, method)
     settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
     if cloud is not None:
@@ -47,8 +49,10 @@ def track_folder(
         assert camera is not None
         jobs = inputs.frame_jobs(depth, camera, name, unit, out)
         settings |= inputs.camera_facts(camera)
+    if first is not None:
+        settings |= {"first": named_file(first)}
     predicting.claim(out, settings, jobs, cloud or depth or out)
-    predictions = _kept(_followed(method, jobs, name), out)
+    predictions = _kept(_followed(method, jobs, name, start), out)
     shown = _shown(predictions, jobs, method)
     predicting.write_files(predictions, shown, out, method)
     write_pose_page(out, predictions, shown, method)
@@ -115,7 +119,9 @@ def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
     return found
 
 
-def _followed(method: PoseMethod, jobs: Sequence[Job[Any]], name: str) -> Iterator[Prediction]:
+def _followed(
+    method: PoseMethod, jobs: Sequence[Job[Any]], name: str, first: Rigid | None = None
+) -> Iterator[Prediction]:
     """Follow an object, frame by frame; one that cannot be read is skipped."""
     places = {job.name: job.place for job in jobs}
     unread: list[PoseEstimate] = []
@@ -129,7 +135,7 @@ def _followed(method: PoseMethod, jobs: Sequence[Job[Any]], name: str) -> Iterat
                 yield given
 
     assert method.track is not None
-    for found in method.track(readable(), name):
+    for found in method.track(readable(), name, first):
         # What could not be read was passed on the way to this frame.
         for estimate in [*unread, found]:
             yield Prediction(estimate=estimate, place=places[estimate.name])
