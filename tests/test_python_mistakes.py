@@ -21,6 +21,14 @@ MISTAKES = {
         "pose.estimate(depth=depth_m, mask=mask, camera=camera, object='flange', unit='cm')",
         "unit is 'cm'; did you mean 'm'? Known: 'm', 'mm'.",
     ),
+    "a list of CAD files": (
+        "Registration.load(['part.stl'], unit='mm')",
+        "Registration.load takes paths one by one: load(*files, unit=...)",
+    ),
+    "a depth image in another format": (
+        "pose.estimate(depth='depth.tiff', mask=mask, camera=camera, object='flange')",
+        "depth.tiff: .tiff is no depth image format; use .png, .npy, .pfm",
+    ),
     "unit of a mesh": (
         "read_model('part.stl', 'metres')",
         "unit is 'metres'; Known: 'm', 'mm'.",
@@ -96,7 +104,7 @@ import json, sys
 import numpy as np
 import torch
 from PIL import Image
-from depthpose import FakestereoNet, GeoPoseNet
+from depthpose import FakestereoNet, GeoPoseNet, Registration
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig

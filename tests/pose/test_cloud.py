@@ -106,8 +106,9 @@ def test_voxels_are_those_of_the_network_whatever_the_default_of_torch_is() -> N
 
 
 def test_a_point_in_the_camera_is_no_reading() -> None:
-    points = torch.tensor([[0, 0, 0], [0, 0, 1], [torch.nan, 0, 1], [0, 0.1, 0], [0, 0, torch.inf]])
-    assert is_reading(points).tolist() == [False, True, False, True, False]
+    points = torch.tensor([[0, 0, 0], [0, 0, 1], [torch.nan, 0, 1], [0, 0.1, 0], [0, 0, torch.inf],
+                           [0, 0, torch.finfo(torch.float32).max]])  # fmt: skip
+    assert is_reading(points).tolist() == [False, True, False, True, False, False]
     given = CloudInput(name="a", points_m=points, object="b")
     assert torch.equal(object_points(given, 1.0), points[[1, 3]])
 

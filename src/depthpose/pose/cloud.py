@@ -18,6 +18,8 @@ _NEIGHBOURS = 20
 _MOST = 0.5
 _STEEP = 1.73
 """Tangent of 60 degrees."""
+_FARTHEST_M = 1e6
+"""A coordinate beyond this marks a missing reading."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,9 +111,9 @@ def is_flying(points_m: Float[Tensor, "n 3"], limit_m: float) -> Bool[Tensor, " 
 def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Mark the points of a cloud that were measured.
 
-    Drivers write NaN, infinity or (0, 0, 0) where there is no return.
+    Drivers write NaN, infinity, the largest float or (0, 0, 0) where there is no return.
     """
-    return points_m.isfinite().all(-1) & (points_m != 0).any(-1)
+    return (points_m.abs() < _FARTHEST_M).all(-1) & (points_m != 0).any(-1)
 
 
 def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:

@@ -20,7 +20,8 @@ from depthpose.core.camera import (
 )
 from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_cloud, read_depth_png, read_map
+from depthpose.core.files import MAP_SUFFIXES, read_cloud, read_depth_png, read_map
+from depthpose.core.files.disk import refused_suffix
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import Unit, metres_of
 from depthpose.pose.datasets import mask_from_rle, read_mask
@@ -135,7 +136,10 @@ def _values(depth: AnyArray, name: str) -> Shaped[Tensor, "h w"]:
     """Read depth as it is stored: whole numbers of a PNG, or floats."""
     if not isinstance(depth, str | Path):
         return _refuse_no_picture(_tensor(depth), name)
-    if Path(depth).suffix.lower() == ".png":
+    suffix = Path(depth).suffix.lower()
+    if suffix not in (".png", *MAP_SUFFIXES):
+        raise refused_suffix(depth, "depth image", (".png", *MAP_SUFFIXES))
+    if suffix == ".png":
         return read_depth_png(depth, 1.0).nan_to_num(0.0).int()
     return _refuse_no_picture(read_map(Path(depth)), name)
 
@@ -149,7 +153,7 @@ def _metres(
     if given_m is not None and said_m is not None and given_m != said_m:
         raise InputError(
             f"{name}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m {said_m:g}; "
-            "omit one of the two"
+            "omit one of the two (the unit of a CAD file is --cad-unit)"
         )
     unit_m = said_m if given_m is None else given_m
     if unit_m is None:

@@ -25,8 +25,6 @@ from depthpose.pose.types import CloudInput, ObjectModel, Status, ViewInput
 AnyInput = CloudInput | ViewInput
 _MOST = 0.5
 """Where most points lie farther from their median than the object is long, they are not its."""
-_FARTHEST_M = 1e6
-"""A coordinate beyond this marks a missing reading."""
 _BEFORE = 0.05
 """Nearly all points of a cloud that was seen lie so many diameters before the camera, and more."""
 _THIN = 0.002
@@ -101,12 +99,11 @@ def _points_of(given: AnyInput, most: int) -> Float[Tensor, "n 3"] | Refusal:
             return Refusal(status="too few points", reason=nothing_seen(given))
     else:
         points_m = given.points_m.float()
-    # Some sensors write the largest float where they have no reading; NaN is not below either.
-    finite_m = points_m[(points_m.abs() < _FARTHEST_M).all(-1)]
-    read_m = take_evenly(finite_m[is_reading(finite_m)], most)
+    read_m = take_evenly(points_m[is_reading(points_m)], most)
     if len(read_m) == 0:
+        is_zero = bool((points_m == 0).all(-1).any())
         finite = "is (0, 0, 0), no reading, in every point"
-        what = "has no point with finite coordinates" if len(finite_m) == 0 else finite
+        what = finite if is_zero else "has no point with finite coordinates"
         what = "is empty" if len(points_m) == 0 else what
         return Refusal(status="too few points", reason=f"the cloud {what}")
     return read_m

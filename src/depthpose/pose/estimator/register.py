@@ -122,6 +122,8 @@ class Registration(PoseEstimator):
         Raises:
             InputError: no file, two of one name, one that cannot be read, or without a surface.
         """
+        if not all(isinstance(path, str | Path) for path in cad):
+            raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")
         models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
         return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
 

@@ -34,8 +34,8 @@ def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor,
         farthest = int(nearest.argmax())
         if nearest[farthest] == 0 and chosen:
             raise InputError(
-                f"farthest_points: {count} keypoints are wanted, but the model has only "
-                f"{len(chosen)} different points. Ask for fewer, or give a finer model."
+                f"the model has only {len(chosen)} different points, and {count} keypoints are to "
+                "be chosen among them; give a mesh with triangles, or more points"
             )
         chosen.append(farthest)
         distance = ((points - points[farthest]) ** 2).sum(-1)
