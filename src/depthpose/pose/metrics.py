@@ -4,7 +4,7 @@ Definitions of Hinterstoisser et al. (2012) and of the BOP toolkit (Hodan et al.
 Computed in float64.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -111,12 +111,8 @@ def add_of_nearest_m(
         points_m: of the model.
         symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    found = _moved(estimated, points_m)
-    means = [
-        (_moved(copy, points_m) - found).norm(dim=-1).mean(-1)
-        for copy in _symmetric_copies(true, symmetries, len(points_m))
-    ]
-    return torch.cat(means).min()
+    gaps_m = _gaps_to_copies(estimated, true, points_m, symmetries)
+    return torch.cat([gap_m.mean(-1) for gap_m in gaps_m]).min()
 
 
 def mssd_m(
@@ -130,12 +126,8 @@ def mssd_m(
         points_m: of the model.
         symmetries: a batch with the identity, of ``mesh.symmetry_transforms``.
     """
-    found = _moved(estimated, points_m)
-    largest = [
-        (_moved(copy, points_m) - found).norm(dim=-1).amax(-1)
-        for copy in _symmetric_copies(true, symmetries, len(points_m))
-    ]
-    return torch.cat(largest).min()
+    gaps_m = _gaps_to_copies(estimated, true, points_m, symmetries)
+    return torch.cat([gap_m.amax(-1) for gap_m in gaps_m]).min()
 
 
 def mspd_px(
@@ -230,6 +222,15 @@ def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) ->
 def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
+
+
+def _gaps_to_copies(
+    estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
+) -> Iterator[Float[Tensor, "copies n"]]:
+    """Distance of each point from where each symmetric truth has it, in groups of copies."""
+    found = _moved(estimated, points_m)
+    for copies in _symmetric_copies(true, symmetries, len(points_m)):
+        yield (_moved(copies, points_m) - found).norm(dim=-1)
 
 
 def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
