@@ -8,12 +8,12 @@ Each object of the weights moves on a smooth path before a wall, over a table, b
 boxes, and turns as it goes, at 30 frames a second (``--speed 1``: 0.2 m/s and 40 degrees a second
 on average). A plate covers it fully in some frames, it is removed in others, and two
 fifths of it are occluded in others. With ``--resting`` it lies on the table, on the largest face of
-its convex hull, and slides and turns there. Depth has a sensor's errors. Right is an answer with ADD (ADD-S
-where symmetries are declared or were found) below 10 % of the diameter in a frame that shows the
-object; lost is no answer in such a frame. "says so" are frames from the start of a drop-out to the
-first that is refused, "back" those from its end to the next right answer. "off" is the error of
-right answers in percent of the diameter, the median and the 95 % quantile. Seconds are of the
-processor, one thread. ``--anew N``: every N-th frame is searched without earlier frames.
+its convex hull, and slides and turns there. Depth has a sensor's errors. Right is an answer with
+ADD (ADD-S where symmetries are declared or were found) below 10 % of the diameter in a frame that
+shows the object; lost is no answer in such a frame. "says so" are frames from the start of a
+drop-out to the first that is refused, "back" those from its end to the next right answer. "off" is
+the error of right answers in percent of the diameter, the median and the 95 % quantile. Seconds are
+of the processor, one thread. ``--anew N``: every N-th frame is searched without earlier frames.
 """
 
 import argparse

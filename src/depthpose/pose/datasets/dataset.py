@@ -183,7 +183,8 @@ def _annotations_sha256(instances: Sequence[Instance]) -> str:
     for one in instances:
         pose = one.camera_from_model
         said.update(f"{one.name} {one.object_id} {one.depth_unit_m}".encode())
-        said.update(torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy())
+        numbers = torch.cat([one.K.flatten(), pose.R.flatten(), pose.t_m]).double().numpy()
+        said.update(numbers.tobytes())
     return said.hexdigest()
 
 
