@@ -395,7 +395,7 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
         (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),
         (
-            ["--focal-px", "70", "--weights", "default", "--precision", "bf16"],
+            ["--focal-px", "70", "--weights", "default", "--max-memory", "1GB"],
             "for a matcher with weights, and none runs here",
         ),
     ],
