@@ -42,7 +42,7 @@ CANDIDATE_SLOPES = {
     name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
 }
 """As of :class:`RefusalConfig`; no network disagrees."""
-_REFUSAL = RefusalConfig(
+REFUSAL = RefusalConfig(
     max_risk=0.1409,
     bias=48.084,
     slopes={
@@ -105,7 +105,7 @@ class Registration(PoseEstimator):
                 "--register-refused (register_refused=True)"
             )
         super().__init__(models, config)
-        self._models, self._refusal = tuple(models), refusal or _REFUSAL
+        self._models, self._refusal = tuple(models), refusal or REFUSAL
         self._tables: dict[int, PairTable] = {}
 
     @classmethod

@@ -83,6 +83,39 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
                       name=name)  # fmt: skip
 
 
+def random_simple_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
+    """Make a box, a tube, a cup, or a profile of the shape of an L, T or U.
+
+    Most have symmetries, which the model does not name
+    (:func:`~depthpose.pose.mesh.with_found_symmetries` finds them).
+
+    Args:
+        generator: of kind and sizes, in millimetres.
+        name: what samples call it.
+    """
+    width, depth, length = (uniform(generator, 20.0, 90.0) for _ in range(3))
+    wall, bore = uniform(generator, 3.0, 10.0), uniform(generator, 0.3, 0.9)
+    foot, web, edge = _box((width, wall, length)), _box((wall, depth, length)), (width - wall) / 2
+    left, middle, right = (_moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
+    solids = [
+        _box((width, depth, length)),
+        _tube(width / 2, bore * width / 2, length),
+        _cup(width / 2, length, wall),
+        _joined(foot, left),
+        _joined(foot, middle),
+        _joined(foot, left, right),
+    ]
+    vertices, faces = solids[whole(generator, len(solids))]
+    return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
+                      name=name)  # fmt: skip
+
+
+def _cup(radius: float, height: float, wall: float) -> Mesh:
+    inner = radius - min(wall, radius / 2)
+    return _revolved([(0.0, 0.0), (radius, 0.0), (radius, height), (inner, height),
+                      (inner, radius - inner), (0.0, radius - inner)])  # fmt: skip
+
+
 def _random_solid(generator: torch.Generator) -> Mesh:
     kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
     if kind == 0:
