@@ -7,8 +7,13 @@ import torch
 import trimesh
 
 from depthpose.core.errors import InputError
-from depthpose.pose.mesh import propose_symmetries, read_model, symmetries_from_proposals
-from depthpose.pose.synthetic import PARTS, make_part, write_part
+from depthpose.pose.mesh import (
+    propose_symmetries,
+    read_model,
+    symmetries_from_proposals,
+    with_found_symmetries,
+)
+from depthpose.pose.synthetic import PARTS, make_part, random_simple_part, write_part
 
 
 @pytest.mark.parametrize("name", sorted(PARTS))
@@ -24,6 +29,20 @@ def test_a_part_has_the_symmetries_that_it_declares(name: str, turns: int, axes:
     for symmetries in (model.symmetries, symmetries_from_proposals(propose_symmetries(model))):
         found = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
         assert (found, len(symmetries.continuous)) == (turns, axes)
+
+
+def test_simple_parts_are_closed_and_their_symmetries_are_found() -> None:
+    chance = torch.Generator().manual_seed(0)
+    models = [random_simple_part(chance) for _ in range(12)]
+    for model in models:
+        mesh = trimesh.Trimesh(model.vertices_m.numpy(), model.faces.numpy())
+        pieces = mesh.split(only_watertight=False)
+        assert all(piece.is_watertight and piece.volume > 0 for piece in pieces)
+    found = [with_found_symmetries(model, None, is_taken=True).symmetries for model in models]
+    assert (
+        sum(not symmetries.is_none for symmetries in found) >= 8
+    )  # an L with unlike legs has none
+    assert len({len(model.faces) for model in models}) >= 4  # boxes, tubes, cups and profiles
 
 
 def test_a_written_part_is_read_back_in_millimetres(tmp_path: Path) -> None:

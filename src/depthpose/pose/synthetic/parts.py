@@ -86,7 +86,7 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
 def random_simple_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
     """Make a box, a tube, a cup, or a profile of the shape of an L, T or U.
 
-    Most have symmetries, which the model does not name
+    All but an L of unlike legs have symmetries, which the model does not name
     (:func:`~depthpose.pose.mesh.with_found_symmetries` finds them).
 
     Args:
