@@ -1,4 +1,4 @@
-"""What a small file may cost: refused in seconds, below a gigabyte, measured in child processes."""
+"""What a small file may cost: refused soon, below a gigabyte, measured in child processes."""
 
 import json
 import os
@@ -37,4 +37,5 @@ def test_a_bomb_is_refused_soon_and_in_little_memory(
     # The doctor says what is odd of a file that cannot be used.
     assert row["outcome"] in (("read",) if name in READ else ("refused", "odd")), row
     assert row["mb"] < 1000, row
-    assert row["s"] < 20, row
+    # Processor time: up to 27 s on a slow machine; what grows with the square takes an hour.
+    assert row["s"] < 90, row
