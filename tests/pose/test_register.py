@@ -122,7 +122,6 @@ def test_registration_without_icp_is_an_error() -> None:
 
 
 @cache
-@cache
 def doubting_net() -> GeoPoseNet:
     """Trained weights that take none of their own answers."""
     weights = read_pose_weights(find_weights("parts"))
