@@ -141,7 +141,7 @@ class VoxelIndex:
         if self._table is None:
             return self._by_search(standing, moves)
         cells = self._cells(standing)
-        offsets = torch.tensor(moves, device=cells.device) @ self._strides[1:]
+        offsets = (torch.tensor(moves, device=cells.device) * self._strides[1:]).sum(-1)
         wanted = offsets[:, None] + cells
         return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
 
