@@ -171,6 +171,17 @@ def test_the_version_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert said.endswith(f"{device})\n")
 
 
+def test_output_that_nobody_reads_is_no_mistake() -> None:
+    """As in ``depthpose weights show parts | head -1``."""
+    command = [sys.executable, "-m", "depthpose", "weights", "show", "parts"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        running.stdout.close()
+        assert running.stderr.read() == b""
+    assert running.returncode == 141
+
+
 def test_matching_writes_every_file(pair_folder: Path, tmp_path: Path) -> None:
     assert match(pair_folder, tmp_path / "o", "--matcher", "sgbm", "--cloud") == 0
     kinds = ("depth_m.npy", "disparity_px.npy", "depth.png", "color.png", "cloud.ply")

@@ -5,6 +5,7 @@ when it runs, so that every ``--help`` is quick.
 """
 
 import errno
+import os
 import platform
 import sys
 import warnings
@@ -145,7 +146,8 @@ def main(words: Sequence[str] | None = None) -> int:
         words: what follows ``depthpose``; the process's own arguments by default.
 
     Returns:
-        The exit code: 0 done, 1 something in the input failed, 2 unusable, 130 interrupted.
+        The exit code: 0 done, 1 something in the input failed, 2 unusable, 130 interrupted,
+        141 nobody reads the output.
     """
     given = list(sys.argv[1:] if words is None else words)
     if given in (["--version"], ["-V"]):
@@ -161,9 +163,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except (InputError, MissingExtraError) as error:
         return _fail(f"error: {error}")
     except OSError as error:
-        if error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
-            raise
-        return _fail(f"error: {_message_of(error)}")
+        return _end_for(error)
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
@@ -174,6 +174,15 @@ def main(words: Sequence[str] | None = None) -> int:
 def _fail(reason: str, code: int = 2) -> int:
     print(f"depthpose: {reason}", file=sys.stderr)
     return code
+
+
+def _end_for(error: OSError) -> int:
+    if isinstance(error, BrokenPipeError):  # nobody reads the output any longer, as in '| head'
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is buffered
+        return 141
+    if error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
+        raise error
+    return _fail(f"error: {_message_of(error)}")
 
 
 def _message_of(error: OSError) -> str:
@@ -236,7 +245,9 @@ def _run(name: str, rest: list[str]) -> int:
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:
         refuse_missing(signature(command).bind(*words, **options).arguments)
-        return command(*words, **options)
+        code = command(*words, **options)
+        sys.stdout.flush()
+        return code
 
     refuse_empty(rest)
     try:
