@@ -81,7 +81,7 @@ product, padded: up to twice as fast. Beyond, padding costs what fewer calls sav
 
 GRID_ELEMENTS = 1 << 29
 """Largest padded table on a GPU, where the calls cost more than the padding: a training step of 128
-clouds takes 101 ms with it, one of 64 clouds offset by offset 169 ms (H200)."""
+clouds takes 101 ms with it, one of only 64 clouds offset by offset 169 ms (H200)."""
 
 NARROW = 4
 """Inputs of up to this many channels are laid out as a table: their products are too thin."""
