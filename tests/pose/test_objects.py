@@ -114,6 +114,21 @@ def test_a_sample_depends_on_seed_and_index_alone() -> None:
     assert torch.equal(alone[7].input.points_m, ahead.sample(7).input.points_m)
 
 
+def test_views_drawn_by_other_processes_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [_model("first"), _model("second", 0.03)]
+    ahead, alone = (Objects(models, ObjectsConfig(views=3, number=20)) for _ in range(2))
+    ahead.draw_stored(workers=2)
+    expected = [alone.view(index).input.depth_m.nan_to_num() for index in range(12)]
+
+    def draw(*_: object) -> None:
+        raise AssertionError("every stored view is drawn already")
+
+    monkeypatch.setattr("depthpose.pose.synthetic.dataset.draw_view", draw)
+    found = [ahead.view(index).input.depth_m for index in range(12)]
+    for mine, theirs in zip(found, expected, strict=True):
+        assert torch.equal(mine.nan_to_num(), theirs)
+
+
 def test_the_number_of_samples_is_kept() -> None:
     objects = Objects([_model()], ObjectsConfig(number=2, views=1))
     assert len(objects) == 2

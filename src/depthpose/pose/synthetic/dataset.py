@@ -1,5 +1,6 @@
 """Synthetic views of known objects as a dataset."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
@@ -105,6 +107,18 @@ class Objects:
         if not 0 <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
         return self.sample(index)
+
+    def draw_stored(self, workers: int) -> None:
+        """Draw all stored views now, in so many processes.
+
+        Processes that are forked later share them. Without this each process draws a view when a
+        sample first needs it, and keeps it for itself.
+        """
+        bank = _Bank(self)
+        views = DataLoader(bank, batch_size=None, num_workers=workers)  # pyright: ignore[reportArgumentType]
+        for index, view in enumerate(views):
+            # Tensors that a worker process sends hold file descriptors; copies do not.
+            self._views[bank.place(index)] = copy.deepcopy(view)
 
     def sample(self, index: int) -> CloudSample:
         """Make the partial cloud of any index, also beyond the number of samples."""
@@ -255,6 +269,22 @@ class Objects:
         is_clutter = (levels < level) & ~(behind_m < clutter_m)
         behind_m = torch.where(is_clutter, clutter_m, behind_m)
         return torch.where(clean.depth_m.isfinite(), clean.depth_m, behind_m)
+
+
+class _Bank:
+    """The stored views of all objects by index."""
+
+    def __init__(self, objects: Objects) -> None:
+        self._objects = objects
+
+    def __len__(self) -> int:
+        return (self._objects.config.views or 0) * len(self._objects.models)
+
+    def __getitem__(self, index: int) -> _Stored:
+        return self._objects._stored(*self.place(index))
+
+    def place(self, index: int) -> tuple[int, int]:
+        return index % len(self._objects.models), index // len(self._objects.models)
 
 
 def _refuse_near(model: ObjectModel, config: ObjectsConfig) -> None:

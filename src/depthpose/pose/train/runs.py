@@ -59,6 +59,8 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
         config.loop.seed,
         first_alone=config.first_alone,
     )
+    if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
+        clouds.synthetic.draw_stored(config.loop.workers)
     held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
     network = _network_of(config.network)
     if config.start is not None:
