@@ -164,10 +164,12 @@ def test_frames_are_not_made_of_two_objects_of_one_name(
 def test_a_cad_file_begins_with_the_weights_that_ship(
     part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[str | None] = []
+    started: list[tuple[str | None, str]] = []
+    configs: list[PoseTraining] = []
 
     def stand_in(config: PoseTraining, run: Run) -> Path:
-        started.append(config.start)
+        started.append((config.start, config.network.norm))
+        configs.append(config)
         return run.folder / "pose.safetensors"
 
     monkeypatch.setitem(STAGES, "pose", (PoseTraining, stand_in))
@@ -176,11 +178,11 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     more = [[], ["--start", "nothing"], ["--start", "default"]]
     for extra in [*more, ["--config", str(tmp_path / "c.yaml")]]:
         assert main([*words, *extra]) == 0
-    assert started == ["parts", None, "default", None]
+    assert started == [("parts", "none"), (None, "batch"), ("default", "none"), (None, "batch")]
     own = read_config(
         Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml", PoseTraining
     )
-    assert own.start == "parts"
+    assert dataclasses.replace(own, models=configs[0].models) == configs[0]
 
 
 @pytest.mark.parametrize("words", [["--seed", "99999999999999999999"], ["--number", "50001"]])

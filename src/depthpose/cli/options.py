@@ -133,12 +133,13 @@ class TrainingOptions:
     view: str | None = None
     """live draws the losses in Rerun's viewer (an extra); FILE.rrd records them."""
 
-    def read(self, path: Path | None, kind: type, **others: Any) -> Any:  # noqa: ANN401
+    def read(self, path: Path | None, kind: type, default: object = None, **others: Any) -> Any:  # noqa: ANN401
         """Read the config of a training, or take its defaults, with what was said here.
 
         Args:
             path: of the config.
             kind: its dataclass.
+            default: the config if none is named; None: the dataclass's own.
             others: more settings of the loop.
 
         Raises:
@@ -148,7 +149,7 @@ class TrainingOptions:
         from depthpose.core.config import read_config
         from depthpose.core.loop import refuse_long_warmup  # --help must not load torch
 
-        chosen: Any = kind() if path is None else read_config(path, kind)
+        chosen: Any = (default or kind()) if path is None else read_config(path, kind)
         if not (self.resume or self.finish):
             own = chosen.loop.steps
             refuse_long_warmup(chosen, None if own is None else max(own, self.steps or 0))

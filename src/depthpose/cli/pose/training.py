@@ -39,16 +39,21 @@ class LearntOptions:
     """pose: the network of directions; segmentation: the masks for it; depth-image and pointnet:
     baselines."""
     start: str | None = None
-    """weights to begin with, by name or file. A CAD file without a config begins with 'parts',
-    which saves two thirds of the first minutes; 'nothing' begins anew."""
+    """weights to begin with, by name or file. A CAD file without a config begins with 'parts';
+    'nothing' begins anew and takes twice the steps."""
 
-    def applied(self, chosen: Any, config: Path | None) -> Any:  # noqa: ANN401 - any config
-        """Give the config of a training, or the default where no file was named, with these."""
-        start = self.start
-        if start is None and self.what == "pose" and self.cad and config is None:
-            start = _START
-        if start is not None:
-            chosen = dataclasses.replace(chosen, start=None if start == _NOTHING else start)
+    def default(self) -> "PoseTraining | None":
+        """Give the settings of a training without a config, where they are not the network's."""
+        from depthpose.pose.train.config import start_from
+
+        is_own = self.what == "pose" and self.cad and self.start != _NOTHING
+        return start_from(self.start or _START) if is_own else None
+
+    def applied(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
+        """Give the config of a training with these."""
+        if self.start is not None:
+            start = None if self.start == _NOTHING else self.start
+            chosen = dataclasses.replace(chosen, start=start)
         if self.cad or self.unit or self.symmetries:
             chosen = dataclasses.replace(chosen, models=self._models(chosen))
         return chosen if self.data is None else _with_data(chosen, self.data)
@@ -94,10 +99,10 @@ def train(
     from depthpose.pose.train import STAGES
 
     kind, run_stage = STAGES[learnt.what]
-    chosen = training.read(config, kind, workers=workers)
+    chosen = training.read(config, kind, default=learnt.default(), workers=workers)
     if learnt.cad and learnt.unit is None:
         raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
-    chosen = learnt.applied(chosen, config)
+    chosen = learnt.applied(chosen)
     is_first = find_rank().rank == 0
     with progress_bar(training.view) as on_step:
         on_message = partial(print, flush=True) if is_first else None
