@@ -44,10 +44,10 @@ class LearntOptions:
 
     def default(self) -> "PoseTraining | None":
         """Give the settings of a training without a config, where they are not the network's."""
-        from depthpose.pose.train.config import start_from
+        from depthpose.pose.train.config import own_part
 
         is_own = self.what == "pose" and self.cad and self.start != _NOTHING
-        return start_from(self.start or _START) if is_own else None
+        return own_part(self.start or _START) if is_own else None
 
     def applied(self, chosen: Any) -> Any:  # noqa: ANN401 - any config of a training
         """Give the config of a training with these."""

@@ -29,8 +29,9 @@ class ResUNetConfig:
     """A fourth output beside each direction: the logit of how far to trust it."""
 
     norm: Literal["batch", "none"] = "batch"
-    """batch trains within hundreds of steps and is folded for use; none is the published network,
-    which hardly trains, though its residual branches are initialised smaller."""
+    """batch trains within hundreds of steps and is folded for use. none is the published network,
+    which hardly trains from random weights, though its residual branches are initialised smaller;
+    with a trained backbone in which norms are folded it learns another part faster than batch."""
 
     with_bias: bool = False
     """A bias for each inner convolution, as folding batch norm leaves one."""

@@ -221,20 +221,20 @@ class PoseTraining:
             raise InputError(f"confidence_weight is {self.confidence_weight}; take 0 or more, 0.1")
 
 
-def start_from(weights: str) -> PoseTraining:
-    """Settings of a training of one part that begins with a trained backbone.
+def own_part(start: str) -> PoseTraining:
+    """Settings of a training of one part from a trained backbone, as in own-part.yaml.
 
     The backbone learns on as it ships, with batch norm folded into its convolutions, at a third of
     the rate: new norms would take the place of statistics that it learnt with, and after 600 steps
     the loss of an unknown part is then a fifth higher (docs/results.md, A CAD part of your own).
 
     Args:
-        weights: of the backbone, by name or file.
+        start: weights of the backbone, by name or file.
     """
     own = PoseTraining()
     return dataclasses.replace(
         own,
-        start=weights,
+        start=start,
         network=dataclasses.replace(own.network, norm="none", with_bias=True),
         adam=dataclasses.replace(own.adam, learning_rate=1e-3),
         loop=dataclasses.replace(own.loop, steps=5300, validate_every_steps=2000, workers=1),
