@@ -1,13 +1,11 @@
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import depthpose
 from depthpose import core
-from depthpose.moved import MOVED
 
 
 def modules_after(statement: str) -> set[str]:
@@ -61,10 +59,3 @@ def test_an_unknown_name_is_refused() -> None:
 def test_the_public_names_are_listed() -> None:
     assert {"FakestereoNet", "GeoPoseNet", "pipeline"} <= set(dir(depthpose))
     assert "torch" not in modules_after("import depthpose; dir(depthpose)")
-
-
-@pytest.mark.parametrize(("old", "new"), MOVED.items())
-def test_an_old_module_name_says_the_new_one(old: str, new: str) -> None:
-    with pytest.raises(ModuleNotFoundError, match=rf"depthpose\.{old} is now depthpose\.{new}"):
-        import_module(f"depthpose.{old}")
-    import_module(f"depthpose.{new}")

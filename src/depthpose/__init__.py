@@ -3,8 +3,6 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from depthpose.moved import point_to_new_names
-
 if TYPE_CHECKING:
     from depthpose.depth.estimator import FakestereoNet as FakestereoNet
     from depthpose.depth.estimator import pipeline as pipeline
@@ -20,8 +18,6 @@ _HOMES = {
     "Registration": "depthpose.pose.estimator",
     "pipeline": "depthpose.depth.estimator",
 }
-
-point_to_new_names()
 
 
 def __getattr__(name: str) -> object:

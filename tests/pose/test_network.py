@@ -123,8 +123,9 @@ def test_descriptors_need_no_classes() -> None:
     again = resunet_from_published(published_state(network))
     assert again.config.descriptor == 32
     voxels = Voxels.from_points(surface())
-    torch.testing.assert_close(again.descriptors(voxels), network.descriptors(voxels))
-    assert again.descriptors(voxels).shape[1] == 32
+    torch.testing.assert_close(again.point_features(voxels), network.point_features(voxels))
+    assert torch.equal(again.final.weight, network.final.weight)
+    assert again.final.weight.shape[-1] == 32
 
 
 def test_other_checkpoints_are_refused() -> None:

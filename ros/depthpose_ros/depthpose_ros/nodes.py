@@ -63,13 +63,12 @@ class DepthImageNode(WorkNode):
 
     def __init__(self) -> None:
         super().__init__(
-            "depth_image", weights="default", encoding="32FC1", engine="torch", device="cpu",
-            speed="fine", allow_ood=False,
+            "depth_image", weights="default", encoding="32FC1", device="cpu", speed="fine",
+            allow_ood=False,
         )  # fmt: skip
         net = FakestereoNet.load(
             self.value("weights"),
             config=MatcherConfig(device=self.value("device"), speed=self.value("speed")),
-            engine=self.value("engine"),
             allow_ood=self.value("allow_ood"),
         )
         work = DepthFromImage(net, self.value("encoding"))

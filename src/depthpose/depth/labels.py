@@ -45,7 +45,7 @@ class LabelConfig:
             )
 
 
-def label_pairs(  # noqa: PLR0913  what is labelled, how and where
+def label_pairs(
     net: FakestereoNet,
     dataset: Dataset,
     config: LabelConfig,

@@ -18,10 +18,6 @@ from depthpose.core.camera.pinhole import Camera as Camera
 from depthpose.core.camera.pinhole import StereoRig as StereoRig
 from depthpose.core.camera.pinhole import back_project as back_project
 from depthpose.core.camera.pinhole import crop_camera as crop_camera
-from depthpose.core.camera.pinhole import epipolar_distance_px as epipolar_distance_px
-from depthpose.core.camera.pinhole import essential_matrix as essential_matrix
-from depthpose.core.camera.pinhole import fundamental_matrix as fundamental_matrix
-from depthpose.core.camera.pinhole import pad_camera as pad_camera
 from depthpose.core.camera.pinhole import pixel_grid as pixel_grid
 from depthpose.core.camera.pinhole import project as project
 from depthpose.core.camera.pinhole import resize_camera as resize_camera

@@ -180,28 +180,11 @@ def crop_camera(camera: AnyCamera, left: int, top: int, width: int, height: int)
     if not is_inside or left + width > camera.width or top + height > camera.height:
         raise InputError(
             f"the window {width}x{height} at ({left}, {top}) does not lie inside the image of "
-            f"{camera.width}x{camera.height}; make it smaller, or pad_camera first"
+            f"{camera.width}x{camera.height}; make it smaller"
         )
-    return replace(camera, width=width, height=height, K=_move(camera.K, -left, -top))
-
-
-def pad_camera(camera: AnyCamera, left: int, top: int, right: int, bottom: int) -> AnyCamera:
-    """Make the camera of an image with columns and rows added at its sides [px].
-
-    Raises:
-        InputError: a number is negative.
-    """
-    if min(left, top, right, bottom) < 0:
-        raise InputError(
-            f"padding {(left, top, right, bottom)} (left, top, right, bottom) is negative; "
-            "crop_camera takes pixels away"
-        )
-    return replace(
-        camera,
-        width=camera.width + left + right,
-        height=camera.height + top + bottom,
-        K=_move(camera.K, left, top),
-    )
+    K = camera.K.clone()
+    K[:2, 2] -= K.new_tensor([left, top])
+    return replace(camera, width=width, height=height, K=K)
 
 
 def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:
@@ -221,53 +204,3 @@ def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:
     if isinstance(resized, StereoRig):
         return replace(resized, cx_right_minus_left_px=resized.cx_right_minus_left_px * sx)
     return resized
-
-
-def _move(K: Float[Tensor, "3 3"], right: int, down: int) -> Float[Tensor, "3 3"]:
-    moved = K.clone()
-    moved[0, 2] += right
-    moved[1, 2] += down
-    return moved
-
-
-def essential_matrix(rig: StereoRig) -> Float[Tensor, "3 3"]:
-    """Make E with ``x_right^T E x_left = 0`` for rays ``x = K^-1 (u, v, 1)``.
-
-    ``E = [t]_x R`` (Hartley and Zisserman, 9.12), where ``p_right = R p_left + t``. The right
-    camera of a rectified rig stands at (baseline, 0, 0), so R = I and t = (-baseline, 0, 0).
-    """
-    baseline_m = rig.baseline_m
-    return rig.K.new_tensor([[0, 0, 0], [0, 0, baseline_m], [0, -baseline_m, 0]])
-
-
-def fundamental_matrix(rig: StereoRig) -> Float[Tensor, "3 3"]:
-    """Make F with ``x_right^T F x_left = 0`` for pixels ``x = (u, v, 1)``; its scale is arbitrary.
-
-    ``F = K_right^-T E K_left^-1`` (Hartley and Zisserman, 9.12). The two K differ by a shift along
-    the rows, where the epipole lies, so F is the same with either of them.
-    """
-    inverse = rig.K.inverse()
-    return inverse.mT @ essential_matrix(rig) @ inverse
-
-
-def epipolar_distance_px(
-    points_left: Float[Tensor, "n 2"], points_right: Float[Tensor, "n 2"], F: Float[Tensor, "3 3"]
-) -> Float[Tensor, " n"]:
-    """Measure how far matched pixels lie from each other's epipolar lines [px].
-
-    The root mean square of the two distances, symmetric in the images (Hartley and Zisserman,
-    11.10), computed in F's precision. Two pixels a rectified pair shifts apart by d rows are d
-    apart. At an epipole, where no line is defined, it is 0.
-    """
-    left, right = _homogeneous(points_left.to(F)), _homogeneous(points_right.to(F))
-    lines_right, lines_left = left @ F.mT, right @ F
-    residual = (right * lines_right).sum(-1)
-    floor = torch.finfo(F.dtype).eps * torch.linalg.matrix_norm(F)
-    near, far = (line[:, :2].norm(dim=-1).clamp_min(floor) for line in (lines_left, lines_right))
-    # The root is of the lines alone: at residual 0 its gradient would be infinite.
-    distance_px = residual.abs() * ((near**-2 + far**-2) / 2).sqrt()
-    return distance_px.to(points_left.dtype)
-
-
-def _homogeneous(points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    return torch.cat([points, torch.ones_like(points[:, :1])], -1)

@@ -49,7 +49,7 @@ class Progress:
     numbers: dict[str, float]
 
 
-def train(  # noqa: PLR0913  what is trained, and how it is run
+def train(
     task: Task,
     samples: Samples,
     config: LoopConfig,

@@ -18,7 +18,7 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.far import match_to_infinity
@@ -40,20 +40,12 @@ from depthpose.depth.estimator.rig import (
     square_camera,
 )
 from depthpose.depth.stereo import CameraMatcher, Matcher
-from depthpose.depth.synthesis import (
-    SynthesisedViews,
-    Synthesiser,
-    make_synthesiser,
-    openvino_generator,
-)
+from depthpose.depth.synthesis import SynthesisedViews, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
 
 DEFAULT = "default"
 """Name of the weights that are taken where none are named."""
-
-ENGINES = ("torch", "openvino")
-"""What computes a generator that selects."""
 
 
 class FakestereoNet:
@@ -118,7 +110,6 @@ class FakestereoNet:
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
         allow_ood: bool = False,
-        engine: str = "torch",
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
@@ -135,16 +126,11 @@ class FakestereoNet:
                 (:class:`~depthpose.depth.config.SelectionConfig`).
             allow_ood: answer images that are unlike what the weights know too, with a
                 ``warning`` in the estimate, in place of refusing them.
-            engine: what computes a generator that selects on the processor: torch, or openvino
-                (extra ``openvino``), half the network's time after some seconds, in ``config``'s
-                precision: a quarter in bf16.
 
         Raises:
-            InputError: no such weights, no matcher in what was given, an ``answer`` that these
-                weights cannot give, or an ``engine`` that cannot compute them.
-            MissingExtraError: OpenVINO is not installed.
+            InputError: no such weights, no matcher in what was given, or an ``answer`` that these
+                weights cannot give.
         """
-        refuse_unknown("engine", engine, ENGINES)
         if weights is None and matcher is None:
             weights = DEFAULT
         found = None if weights is None else read_depth_weights(find_weights(weights))
@@ -160,13 +146,8 @@ class FakestereoNet:
         chosen = choose_matcher(weights, found, matcher, own, config)
         said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
         if found is None or found.generator is None:
-            if engine != "torch":
-                raise InputError(f"engine is {engine!r}, and there is no generator; omit it")
             return cls(chosen, terms=terms, weights=said)
-        generator = found.generator
-        if engine == "openvino":
-            generator = openvino_generator(generator, run.device, run.precision)
-        synthesiser = make_synthesiser(generator, run.device, run.speed)
+        synthesiser = make_synthesiser(found.generator, run.device, run.speed)
         return cls(chosen, synthesiser, terms=terms, weights=said, allow_ood=allow_ood)
 
     from_pretrained = load

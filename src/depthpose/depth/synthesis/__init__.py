@@ -6,7 +6,6 @@ from depthpose.depth.synthesis.generator import (
     UNetGenerator,
     make_discriminator,
 )
-from depthpose.depth.synthesis.openvino import openvino_generator
 from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
     Generator,
@@ -29,5 +28,4 @@ __all__ = [
     "UNetSynthesiser",
     "make_discriminator",
     "make_synthesiser",
-    "openvino_generator",
 ]

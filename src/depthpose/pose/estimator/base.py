@@ -73,7 +73,7 @@ class PoseEstimator(ABC):
         """Estimate inputs of which most do not show their object."""
         return self.estimate_many(inputs)
 
-    def estimate(  # noqa: PLR0913  one input in several forms
+    def estimate(
         self,
         *,
         cloud: AnyArray | None = None,

@@ -169,10 +169,6 @@ class ResUNet(nn.Module):
         """Give what the last layer sees of each point given: the features of figure 3-2."""
         return self._features(voxels).at_points()
 
-    def descriptors(self, voxels: Voxels) -> Float[Tensor, "points outputs"]:
-        """Give the raw last layer of each point; FCGF scales its descriptors to unit length."""
-        return self.final(self._features(voxels)).at_points()
-
     def forward_class(
         self, voxels: Voxels, number: int
     ) -> Float[Tensor, "points keypoints components"]:
