@@ -2,6 +2,7 @@
 PYTHON ?= python3
 OUT ?= out
 BIN := .venv/bin
+DEMO := .venv/.ready-demo
 READY := .venv/.ready
 # Real samples for the tests that need them; those tests skip, and say so, where there are none.
 export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
@@ -15,17 +16,22 @@ all: check test
 setup: $(READY)
 
 # torch first and exactly, so that nothing else chooses a build of several gigabytes.
-$(READY): pyproject.toml constraints.txt
+$(DEMO): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@echo "1 of 2: torch into .venv. On Linux this is a GPU build of several GB; for the CPU"
+	@echo "torch into .venv. On Linux this is a GPU build of several GB; for the CPU"
 	@echo "   build (0.9 GB): PIP_EXTRA_INDEX_URL=URL make ..., URL as PyTorch's 'Start Locally' page says."
 	$(BIN)/python -m pip install -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
-	@echo "2 of 2: depthpose and what its tests need"
-	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
+	@echo "depthpose and what its demo needs"
+	$(BIN)/python -m pip install -c constraints.txt -e '.[demo,fast]'
 	touch $@
 	@echo "ready: 'source .venv/bin/activate' puts depthpose on your path"
 
-demo: $(READY)
+$(READY): $(DEMO)
+	@echo "what the tests and checks need"
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: $(DEMO)
 	$(BIN)/depthpose demo --out $(OUT)/demo
 
 test: $(READY)
