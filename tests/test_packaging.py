@@ -227,6 +227,18 @@ def test_ci_checks_out_reads_only_and_knows_our_python() -> None:
     assert f"{base}-slim" == of("FROM")[0]
 
 
+def test_a_release_is_checked_before_it_is_published() -> None:
+    jobs = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]
+    assert (jobs["wheel"]["needs"], jobs["publish"]["needs"]) == ("build", "wheel")
+    said = "\n".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
+    for words in ("python -m build", "twine check --strict", "depthpose doctor", "depthpose demo"):
+        assert words in said, words
+    tried = jobs["wheel"]["strategy"]["matrix"]["python"]
+    known = [c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if "Python ::" in c]
+    assert set(known) <= set(tried)
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+
+
 def test_the_release_checklist_names_what_is_there() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for target in re.findall(r"`make (\w+)`", RELEASE):

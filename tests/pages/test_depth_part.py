@@ -48,8 +48,8 @@ def test_what_there_is_is_shown_in_its_colours() -> None:
 def test_the_facts_are_those_of_the_map() -> None:
     facts = dict(depth_section("a", DepthShown(pair=PAIR, estimate=estimate())).facts)
     known_m = truth_m()[truth_m().isfinite()]
-    numbers = [float(f(known_m)) for f in (torch.min, torch.median, torch.max)]
-    assert facts["nearest, middle, farthest"] == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
+    numbers = [float(known_m.double().quantile(share)) for share in (0.01, 0.5, 0.99)]
+    assert facts["1, 50, 99 % are nearer than"] == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
     assert facts["pixels with depth"] == f"{len(known_m) / truth_m().numel():.1%}"
     assert "baseline" not in facts, "one image has none"
     assert "mean confidence" not in facts

@@ -3,9 +3,10 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, get_args, get_origin, get_type_hints
+from functools import cache
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 
 LONGEST = 500
 """Letters of a value that an error shows."""
@@ -31,6 +32,49 @@ def refuse_distorted(content: Mapping[Any, Any], kind: type, source: str, prefix
     for name, value in content.items():
         if not isinstance(value, float) or value != default_of(fields[name]):
             _refuse(value, hints[name], source, f"{prefix}{name}")
+
+
+def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dataclass
+    """Refuse numbers outside their ranges, and words that the type of a setting does not know.
+
+    Args:
+        config: the dataclass of the settings. Those that are None are left out, and of several
+            numbers each is looked at.
+        ranges: intervals by the names of settings, written as in mathematics: ``"[0, 1)"``.
+
+    Raises:
+        InputError: the setting, what it may be, and its default are said.
+    """
+    for name, words in _words_of(type(config)).items():
+        value = getattr(config, name)
+        for word in value if isinstance(value, tuple) else (value,):
+            if word is not None:
+                refuse_unknown(name, word, words)
+    defaults = {field.name: default_of(field) for field in dataclasses.fields(config)}
+    for name, interval in ranges.items():
+        value, default = getattr(config, name), defaults[name]
+        low, high = (float(end) for end in interval[1:-1].split(", "))
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is None:
+                continue
+            is_above = number >= low if interval[0] == "[" else number > low
+            is_below = number <= high if interval[-1] == "]" else number < high
+            if not (is_above and is_below):
+                known = default is not dataclasses.MISSING and default is not None
+                remedy = f"; the default is {default}" if known else ""
+                raise InputError(f"{name} must be in {interval}, got {shown(value)}{remedy}")
+
+
+@cache
+def _words_of(kind: type) -> dict[str, tuple[str, ...]]:
+    """Settings whose type lists the words that it knows."""
+    found = {}
+    for name, hint in get_type_hints(kind).items():
+        choices = [hint, *get_args(hint)]
+        literal = next((c for c in choices if get_origin(c) is Literal), None)
+        if literal is not None and all(isinstance(word, str) for word in get_args(literal)):
+            found[name] = get_args(literal)
+    return found
 
 
 def default_of(field: dataclasses.Field[Any]) -> object:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
 from depthpose.core.run import claim_folder, claim_names
@@ -34,15 +35,12 @@ class LabelConfig:
 
     def __post_init__(self) -> None:
         """Refuse limits that keep nothing."""
-        if min(self.largest_difference_px, self.largest_share) < 0:
-            raise InputError(
-                "largest_difference_px and largest_share must be 0 or more, got "
-                f"{self.largest_difference_px} and {self.largest_share}"
-            )
-        if not 0 <= self.least_confidence < 1:
-            raise InputError(
-                f"least_confidence must be from 0, and below 1; got {self.least_confidence}"
-            )
+        check_settings(
+            self,
+            largest_difference_px="[0, inf)",
+            largest_share="[0, inf)",
+            least_confidence="[0, 1)",
+        )
 
 
 def label_pairs(

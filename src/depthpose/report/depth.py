@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -100,8 +100,8 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
         if len(known_m):
-            low, middle, high = (float(f(known_m)) for f in (torch.min, torch.median, torch.max))
-            facts.append(("nearest, middle, farthest", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
+            low, middle, high = np.percentile(known_m.numpy(), (1, 50, 99))
+            facts.append(("1, 50, 99 % are nearer than", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
     if found.is_sky is not None:
         facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
     if found.warning:

@@ -14,18 +14,20 @@ function choose(tab) {
     one.tabIndex = isChosen ? 0 : -1;
     document.getElementById(one.getAttribute("aria-controls")).hidden = !isChosen;
   }
-  history.replaceState(null, "", `#${tab.getAttribute("aria-controls")}`);
 }
+const address = tab => `#${tab.getAttribute("aria-controls")}`;
 for (const tab of tabs) {
-  tab.addEventListener("click", () => choose(tab));
+  tab.addEventListener("click", () => { choose(tab); history.replaceState(null, "", address(tab)); });
   tab.addEventListener("keydown", event => {
     if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
     const other = tabs[1 - tabs.indexOf(tab)];
-    choose(other);
+    other.click();
     other.focus();
   });
 }
-choose(tabs.find(tab => `#${tab.getAttribute("aria-controls")}` === location.hash) || tabs[0]);
+choose(tabs.find(tab => address(tab) === location.hash) || tabs[0]);
+// An address that ends in #pose names the tab; the browser would scroll past the tabs to it.
+addEventListener("load", () => scrollTo(0, 0));
 
 // Drop zones show the chosen file, with a button to remove it.
 for (const zone of document.querySelectorAll(".drop")) {

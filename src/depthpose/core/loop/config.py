@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import nn
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError, refuse_seed
 
 Schedule = Literal["constant", "constant-linear", "halving", "cosine"]
@@ -40,22 +41,15 @@ class AdamConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot train."""
-        if not 0 < self.learning_rate < 1:
-            raise InputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
-        if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
-            raise InputError(f"betas must be in [0, 1), got {self.beta1} and {self.beta2}")
-        if self.halvings < 1 or self.warmup_steps < 0:
-            raise InputError(
-                f"halvings must be 1 or more and warmup_steps 0 or more, got {self.halvings} and "
-                f"{self.warmup_steps}"
-            )
-        if self.weight_decay < 0:
-            raise InputError(f"weight_decay must be 0 or more, got {self.weight_decay}")
-        if self.schedule not in ("constant", "constant-linear", "halving", "cosine"):
-            raise InputError(
-                f"schedule must be constant, constant-linear, halving or cosine, "
-                f"got {self.schedule!r}"
-            )
+        check_settings(
+            self,
+            learning_rate="(0, 1)",
+            beta1="[0, 1)",
+            beta2="[0, 1)",
+            halvings="[1, inf)",
+            warmup_steps="[0, inf)",
+            weight_decay="[0, inf)",
+        )
 
     def rate_at(self, step: int, steps: int) -> float:
         """Learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
@@ -125,26 +119,11 @@ class LoopConfig:
                 f"a training is as long as steps or epochs say: give one of the two, got "
                 f"steps={self.steps}, epochs={self.epochs}"
             )
-        counts = {
-            "steps": self.steps,
-            "epochs": self.epochs,
-            "batch_size": self.batch_size,
-            "accumulate": self.accumulate,
-            "save_every_steps": self.save_every_steps,
-            "validate_every_steps": self.validate_every_steps,
-            "log_every_steps": self.log_every_steps,
-            "clip_norm": self.clip_norm,
-        }
-        for name, value in counts.items():
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} must be positive, got {value}")
+        counts = ("steps", "epochs", "batch_size", "accumulate", "save_every_steps",
+                  "validate_every_steps", "log_every_steps", "clip_norm")  # fmt: skip
+        positive = dict.fromkeys(counts, "(0, inf)")
+        check_settings(self, **positive, workers="[0, inf)", ema_decay="(0, 1)")
         refuse_seed(self.seed)
-        if self.workers < 0:
-            raise InputError(f"workers must be 0 or more processes, got {self.workers}")
-        if self.precision not in ("fp32", "bf16", "fp16"):
-            raise InputError(f"precision must be fp32, bf16 or fp16, got {self.precision!r}")
-        if self.ema_decay is not None and not 0 < self.ema_decay < 1:
-            raise InputError(f"ema_decay must be between 0 and 1, got {self.ema_decay}; try 0.999")
 
     def total_steps(self, samples: int, processes: int) -> int:
         """Number of optimiser steps for a dataset of ``samples`` on ``processes``."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 
 TruthKind = Literal["scan", "annotated", "disparity"]
@@ -46,17 +47,14 @@ class DegradeConfig:
 
     def __post_init__(self) -> None:
         """Refuse shares that are none."""
-        for name in ("hue", "haze", "glare", "blur", "noise", "jpeg"):
-            share = getattr(self, f"{name}_share")
-            if not 0 <= share <= 1:
-                raise InputError(f"{name}_share must be from 0 to 1, got {share}")
-        if not 0 <= self.colour < 1:
-            raise InputError(f"colour must be in [0, 1), got {self.colour}")
-        if self.blur_px < 0.3 or self.noise < 0:
-            raise InputError(
-                f"blur_px must be 0.3 or more and noise 0 or more, got {self.blur_px} and "
-                f"{self.noise}"
-            )
+        shares = [f"{name}_share" for name in ("hue", "haze", "glare", "blur", "noise", "jpeg")]
+        check_settings(
+            self,
+            **dict.fromkeys(shares, "[0, 1]"),
+            colour="[0, 1)",
+            blur_px="[0.3, inf)",
+            noise="[0, inf)",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,18 +86,17 @@ class AugmentConfig:
 
     def __post_init__(self) -> None:
         """Refuse changes that would break a pair."""
-        if min(self.crop_px) < 1:
-            raise InputError(f"crop_px must be two positive sizes, got {self.crop_px}")
-        if not 0 < self.scale[0] <= self.scale[1] <= 10:
-            raise InputError(f"scale must be a range of positive sizes to 10, got {self.scale}")
-        if not 0 <= self.jitter < 1:
-            raise InputError(f"jitter must be in [0, 1), got {self.jitter}; the thesis takes 0.2")
-        if not 0 <= self.flip_share <= 1:
-            raise InputError(f"flip_share must be in [0, 1], got {self.flip_share}")
-        if not 0 <= self.erased_share <= 1:
-            raise InputError(f"erased_share must be in [0, 1], got {self.erased_share}")
-        if not 0 <= self.misaligned_px < 10:
-            raise InputError(f"misaligned_px must be in [0, 10), got {self.misaligned_px}")
+        check_settings(
+            self,
+            crop_px="[1, inf)",
+            scale="(0, 10]",
+            jitter="[0, 1)",
+            flip_share="[0, 1]",
+            erased_share="[0, 1]",
+            misaligned_px="[0, 10)",
+        )
+        if self.scale[0] > self.scale[1]:
+            raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,25 +136,16 @@ class StreetsConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
-        for name, value in (("seed", self.seed), ("frames", self.frames)):
-            if value < 0:
-                raise InputError(f"{name} must be 0 or more, got {value}")
-        if self.rigs not in ("kitti", "varied"):
-            raise InputError(f"rigs must be 'kitti' or 'varied', got {self.rigs!r}")
-        if not 0.02 <= self.scale <= 4:
-            raise InputError(f"scale must be from 0.02 to 4, got {self.scale}; 1 is full size")
-        if self.crop is not None and min(self.crop) < 1:
-            raise InputError(f"crop must be two positive sizes, got {self.crop}; None: no crop")
-        self._refuse_shares()
-        if not 0 <= self.rectification_error_px < 10:
-            raise InputError(
-                f"rectification_error_px must be from 0 to 10, got {self.rectification_error_px}"
-            )
-
-    def _refuse_shares(self) -> None:
-        for name, share in (("jpeg_share", self.jpeg_share), ("clutter_share", self.clutter_share)):
-            if not 0 <= share <= 1:
-                raise InputError(f"{name} must be from 0 to 1, got {share}")
+        check_settings(
+            self,
+            seed="[0, inf)",
+            frames="[0, inf)",
+            scale="[0.02, 4]",
+            crop="[1, inf)",
+            jpeg_share="[0, 1]",
+            clutter_share="[0, 1]",
+            rectification_error_px="[0, 10)",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,9 +185,4 @@ class PairsConfig:
 
     def __post_init__(self) -> None:
         """Refuse what selects nothing."""
-        if self.limit is not None and self.limit < 1:
-            raise InputError(f"limit must be 1 pair or more, got {self.limit}")
-        if self.focal_px is not None and not 0 < self.focal_px <= _MOST_FOCAL_PX:
-            raise InputError(
-                f"focal_px must be positive pixels, at most {_MOST_FOCAL_PX}, got {self.focal_px}"
-            )
+        check_settings(self, limit="[1, inf)", focal_px=f"(0, {_MOST_FOCAL_PX}]")

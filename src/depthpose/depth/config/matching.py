@@ -1,8 +1,9 @@
 """Settings of the stereo matchers, and the names of the baselines."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 
 BaselineName = Literal["rows", "nearest"]
@@ -37,19 +38,21 @@ class PSMNetConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if not 16 <= self.max_disparity_px <= 2**14 or self.max_disparity_px % 16:
+        check_settings(
+            self,
+            max_disparity_px="[16, 16384]",
+            width="[1, inf)",
+            blocks="[1, 1000]",
+            pools="[1, 1024]",
+            work_focal_px="(0, inf)",
+        )
+        if self.max_disparity_px % 16:
             raise InputError(
-                f"max_disparity_px must be a multiple of 16 up to {2**14} (the volume is a quarter "
-                f"of it and is halved twice), got {self.max_disparity_px}; take 192"
+                "max_disparity_px must be a multiple of 16 (the volume is a quarter of it and is "
+                f"halved twice), got {self.max_disparity_px}; take 192"
             )
-        if self.width < 1:
-            raise InputError(f"width must be 1 or more channels, got {self.width}; take 32")
-        if not 1 <= min(self.blocks) <= max(self.blocks) <= 1000:
-            raise InputError(f"each stage needs 1 to 1000 blocks, got blocks={self.blocks}")
-        if not 1 <= len(self.pools) <= 16 or not 1 <= min(self.pools) <= max(self.pools) <= 1024:
-            raise InputError(f"pools must hold 1 to 16 windows of 1 to 1024 px, got {self.pools}")
-        if self.work_focal_px is not None and self.work_focal_px <= 0:
-            raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
+        if not 1 <= len(self.pools) <= 16:
+            raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
 
     @property
     def step_px(self) -> int:
@@ -101,27 +104,26 @@ class LightConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if not 32 <= self.max_disparity_px <= 2**14 or self.max_disparity_px % 32:
+        check_settings(
+            self,
+            max_disparity_px="[32, 16384]",
+            groups="[1, inf)",
+            width="[1, inf)",
+            volume_widths="[1, inf)",
+            candidates=f"[1, {self.max_disparity_px // 4}]",
+            encoder_width="(0, 4]",
+            work_focal_px="(0, inf)",
+        )
+        if self.max_disparity_px % 32:
             raise InputError(
-                f"max_disparity_px must be a multiple of 32 up to {2**14} (the volume is a quarter "
-                f"of it and is halved three times), got {self.max_disparity_px}; take 192"
+                "max_disparity_px must be a multiple of 32 (the volume is a quarter of it and is "
+                f"halved three times), got {self.max_disparity_px}; take 192"
             )
-        if self.groups < 1 or self.width < 1 or self.width % self.groups:
+        if self.width % self.groups:
             raise InputError(
                 f"width must be a multiple of groups, got width={self.width} and "
                 f"groups={self.groups}; take 48 and 8"
             )
-        if min(self.volume_widths) < 1:
-            raise InputError(f"volume_widths must be positive, got {self.volume_widths}")
-        if not 1 <= self.candidates <= self.max_disparity_px // 4:
-            raise InputError(
-                f"candidates must be from 1 to {self.max_disparity_px // 4}, a quarter of "
-                f"max_disparity_px, got {self.candidates}; take 2"
-            )
-        if not 0 < self.encoder_width <= 4:
-            raise InputError(f"encoder_width must be in (0, 4], got {self.encoder_width}; take 1")
-        if self.work_focal_px is not None and self.work_focal_px <= 0:
-            raise InputError(f"work_focal_px must be positive, got {self.work_focal_px}")
 
     @property
     def step_px(self) -> int:
@@ -173,18 +175,9 @@ class MatcherConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that no run can have."""
-        if self.precision not in ("fp32", "bf16"):
-            raise InputError(f"precision must be 'fp32' or 'bf16', got {self.precision!r}")
-        if self.speed not in get_args(Speed):
-            raise InputError(f"speed must be 'quick' or 'fine', got {self.speed!r}")
-        if self.max_memory_bytes is not None and self.max_memory_bytes < 1:
-            raise InputError(
-                f"max_memory_bytes must be positive, got {self.max_memory_bytes}; None: no bound"
-            )
-        if self.tile_px is not None and min(self.tile_px) < 1:
-            raise InputError(f"tile_px must be two positive sizes, got {self.tile_px}")
-        if self.tile_overlap_px < 0:
-            raise InputError(f"tile_overlap_px must be 0 or more, got {self.tile_overlap_px}")
+        check_settings(
+            self, max_memory_bytes="[1, inf)", tile_px="[1, inf)", tile_overlap_px="[0, inf)"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,13 +222,12 @@ class SGBMConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that OpenCV would misread."""
-        if self.num_disparities < 16 or self.num_disparities % 16:
+        check_settings(self, num_disparities="[16, inf)", block_size="[1, inf)")
+        if self.num_disparities % 16:
             raise InputError(
-                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
+                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
             )
-        if self.block_size < 1 or self.block_size % 2 == 0:
-            raise InputError(f"block_size must be odd and positive, got {self.block_size}")
+        if self.block_size % 2 == 0:
+            raise InputError(f"block_size must be odd, got {self.block_size}")
         if not 0 < self.p1 < self.p2:
             raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
-        if self.mode not in ("sgbm", "hh", "sgbm_3way", "hh4"):
-            raise InputError(f"mode must be 'sgbm', 'hh', 'sgbm_3way' or 'hh4', got {self.mode!r}")

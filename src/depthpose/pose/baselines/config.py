@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from depthpose.core.errors import InputError
+from depthpose.core.config_values import check_settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,19 +29,8 @@ class DepthImageConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if self.classes < 1 or min(self.widths) < 1 or self.min_points < 1:
-            raise InputError(
-                f"classes is {self.classes}, widths {self.widths} and min_points "
-                f"{self.min_points}; all are 1 or more"
-            )
-        if self.crop_px < 32:
-            raise InputError(
-                f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take 128"
-            )
-        if not (self.margin >= 1 and self.contrast > 0):
-            raise InputError(
-                f"margin is {self.margin} and contrast {self.contrast}; take 1.1 and 0.1"
-            )
+        counts = dict.fromkeys(("classes", "widths", "min_points"), "[1, inf)")
+        check_settings(self, **counts, crop_px="[32, inf)", margin="[1, inf)", contrast="(0, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +63,8 @@ class PointNetConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if min(self.classes, self.keypoints, *self.local, *self.pooled, *self.head) < 1:
-            raise InputError(
-                f"classes {self.classes}, keypoints {self.keypoints} and channels {self.local}, "
-                f"{self.pooled}, {self.head} are all 1 or more"
-            )
-        if not self.unit_m > 0:
-            raise InputError(f"unit_m is {self.unit_m}; take 0.1")
+        counts = ("classes", "keypoints", "local", "pooled", "head")
+        check_settings(self, **dict.fromkeys(counts, "[1, inf)"), unit_m="(0, inf)")
 
     @property
     def components(self) -> int:
@@ -108,8 +92,4 @@ class FpfhConfig:
 
     def __post_init__(self) -> None:
         """Refuse voxels without a size, and no iteration."""
-        if self.voxel_diameters <= 0 or self.iterations < 1:
-            raise InputError(
-                f"voxel_diameters is {self.voxel_diameters} and iterations {self.iterations}; take "
-                "more than 0, and 1 at least"
-            )
+        check_settings(self, voxel_diameters="(0, inf)", iterations="[1, inf)")

@@ -1,8 +1,9 @@
 """Settings of the pose geometry: frozen dataclasses that check their values."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError, refuse_seed, refuse_unknown
 
 Unit = Literal["m", "mm"]
@@ -34,11 +35,7 @@ class MeshConfig:
 
     def __post_init__(self) -> None:
         """Refuse fewer keypoints than fix a pose."""
-        if self.keypoints < 4:
-            raise InputError(
-                f"keypoints is {self.keypoints}, but a pose with a spare is fixed by 4 or more; "
-                "take 8"
-            )
+        check_settings(self, keypoints="[4, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,32 +126,16 @@ class VotingConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
-        refuse_unknown("method", self.method, get_args(VotingMethod))
-        refuse_unknown("inlier_test", self.inlier_test, get_args(InlierTest))
+        check_settings(
+            self,
+            hypotheses="[1, inf)",
+            min_cosine="(0, 1)",
+            max_distance_m="(0, 1)",
+            refinements="[0, inf)",
+            max_condition="(1, inf)",
+            rigidity_diameters="(0, inf)",
+        )
         refuse_seed(self.seed)
-        if self.hypotheses < 1:
-            raise InputError(f"hypotheses is {self.hypotheses}, but one pair at least is tried; "
-                             "take 128")  # fmt: skip
-        if not 0 < self.min_cosine < 1:
-            raise InputError(
-                f"min_cosine is {self.min_cosine}, but it is a cosine between 0 and 1; 0.99 means "
-                "8 degrees"
-            )
-        if not 0 < self.max_distance_m < 1:
-            raise InputError(
-                f"max_distance_m is {self.max_distance_m}, but it is a positive part of a metre; "
-                "0.0005 means half a millimetre"
-            )
-        if self.refinements < 0:
-            raise InputError(f"refinements is {self.refinements}; take 0 or more")
-        if not self.max_condition > 1:
-            raise InputError(f"max_condition is {self.max_condition}, and no matrix is below 1; "
-                             "take 1000")  # fmt: skip
-        if not self.rigidity_diameters > 0:
-            raise InputError(
-                f"rigidity_diameters is {self.rigidity_diameters}, but no found distance is exact; "
-                "take 0.1"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,16 +164,13 @@ class IcpConfig:
 
     def __post_init__(self) -> None:
         """Refuse limits that grow, and counts of nothing."""
-        if not 1 <= self.starts <= 7:
-            raise InputError(
-                f"starts is {self.starts}; take 1, the voted pose, to 7: it, and turned one way "
-                "and the other about each axis of the camera"
-            )
-        if self.iterations < 1 or min(self.surface_points, self.cloud_points) < 100:
-            raise InputError(
-                f"iterations is {self.iterations}, surface_points {self.surface_points} and "
-                f"cloud_points {self.cloud_points}; take 1, 100 and 100 at least"
-            )
+        check_settings(
+            self,
+            starts="[1, 7]",
+            iterations="[1, inf)",
+            surface_points="[100, inf)",
+            cloud_points="[100, inf)",
+        )
         if not 0 < self.end_distance_diameters <= self.start_distance_diameters:
             raise InputError(
                 f"the distances go from {self.start_distance_diameters} to "

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 from depthpose.pose.types import SeenPoints
@@ -53,17 +54,8 @@ class ResUNetConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        sizes = {
-            "classes": self.classes,
-            "keypoints": self.keypoints,
-            "inputs": self.inputs,
-            "encoder": min(self.encoder),
-            "decoder": min(self.decoder),
-            "descriptor": 1 if self.descriptor is None else self.descriptor,
-        }
-        for name, size in sizes.items():
-            if size < 1:
-                raise InputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        sizes = ("classes", "keypoints", "inputs", "encoder", "decoder", "descriptor")
+        check_settings(self, **dict.fromkeys(sizes, "[1, inf)"))
         if self.first_kernel not in (1, 3, 5, 7):
             raise InputError(
                 f"first_kernel must be 1, 3, 5 or 7 (an odd kernel has a centre), got "

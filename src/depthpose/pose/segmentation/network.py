@@ -22,6 +22,7 @@ from depthpose.core.checkpoint import (
     save_checkpoint,
 )
 from depthpose.core.config import config_from_dict, config_to_dict
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 from depthpose.pose.resnet import ResNet18
 
@@ -49,17 +50,7 @@ class SegmentationConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if min(self.widths) < 1:
-            raise InputError(f"widths must be 1 or more, got {self.widths}")
-        if self.long_side_px < 32:
-            raise InputError(
-                f"long_side_px is {self.long_side_px}, but the coarsest feature is 32 pixels wide; "
-                "take 640"
-            )
-        if not 0 <= self.min_share < 1:
-            raise InputError(
-                f"min_share is {self.min_share}, but it is a share of the image; take 0.0005"
-            )
+        check_settings(self, widths="[1, inf)", long_side_px="[32, inf)", min_share="[0, 1)")
 
 
 class FCN(nn.Module):

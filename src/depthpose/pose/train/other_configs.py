@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.baselines.config import DepthImageConfig, PointNetConfig
@@ -70,10 +71,7 @@ class DepthImageTraining:
 
     def __post_init__(self) -> None:
         """Refuse a loss of nothing."""
-        if self.surface_points < 3:
-            raise InputError(
-                f"surface_points is {self.surface_points}, but 3 points fix a pose; take 500"
-            )
+        check_settings(self, surface_points="[3, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,19 +114,14 @@ class ImageAugmentConfig:
 
     def __post_init__(self) -> None:
         """Refuse windows and ranges that cannot be."""
+        check_settings(self, scale="(0, 10]", flip_share="[0, 1]", jitter="[0, 1)")
         if any(side < 32 or side % 32 for side in self.crop_px):
             raise InputError(
                 f"crop_px is {self.crop_px}, but the coarsest feature is 32 pixels wide; take "
                 "multiples of 32"
             )
-        if not 0 < self.scale[0] <= self.scale[1] <= 10:
-            raise InputError(
-                f"scale is {self.scale}; take a positive range up to 10, as (0.75, 1.5)"
-            )
-        if not (0 <= self.flip_share <= 1 and 0 <= self.jitter < 1):
-            raise InputError(
-                f"flip_share is {self.flip_share} and jitter {self.jitter}; both are shares"
-            )
+        if self.scale[0] > self.scale[1]:
+            raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,5 +163,4 @@ class SegmentationTraining:
 
     def __post_init__(self) -> None:
         """Refuse a loss that ignores the objects."""
-        if not self.object_weight > 0:
-            raise InputError(f"object_weight is {self.object_weight}; take a positive number, 3")
+        check_settings(self, object_weight="(0, inf)")
