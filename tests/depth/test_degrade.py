@@ -60,9 +60,9 @@ def test_jpeg_loses_more_at_lower_quality() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"blur_share": 1.5}, "blur_share must be from 0 to 1"),
+        ({"blur_share": 1.5}, r"blur_share must be in \[0, 1\]"),
         ({"colour": 1.0}, r"colour must be in \[0, 1\)"),
-        ({"noise": -1.0}, "noise 0 or more"),
+        ({"noise": -1.0}, r"noise must be in \[0, inf\)"),
     ],
 )
 def test_shares_that_are_none_are_refused(changes: dict[str, float], message: str) -> None:

@@ -124,7 +124,7 @@ def test_nothing_to_fill_from_is_an_error() -> None:
     ("settings", "text"),
     [
         ({"num_disparities": 100}, "multiple of 16, got 100"),
-        ({"block_size": 4}, "block_size must be odd and positive, got 4"),
+        ({"block_size": 4}, "block_size must be odd, got 4"),
         ({"p1": 9, "p2": 3}, "0 < p1 < p2, got p1=9, p2=3"),
     ],
 )

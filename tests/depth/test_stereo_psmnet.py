@@ -162,9 +162,9 @@ def test_import_names_what_is_missing_unknown_and_misshaped() -> None:
     ("settings", "text"),
     [
         ({"max_disparity_px": 100}, "multiple of 16.*got 100; take 192"),
-        ({"max_disparity_px": 0}, "multiple of 16.*got 0"),
-        ({"width": 0}, "width must be 1 or more channels, got 0"),
-        ({"blocks": (1, 0, 1, 1)}, "each stage needs 1 to 1000 blocks"),
+        ({"max_disparity_px": 0}, r"max_disparity_px must be in \[16, 16384\], got 0"),
+        ({"width": 0}, r"width must be in \[1, inf\), got 0"),
+        ({"blocks": (1, 0, 1, 1)}, r"blocks must be in \[1, 1000\]"),
         ({"pools": ()}, "pools must hold 1 to 16 windows"),
     ],
 )
@@ -176,9 +176,9 @@ def test_network_config_refuses_nonsense(settings: dict, text: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"max_memory_bytes": 0}, "max_memory_bytes must be positive"),
-        ({"tile_px": (0, 5)}, "tile_px must be two positive sizes"),
-        ({"tile_overlap_px": -1}, "tile_overlap_px must be 0 or more"),
+        ({"max_memory_bytes": 0}, "max_memory_bytes must be in"),
+        ({"tile_px": (0, 5)}, "tile_px must be in"),
+        ({"tile_overlap_px": -1}, "tile_overlap_px must be in"),
     ],
 )
 def test_matcher_config_refuses_nonsense(settings: dict, text: str) -> None:

@@ -286,13 +286,13 @@ def test_registration_finds_a_seen_pose_and_refuses_two_points() -> None:
 @pytest.mark.parametrize(
     ("config", "said"),
     [
-        (lambda: DepthImageConfig(classes=0), "classes is 0"),
-        (lambda: DepthImageConfig(crop_px=16), "crop_px is 16.*take 128"),
-        (lambda: DepthImageConfig(margin=0.5), "margin is 0.5"),
-        (lambda: PointNetConfig(keypoints=0), "keypoints 0"),
-        (lambda: PointNetConfig(unit_m=0.0), "unit_m is 0.0"),
-        (lambda: FpfhConfig(voxel_diameters=0.0), "voxel_diameters is 0.0"),
-        (lambda: FpfhConfig(iterations=0), "iterations 0; take"),
+        (lambda: DepthImageConfig(classes=0), "classes must be in"),
+        (lambda: DepthImageConfig(crop_px=16), "crop_px must be in .*default is 128"),
+        (lambda: DepthImageConfig(margin=0.5), "margin must be in"),
+        (lambda: PointNetConfig(keypoints=0), "keypoints must be in"),
+        (lambda: PointNetConfig(unit_m=0.0), "unit_m must be in"),
+        (lambda: FpfhConfig(voxel_diameters=0.0), "voxel_diameters must be in"),
+        (lambda: FpfhConfig(iterations=0), "iterations must be in"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(config: Any, said: str) -> None:  # noqa: ANN401

@@ -367,7 +367,7 @@ def test_an_object_of_one_point_is_refused() -> None:
 
 
 def test_too_few_keypoints_are_refused() -> None:
-    with pytest.raises(InputError, match=r"keypoints is 3, but .* take 8"):
+    with pytest.raises(InputError, match=r"keypoints must be in .* default is 8"):
         MeshConfig(keypoints=3)
 
 

@@ -190,9 +190,9 @@ def test_overlap_of_a_worked_example() -> None:
 @pytest.mark.parametrize(
     ("setting", "value", "said"),
     [
-        ("widths", (0, 1, 1, 1), "widths must be 1 or more"),
-        ("long_side_px", 16, "long_side_px is 16.*take 640"),
-        ("min_share", 1.0, "min_share is 1.0.*share of the image"),
+        ("widths", (0, 1, 1, 1), "widths must be in"),
+        ("long_side_px", 16, "long_side_px must be in .*got 16"),
+        ("min_share", 1.0, "min_share must be in .*got 1.0"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(setting: str, value: Any, said: str) -> None:  # noqa: ANN401
