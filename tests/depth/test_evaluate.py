@@ -25,7 +25,6 @@ from depthpose.depth.predictions import (
     read_disparity,
     read_estimate,
     write_estimate,
-    write_estimate_cloud,
 )
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
@@ -250,7 +249,7 @@ def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:
     assert written == ["x.color.png", "x.disparity_px.npy", "x.right.png"]
     assert is_finished(tmp_path, "x")
     with pytest.raises(InputError, match="a cloud needs metres"):
-        write_estimate_cloud(tmp_path, pair, estimate)
+        write_estimate(tmp_path, pair, estimate, cloud_m=80.0)
 
 
 def test_an_estimate_is_read_back(tmp_path: Path) -> None:

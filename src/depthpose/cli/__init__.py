@@ -5,7 +5,6 @@ when it runs, so that every ``--help`` is quick.
 """
 
 import errno
-import os
 import platform
 import sys
 import warnings
@@ -16,7 +15,15 @@ from importlib.metadata import version
 from inspect import cleandoc, signature
 
 from depthpose import __version__
-from depthpose.core.errors import InputError, MissingExtraError, Notice, nearest_name
+from depthpose.cli.streams import lasting_streams
+from depthpose.core.errors import (
+    InputError,
+    MissingExtraError,
+    Notice,
+    full_memory,
+    is_of_memory,
+    nearest_name,
+)
 
 COMMANDS = {
     "demo": (
@@ -127,7 +134,7 @@ _THESIS = ("reproduce", "figure")
 """Groups of commands that reproduce the thesis."""
 _EXIT_CODES = """exit codes:
   0    done
-  1    done, but something in the input failed (it is named)
+  1    done, but something in the input failed, or the output could not be written (it is named)
   2    wrong usage or unreadable input
   130  interrupted"""
 
@@ -146,10 +153,21 @@ def main(words: Sequence[str] | None = None) -> int:
         words: what follows ``depthpose``; the process's own arguments by default.
 
     Returns:
-        The exit code: 0 done, 1 something in the input failed, 2 unusable, 130 interrupted,
-        141 nobody reads the output.
+        The exit code: 0 done, 1 something in the input failed or the output cannot be written,
+        2 unusable, 130 interrupted, 141 nobody reads the output.
     """
-    given = list(sys.argv[1:] if words is None else words)
+    with lasting_streams() as output:
+        code = _command(list(sys.argv[1:] if words is None else words))
+    if output.failure is None:
+        return code
+    if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'
+        return 141
+    reason = output.failure.strerror
+    lost = f"standard output: cannot be written: {reason}; all files are written as without it"
+    return _fail(f"error: {lost}", code or 1)
+
+
+def _command(given: list[str]) -> int:
     if given in (["--version"], ["-V"]):
         return _say_version()
     name, rest = _split_command(given)
@@ -164,6 +182,10 @@ def main(words: Sequence[str] | None = None) -> int:
         return _fail(f"error: {error}")
     except OSError as error:
         return _end_for(error)
+    except (MemoryError, RuntimeError, ImportError) as error:
+        if not is_of_memory(error):
+            raise
+        return _fail(f"error: {full_memory(error)}; what was finished is kept")
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
     finally:
@@ -177,9 +199,8 @@ def _fail(reason: str, code: int = 2) -> int:
 
 
 def _end_for(error: OSError) -> int:
-    if isinstance(error, BrokenPipeError):  # nobody reads the output any longer, as in '| head'
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is buffered
-        return 141
+    if is_of_memory(error):
+        return _fail(f"error: {full_memory(error)}; what was finished is kept")
     if error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
         raise error
     return _fail(f"error: {_message_of(error)}")

@@ -18,6 +18,7 @@ from torch.overrides import TorchFunctionMode
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import refused_as, write_bytes
+from depthpose.core.files.text import refuse_number
 from depthpose.core.hub import SHIPPED as SHIPPED
 from depthpose.core.hub import find_weights as find_weights
 
@@ -80,12 +81,13 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
         kind: the kind that the caller can use; None takes any.
 
     Raises:
-        InputError: missing, truncated, not safetensors, without our metadata, or of another kind.
+        InputError: missing, truncated, not safetensors, without our metadata, of another kind, or
+            with numbers that are not finite.
     """
     path = Path(path)
     with _opened_safetensors(path) as file:
         found, config, facts = _interpreted(path, dict(file.metadata() or {}), kind)
-        return Checkpoint(kind=found, config=config, state=_tensors(file), facts=facts)
+        return Checkpoint(kind=found, config=config, state=_tensors(path, file), facts=facts)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -199,12 +201,13 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
         network: what it should hold, for errors.
 
     Raises:
-        InputError: missing, damaged, holding pickled code, or no tensors by name.
+        InputError: missing, damaged, holding pickled code, no tensors by name, or numbers that are
+            not finite.
     """
     path = Path(path)
     if path.suffix == ".safetensors":
         with _opened_safetensors(path) as file:
-            return _tensors(file)
+            return _tensors(path, file)
     content = read_torch_file(path)
     state = content.get("state_dict", content)
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
@@ -212,7 +215,7 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
             f"{path}: holds no tensors by name, so it is no {network}. Its entries are "
             f"{', '.join(map(repr, list(content)[:5]))}."
         )
-    return state
+    return _finite(path, state)
 
 
 def save_imported(
@@ -286,8 +289,26 @@ def _opened_safetensors(path: Path) -> Iterator[Any]:
         yield file
 
 
-def _tensors(file: Any) -> dict[str, Tensor]:  # noqa: ANN401  safetensors has no type of it
-    return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+def _tensors(path: Path, file: Any) -> Mapping[str, Tensor]:  # noqa: ANN401  safetensors' own
+    return _finite(path, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+
+
+def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """Refuse numbers of which a network would make depth or poses of nothing."""
+    for name, tensor in state.items():
+        # A sum takes no memory; a large one may overflow though every number is finite.
+        is_finite = not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()
+        if not is_finite and (bad := tensor.numel() - int(tensor.isfinite().sum())):
+            raise InputError(
+                f"{path}: {bad} of the {tensor.numel()} numbers of {name!r} are NaN or infinite, so "
+                "its training diverged or the file is damaged; take other weights"
+            )
+        if name.endswith("running_var") and (tensor < 0).any():
+            raise InputError(
+                f"{path}: {name!r} holds a variance below 0, so the file is damaged; take other "
+                "weights"
+            )
+    return state
 
 
 def _interpreted(
@@ -303,7 +324,7 @@ def _interpreted(
     if kind is not None and found != kind:
         raise InputError(f"{path}: holds weights of kind {found!r}, but {kind!r} is needed here.")
     try:
-        config = json.loads(metadata.pop("config"))
+        config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):

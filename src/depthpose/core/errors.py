@@ -1,6 +1,8 @@
 """The one error that bad input raises, the notice that stops nothing, and the nearest name."""
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -30,6 +32,38 @@ def install_command(extra: str) -> str:
 
 class Notice(UserWarning):
     """A warning that stops nothing; the command line prints it as one line."""
+
+
+_OF_MEMORY = re.compile(
+    r"(out of|not enough|insufficient) memory|(can't|cannot|unable to|failed to) (allocate|map)"
+    r"|bad_alloc",
+    re.IGNORECASE,
+)
+
+
+def is_of_memory(error: BaseException) -> bool:
+    """Whether an error says that the memory is full, whichever library raised it."""
+    return isinstance(error, MemoryError) or _OF_MEMORY.search(str(error)) is not None
+
+
+def full_memory(error: BaseException) -> str:
+    """Say that the memory is full, and what to do."""
+    said = " ".join(str(error).split())[:200] or "no more is given"
+    return (
+        f"the memory is full ({said}); end other programs, raise the limit (ulimit -v), take "
+        "smaller images, or of a stereo matcher --max-memory or --tile"
+    )
+
+
+@contextmanager
+def refused_memory(name: str) -> Iterator[None]:
+    """Turn a full memory into an :class:`InputError`: smaller inputs of a folder may fit."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_of_memory(error):
+            raise
+        raise InputError(f"{name}: {full_memory(error)}") from error
 
 
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, remove_parts, write_json
 from depthpose.core.lock import lock_folder, rewrite_record, write_once
+from depthpose.core.results import note_result, noted_files
 
 RECORD = "run.json"
 _SOURCES = "sources.json"
@@ -181,8 +183,7 @@ def claim_names(
     record = folder / _SOURCES
     # Listed before the record is read: what another process writes, its record names by then.
     results = _results_there(folder, endings)
-    there = read_json(record) if record.exists() else {}
-    known = there if isinstance(there, dict) else {}
+    known = _known_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted = {name: _entry(files) for name, files in sources.items()}
     for name, (path, stamp) in wanted.items():
@@ -205,7 +206,11 @@ def claim_names(
     for stem, file in results.items():
         is_frame = _FRAME.sub("", stem) in new & set(videos)
         if stem not in known and (stem in new or is_frame):
-            raise not_ours(file)
+            if file not in noted_files(folder, stem):
+                raise not_ours(file)
+            note_result(folder, stem, [])
+    for name in filter(partial(noted_files, folder), new):  # of which source is not known any more
+        note_result(folder, name, [])
     if any(known.get(name) != entry for name, entry in wanted.items()):
         write_json(record, known | wanted)
 
@@ -218,11 +223,17 @@ def _entry(files: Path | Sequence[Path]) -> list[str]:
 
 def read_sources(folder: Path) -> dict[str, Path]:
     """Give the file that each result of ``folder`` was made from, by the name of the result."""
-    record = folder / _SOURCES
-    known = read_json(record) if record.exists() else {}
-    files = known.items() if isinstance(known, dict) else ()
-    found = {name: _source(entry)[0] for name, entry in files}
+    found = {name: _source(entry)[0] for name, entry in _known_sources(folder).items()}
     return {name: Path(path) for name, path in found.items() if path}
+
+
+def _known_sources(folder: Path) -> dict[str, object]:
+    """Read the record of sources; one that is damaged says nothing, and is written again."""
+    try:
+        known = read_json(folder / _SOURCES) if (folder / _SOURCES).exists() else {}
+    except InputError:
+        return {}
+    return known if isinstance(known, dict) else {}
 
 
 def _source(entry: object) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import depth_errors, disparity_errors
-from depthpose.depth.predictions import write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
 from depthpose.report.depth import DepthError, DepthShown, depth_section
@@ -162,8 +162,7 @@ def _show(folder: Path, title: str, sample: StereoSample, estimate: DepthEstimat
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
     range_m = _range_m(sample)
-    write_estimate(folder, sample.input, estimate, range_m)
-    write_estimate_cloud(folder, sample.input, estimate)
+    write_estimate(folder, sample.input, estimate, range_m, CLOUD_M)
     error = DepthError(error=(estimate.disparity_px - truth_px).abs(), is_disparity=True)
     shown = DepthShown(pair=sample.input, estimate=estimate, range_m=range_m, error=error)
     return depth_section(title, shown, with_image=False)

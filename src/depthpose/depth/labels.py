@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,6 +13,8 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, write_disparity_png, write_image
+from depthpose.core.files.text import read_text
+from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
@@ -80,14 +83,12 @@ def label_pairs(
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
     sources = {frames[n].name: frames[n].seen_files() for n in usable}
-    truth = folder / "disp_occ"
-    claim_names(folder, sources, is_finished=lambda name: (truth / f"{name}.png").is_file())
+    claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
     rigs = _read_rigs(dataset, usable, failures)
     _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
     for number in rigs:
         name = frames[number].name
-        path = folder / "disp_occ" / f"{name}.png"
-        if path.is_file():
+        if _is_labelled(folder, name):
             continue
         try:
             pair = dataset.read_input(number)
@@ -96,10 +97,16 @@ def label_pairs(
             _take(error, failures)
             continue
         assert pair.right is not None
-        write_image(folder / "left" / f"{name}.png", pair.left)
-        write_image(folder / "right" / f"{name}.png", pair.right)
-        write_disparity_png(path, known_px)
+        files = [folder / place / f"{name}.png" for place in ("left", "right", "disp_occ")]
+        write_image(files[0], pair.left)
+        write_image(files[1], pair.right)
+        write_disparity_png(files[2], known_px)
+        note_result(folder, name, files)
         yield name, float(known_px.isfinite().float().mean())
+
+
+def _is_labelled(folder: Path, name: str) -> bool:
+    return is_whole(folder, name, [f"disp_occ/{name}.png"])
 
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Float[Tensor, "h w"]:
@@ -145,6 +152,7 @@ def _read_rigs(
     for number in usable:
         try:
             rig = dataset.read_rig(number)
+            _refuse_bytes(dataset.frames[number].name)
         except InputError as error:
             _take(error, failures)
             continue
@@ -155,10 +163,19 @@ def _read_rigs(
     return rigs
 
 
+def _refuse_bytes(name: str) -> None:
+    if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
+        raise InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file")
+
+
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
     """Write a line for each pair, beside those of other pairs that are there."""
-    there = path.read_text().splitlines() if path.is_file() else []
-    lines = {line.rsplit(maxsplit=8)[0]: line for line in there}
+    try:
+        there = read_text(path).splitlines() if path.is_file() else []
+    except InputError:  # damaged: the lines of these pairs are made again
+        there = []
+    parts = [line.rsplit(maxsplit=8) for line in there]
+    lines = {part[0]: line for part, line in zip(parts, there, strict=True) if len(part) == 9}
     for name, rig in rigs.items():
         K, shift_px = rig.K, rig.cx_right_minus_left_px
         values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)

@@ -23,6 +23,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.text import read_text
+from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
@@ -47,6 +48,8 @@ ENDINGS = (
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
+CLOUD_M = 80.0
+"""Distance up to which a cloud is written, unless another is given."""
 COLOR_RANGE_M = (3.0, 80.0)
 """Near and far end of the colours of depth, one for all pictures, so that they compare."""
 
@@ -56,40 +59,43 @@ def write_estimate(
     pair: StereoInput,
     estimate: DepthEstimate,
     range_m: tuple[float, float] = COLOR_RANGE_M,
-) -> None:
-    """Write the files of one estimate; the disparity comes last and marks the frame as finished.
+    cloud_m: float | None = None,
+) -> list[Path]:
+    """Write the files of one estimate, and give them; the disparity comes last.
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
     ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
-    ``NAME.warning.txt`` and ``NAME.disparity_px.npy``, each where the estimate has it. The
-    disparity is that of the frame's own rig.
+    ``NAME.warning.txt`` and ``NAME.disparity_px.npy``, each where the estimate has it, and
+    ``NAME.cloud.ply`` (:func:`estimate_cloud`) of what is nearer than ``cloud_m``, if that is
+    given. The disparity is that of the frame's own rig.
     """
-    base = folder / pair.name
+    written: list[Path] = []
+
+    def new(ending: str) -> Path:
+        written.append(_file(folder / pair.name, ending))
+        return written[-1]
+
+    if cloud_m is not None:
+        write_cloud(new(CLOUD), estimate_cloud(pair, estimate, cloud_m))
     if estimate.warning:
-        write_bytes(_file(base, "warning.txt"), f"{estimate.warning}\n".encode())
+        write_bytes(new("warning.txt"), f"{estimate.warning}\n".encode())
     if estimate.depth_m is not None:
-        write_map(_file(base, "depth_m.npy"), estimate.depth_m)
-        write_depth_png(_file(base, "depth.png"), estimate.depth_m)
+        write_map(new("depth_m.npy"), estimate.depth_m)
+        write_depth_png(new("depth.png"), estimate.depth_m)
     if estimate.confidence is not None:
-        write_map(_file(base, "confidence.npy"), estimate.confidence)
+        write_map(new("confidence.npy"), estimate.confidence)
     if estimate.right is not None:
-        write_image(_file(base, "right.png"), estimate.right)
+        write_image(new("right.png"), estimate.right)
     if estimate.is_sky is not None:
-        write_image(_file(base, "sky.png"), estimate.is_sky.float().expand(3, -1, -1))
+        write_image(new("sky.png"), estimate.is_sky.float().expand(3, -1, -1))
     picture = (
         draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
         if estimate.depth_m is None
         else draw_depth(estimate.depth_m, *range_m)
     )
-    write_image(_file(base, "color.png"), picture)
-    write_map(_file(base, "disparity_px.npy"), estimate.disparity_px)
-
-
-def write_estimate_cloud(
-    folder: Path, pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0
-) -> None:
-    """Write ``NAME.cloud.ply``: what :func:`estimate_cloud` gives."""
-    write_cloud(_file(folder / pair.name, CLOUD), estimate_cloud(pair, estimate, far_m))
+    write_image(new("color.png"), picture)
+    write_map(new("disparity_px.npy"), estimate.disparity_px)
+    return written
 
 
 def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80.0) -> Cloud:
@@ -101,14 +107,10 @@ def estimate_cloud(pair: StereoInput, estimate: DepthEstimate, far_m: float = 80
     return replace(estimate, seen=pair).cloud(far_m)
 
 
-def is_finished(folder: Path, name: str) -> bool:
-    """Whether an earlier run left the estimate of this frame."""
-    return _file(folder / name, "disparity_px.npy").is_file()
-
-
-def has_cloud(folder: Path, name: str) -> bool:
-    """Whether an earlier run left the cloud of this frame."""
-    return _file(folder / name, CLOUD).is_file()
+def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
+    """Whether an earlier run left the estimate of this frame whole, and its cloud if wanted."""
+    endings = ("disparity_px.npy", CLOUD) if with_cloud else ("disparity_px.npy",)
+    return is_whole(folder, name, [f"{name}.{ending}" for ending in endings])
 
 
 def has_prediction(folder: Path, name: str) -> bool:
@@ -207,7 +209,7 @@ def predict(
     for name, read_input in inputs.items():
         if not is_finished(folder, name):
             pair = read_input()
-            write_estimate(folder, pair, net.estimate_pair(pair))
+            note_result(folder, name, write_estimate(folder, pair, net.estimate_pair(pair)))
         yield name
 
 

@@ -106,9 +106,9 @@ def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
     """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
     write_json(folder / f"{name}.json", [dict(row) for row in rows])
     with atomic_write(folder / f"{name}.csv") as temporary:
-        temporary.write_text(csv_table(rows))
+        temporary.write_text(csv_table(rows), encoding="utf-8", errors="backslashreplace")
     with atomic_write(folder / f"{_markdown_name(name)}.md") as temporary:
-        temporary.write_text(markdown_table(rows))
+        temporary.write_text(markdown_table(rows), encoding="utf-8", errors="backslashreplace")
 
 
 def _markdown_name(name: str) -> str:
@@ -165,7 +165,7 @@ def write_markdown(
         parts += [markdown_table(section.rows)] if section.rows else []
     parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
     with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
+        temporary.write_text("\n".join(parts), encoding="utf-8", errors="backslashreplace")
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
@@ -207,4 +207,4 @@ def write_page(
         title=title, sections=sections, environment=environment
     )
     with atomic_write(path) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+        temporary.write_text(html, encoding="utf-8", errors="backslashreplace")

@@ -9,7 +9,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.rig import square_camera
-from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate, write_estimate_cloud
+from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.depth import depth_facts, depth_scene, grey_caption
@@ -42,8 +42,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     seconds = time.perf_counter() - began
     assert found.depth_m is not None
     folder = form.results()
-    write_estimate(folder, pair, found, (near_m, far_m))
-    write_estimate_cloud(folder, pair, found, far_m)
+    write_estimate(folder, pair, found, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
     focal = " (guessed as 0.75 widths: the metres are as wrong as the guess)" if is_guess else ""
     pictures = _pictures(pair, found, (near_m, far_m))

@@ -117,7 +117,7 @@ def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
     from tqdm import tqdm
 
     from depthpose.core.run import claim_folder
-    from depthpose.depth.datasets import has_raw_frame
+    from depthpose.depth.datasets import has_calibration, has_raw_frame
     from depthpose.depth.synthetic import rig_number
 
     config = streets.config
@@ -126,7 +126,9 @@ def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
     claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
     indices = range(streets.first, streets.first + streets.number)
     drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
-    wanted = [index for index in indices if not has_raw_frame(out, drives[index], index)]
+    dates = {drive[:10]: index for index, drive in drives.items()}
+    lost = {index for date, index in dates.items() if not has_calibration(out, date)}
+    wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
     for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
         _make_street(out, drives[index], config, index)
     print(f"{out}: {len(wanted)} frames made, {streets.number - len(wanted)} were there")
@@ -157,7 +159,7 @@ def make_objects(
     claim_folder(out, settings, ["models", frames.split])
     write_bop_models(out, models)
     scenes = _scenes(frames)
-    wanted = {k: v for k, v in scenes.items() if not _is_made(out / frames.split, k, v)}
+    wanted = {k: v for k, v in scenes.items() if not _is_made(out, frames.split, k, v)}
     _make_scenes(wanted, models, frames, out)
     print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
     return 0
@@ -202,6 +204,7 @@ def _make_scenes(
 ) -> None:
     from tqdm import tqdm
 
+    from depthpose.core.results import note_result
     from depthpose.pose.datasets import write_bop_scene
     from depthpose.pose.synthetic import make_frames
 
@@ -212,7 +215,9 @@ def _make_scenes(
             for frame in make_frames(models, options.config, len(scene), scene.start):
                 frames.append(frame)
                 bar.update()
-            write_bop_scene(out, options.split, number, frames)
+            home = write_bop_scene(out, options.split, number, frames)
+            files = sorted(path for path in home.rglob("*") if path.is_file())
+            note_result(out, home.relative_to(out).as_posix(), files)
 
 
 def _fingerprint(path: Path) -> dict[str, str]:
@@ -221,14 +226,15 @@ def _fingerprint(path: Path) -> dict[str, str]:
     return {"file": path.name, "sha256": file_sha256(path)}
 
 
-def _is_made(split: Path, scene: int, frames: range) -> bool:
-    """Whether a scene exists with all of its frames, by the file that is written last."""
+def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
+    """Whether a scene exists with all of its frames, every file as it was written."""
     from depthpose.core.files import read_json
+    from depthpose.core.results import is_whole
 
-    path = split / f"{scene:06d}" / "scene_camera.json"
-    if not path.is_file():
+    home = f"{split}/{scene:06d}"
+    if not is_whole(out, home, [f"{home}/scene_camera.json"]):
         return False
-    there = read_json(path)
+    there = read_json(out / home / "scene_camera.json")
     return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.depth.evaluating import signed
-from depthpose.cli.depth.matching import refuse_unrectified_pair, rig_facts, write_match
+from depthpose.cli.depth.matching import refuse_unrectified_pair, rig_facts
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
 from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
@@ -40,7 +40,7 @@ from depthpose.depth.config import Answer, MatcherConfig
 from depthpose.depth.datasets import Dataset, open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import Evaluation, Measured, measure_frame, summarise
-from depthpose.depth.predictions import ENDINGS
+from depthpose.depth.predictions import CLOUD_M, ENDINGS, write_estimate
 from depthpose.depth.types import StereoInput
 
 IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
@@ -176,7 +176,8 @@ def _match(
         try:
             left, right = sample.files
             pair = _read_pair(sample.name, left, right, rig)
-            write_match(out, pair, method.net.estimate_pair(pair), with_cloud=with_cloud)
+            cloud_m = CLOUD_M if with_cloud else None
+            write_estimate(out, pair, method.net.estimate_pair(pair), cloud_m=cloud_m)
             reasons.append("")
         except InputError as error:
             reasons.append(str(error))

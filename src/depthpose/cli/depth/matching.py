@@ -14,17 +14,12 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
 from depthpose.core.files.names import refuse_unpaired
+from depthpose.core.results import note_result
 from depthpose.core.run import claim_folder, claim_names, find_rank
 from depthpose.depth.estimator import FakestereoNet, refuse_unrectified, usable_right
-from depthpose.depth.predictions import (
-    ENDINGS,
-    has_cloud,
-    is_finished,
-    write_estimate,
-    write_estimate_cloud,
-)
+from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, write_estimate
 from depthpose.depth.stereo import NetworkMatcher, tile_change_px
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +108,7 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     mine = find_rank().share(len(pairs.left))
     for index in tqdm(mine, unit=" pairs", disable=None):
         name = pairs.left[index].stem
-        if is_finished(out, name) and (not with_cloud or has_cloud(out, name)):
+        if is_finished(out, name, with_cloud=with_cloud):
             continue
         try:
             pair = pairs.read(index)
@@ -123,20 +118,14 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
                 raise
             failures.append(str(error))
             continue
-        write_match(out, pair, estimate, with_cloud=with_cloud)
+        cloud_m = CLOUD_M if with_cloud else None
+        note_result(out, name, write_estimate(out, pair, estimate, cloud_m=cloud_m))
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{len(mine) - len(failures)} of {len(mine)} pairs are in {out}")
     if find_rank().rank == 0:
         _write_page(pairs, out, failures)
     return 1 if failures else 0
-
-
-def write_match(out: Path, pair: StereoInput, estimate: DepthEstimate, *, with_cloud: bool) -> None:
-    """Write the files of a matched pair; the disparity comes last."""
-    if with_cloud:
-        write_estimate_cloud(out, pair, estimate)
-    write_estimate(out, pair, estimate)
 
 
 def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:

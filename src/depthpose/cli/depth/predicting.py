@@ -29,14 +29,14 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
+from depthpose.core.results import note_result
 from depthpose.core.run import claim_folder, claim_names, find_rank, refuse_among_inputs
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import (
+    CLOUD_M,
     ENDINGS,
-    has_cloud,
     is_finished,
     write_estimate,
-    write_estimate_cloud,
 )
 from depthpose.depth.types import StereoInput
 from depthpose.report.viewer import Viewer, open_viewer
@@ -206,13 +206,17 @@ class Predictor:
 
     def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
         """Predict inputs together; where one of them is unusable, each alone."""
-        wanted = [given for given in inputs if not self._is_finished(given.name)]
+        wanted = [
+            given
+            for given in inputs
+            if not is_finished(self.out, given.name, with_cloud=self.look.cloud)
+        ]
         try:
             found = self.net.estimate_many(wanted)
             for given, estimate in zip(wanted, found, strict=True):
-                if self.look.cloud:
-                    write_estimate_cloud(self.out, given, estimate)
-                write_estimate(self.out, given, estimate, self.look.color_range)
+                cloud_m = CLOUD_M if self.look.cloud else None
+                files = write_estimate(self.out, given, estimate, self.look.color_range, cloud_m)
+                note_result(self.out, given.name, files)
                 if estimate.warning:
                     tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
                 if self.viewer is not None:
@@ -223,10 +227,6 @@ class Predictor:
             self.failures[inputs[0].name] = error
             return []
         return [given.name for given in inputs]
-
-    def _is_finished(self, name: str) -> bool:
-        is_drawn = not self.look.cloud or has_cloud(self.out, name)
-        return is_drawn and is_finished(self.out, name)
 
 
 def _first_size(sources: Sequence[Path]) -> tuple[int, int] | None:

@@ -21,8 +21,7 @@ from depthpose.pose.predictions import (
     Job,
     Prediction,
     is_finished,
-    is_started,
-    read_predictions,
+    kept_predictions,
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate, ViewInput
@@ -60,7 +59,7 @@ def _find_left(
     jobs: Sequence[Job[Any]], objects: tuple[str, ...], method: PoseMethod, out: Path
 ) -> list[tuple[Prediction, Job[Any]]]:
     """Search the images of which no earlier run left a result; all are written after each."""
-    left = [p for p in read_predictions(out) if is_finished(p)] if is_started(out) else []
+    left = [p for p in kept_predictions(out) if is_finished(p)]
     found: list[tuple[Prediction, Job[Any]]] = []
     for job in tqdm(jobs, disable=None, unit=" images"):
         own = [p for p in left if is_result_of(p.estimate.name, job.name)]

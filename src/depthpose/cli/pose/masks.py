@@ -144,8 +144,13 @@ def _segmented(
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
     file, record = home.parent / f"{name}.json", home / "images.json"
-    done = _read_images(record)
-    known = [d for d in read_detections(file) if (d.scene_id, d.image_id) in done] if done else []
+    try:
+        done = _read_images(record)
+        known = (
+            [d for d in read_detections(file) if (d.scene_id, d.image_id) in done] if done else []
+        )
+    except InputError:  # damaged or missing: all is segmented again
+        done, known = set(), []
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     left = [images[place] for place in sorted(images.keys() - done)]
     if left:

@@ -16,16 +16,15 @@ from tqdm import tqdm
 
 from depthpose.cli.pose.inputs import Unreadable
 from depthpose.cli.pose.methods import EstimateMany, PoseMethod
-from depthpose.core.files import (
-    write_cloud,
-    write_image,
-)
+from depthpose.core.files import write_cloud, write_image
+from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
     claim_names,
     find_rank,
+    read_sources,
     wait_for,
 )
 from depthpose.pose.cloud import object_points
@@ -38,9 +37,8 @@ from depthpose.pose.predictions import (
     Prediction,
     alternatives_name,
     is_finished,
-    is_started,
+    kept_predictions,
     predict,
-    read_predictions,
     results_name,
     write_bop_results,
     write_predictions,
@@ -81,6 +79,8 @@ def claim(
             over.
     """
     claim_folder(out, settings, [POSES, PAGE])
+    if find_rank().world == 1 and not read_sources(out):  # lost: of what the poses are
+        (out / POSES).unlink(missing_ok=True)
     endings = [f".{end}" for end in (PICTURE, CLOUD)]
     done = _finished(out)
     sources = {job.name: job.source or source for job in jobs}
@@ -181,10 +181,13 @@ def write_files(
             continue
         given, model = job.read(), _model(method, estimate.object)
         points_m = object_points(given, model.diameter_m)
-        write_cloud(out / f"{job.name}.{CLOUD}", posed_cloud(points_m, pose, model))
+        files = [out / f"{job.name}.{CLOUD}"]
+        write_cloud(files[0], posed_cloud(points_m, pose, model))
         if isinstance(given, ViewInput):
             picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
-            write_image(out / f"{job.name}.{PICTURE}", picture)
+            files.append(out / f"{job.name}.{PICTURE}")
+            write_image(files[1], picture)
+        note_result(out, job.name, files)
 
 
 def write_bop_files(
@@ -200,9 +203,10 @@ def write_bop_files(
         if prediction.place is not None and prediction.estimate.is_ok:
             found[prediction.place[:2]].append(prediction.estimate)
     for (scene, image), estimates in found.items():
-        path = out / _picture_name(scene, image)
-        if not path.is_file():
-            write_image(path, _overlay(image_of[scene, image], estimates, method))
+        name = _picture_name(scene, image)
+        if not is_whole(out, name, [name]):
+            write_image(out / name, _overlay(image_of[scene, image], estimates, method))
+            note_result(out, name, [out / name])
 
 
 def _picture_name(scene: int, image: int) -> str:
@@ -224,7 +228,7 @@ def _finished(out: Path) -> set[str]:
 
 def _known(out: Path) -> dict[str, Prediction]:
     folders = [out, *sorted(out.glob("part-*"))]
-    every = [p for folder in folders if is_started(folder) for p in read_predictions(folder)]
+    every = [p for folder in folders for p in kept_predictions(folder)]
     # What was read at last counts, whatever another part said of an earlier try.
     return {p.estimate.name: p for p in sorted(every, key=is_finished)}
 

@@ -22,9 +22,8 @@ from depthpose.pose.datasets import BopDataset, Instance, open_bop
 from depthpose.pose.predictions import (
     Job,
     Prediction,
-    is_started,
+    kept_predictions,
     place_of,
-    read_predictions,
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate, ViewInput
@@ -106,7 +105,7 @@ def _kept(coming: Iterable[Prediction], out: Path) -> list[Prediction]:
 
     What an earlier run found of frames that this one did not reach stays in the file.
     """
-    left = read_predictions(out) if is_started(out) else []
+    left = kept_predictions(out)
     found: list[Prediction] = []
     try:
         for one in coming:

@@ -5,7 +5,8 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 from depthpose.core.engine.plan import PLAN, Block, Item, make_plan
@@ -17,12 +18,15 @@ from depthpose.core.files.store import (
     absolute,
     exists,
     join,
+    list_sizes,
     local_path,
     publish_bytes,
     read_all,
     read_from,
     refuse_unsafe,
+    remove,
 )
+from depthpose.core.results import is_unchanged
 from depthpose.core.run import RECORD, not_ours, refuse_other_settings, run_record
 
 MANIFEST = "manifest.csv"
@@ -68,7 +72,7 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
     refuse_unsafe(out)
     claim(out, {**job.settings, "shards": job.form})
     blocks = make_plan(out, job.items, job.tars, job.block)
-    done = {shard: one for shard, one in _finished(out).items() if not one.failures}
+    done = _whole(out, blocks)
     left = [block for block in blocks if block.shard not in done]
     if left:
         done |= {_shard(one): one for one in engine(left, job.work, out, job.form)}
@@ -130,7 +134,7 @@ def result_items(out: str) -> list[Item]:
     folder = join(absolute(out), SHARDS)
     return [
         Item(
-            f"{_shard(done)}-{hashlib.sha256(done.to_json().encode()).hexdigest()[:12]}",
+            f"{_shard(done)}-{hashlib.sha256(_untimed(done).encode()).hexdigest()[:12]}",
             (join(folder, f"{_shard(done)}.json"), join(folder, done.shard)),
         )
         for done in read_results(out)
@@ -153,8 +157,45 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
 
 
 def _finished(out: str) -> dict[str, Done]:
-    records = read_all(join(out, SHARDS), ".json")
-    return {name.removesuffix(".json"): Done.from_json(text) for name, text in records.items()}
+    """Read the records of shards; one that is damaged is as none."""
+    found: dict[str, Done] = {}
+    for name, text in read_all(join(out, SHARDS), ".json").items():
+        with suppress(ValueError, KeyError, TypeError):
+            found[name.removesuffix(".json")] = Done.from_json(text)
+    return found
+
+
+def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
+    """Give what is done without failures, its shard as it was written; other records go."""
+    folder = join(out, SHARDS)
+    sizes, records = list_sizes(folder), _finished(out)
+    done: dict[str, Done] = {}
+    for block in blocks:
+        one = records.get(block.shard)
+        is_ours = one is not None and one.block in (None, block.checksum)
+        if one is None or not is_ours or not _is_unchanged(folder, one, sizes):
+            if f"{block.shard}.json" in sizes:
+                remove(join(folder, f"{block.shard}.json"))
+        elif not one.failures:
+            done[block.shard] = one
+    return done
+
+
+def _is_unchanged(folder: str, done: Done, sizes: Mapping[str, int]) -> bool:
+    path = local_path(join(folder, done.shard))
+    if path is None or not done.stamp:  # of a store sizes alone; older records have none
+        return sizes.get(done.shard) in (done.stamp[:1] or sizes.values())
+    is_unchanged_file = is_unchanged(path, done.stamp)
+    if is_unchanged_file and (time_ns := path.stat().st_mtime_ns) != done.stamp[1]:  # a copy
+        stamp = (done.stamp[0], time_ns, done.stamp[2])
+        record = join(folder, f"{_shard(done)}.json")
+        publish_bytes(replace(done, stamp=stamp).to_json().encode(), record)
+    return is_unchanged_file
+
+
+def _untimed(done: Done) -> str:
+    """Write a record without the time of its shard, which a copy changes."""
+    return replace(done, stamp=(*done.stamp[:1], *done.stamp[2:])).to_json()
 
 
 def _shard(done: Done) -> str:
@@ -182,4 +223,4 @@ def _write_manifest(out: str, every: Sequence[Done]) -> None:
                 )
             seen[name] = done.shard
             table.writerow([name, done.shard, reason])
-    publish_bytes(text.getvalue().encode(), join(out, MANIFEST))
+    publish_bytes(text.getvalue().encode(errors="surrogateescape"), join(out, MANIFEST))

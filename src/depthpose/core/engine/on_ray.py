@@ -5,6 +5,7 @@ A block's outcome is a line of text, so that neither queues nor results fill the
 """
 
 import os
+import secrets
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat
 from depthpose.core.engine.work import Done, Runner, Work
 from depthpose.core.errors import InputError, MissingExtraError
+
+_LEAST_VERSION = (2, 52)
+"""Since which Ray has passwords."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +50,8 @@ class RayEngine:
             InputError: no cluster at the address, or one worker does not fit into it.
             MissingExtraError: Ray is not installed.
         """
+        if self.address is None:
+            _keep_to_this_machine()
         ray = _import_ray()
         with _connected(ray, self.address, self._cores_here()):
             # In a list the work stays a reference, which a worker that starts again reads again.
@@ -140,15 +146,33 @@ def _cause(error: BaseException) -> BaseException:
     return error
 
 
+def _keep_to_this_machine() -> None:
+    """Let a cluster that is started here listen to this machine alone, and ask for a password.
+
+    Whoever reaches a port of Ray may run any code. Ray reads these variables as it is imported.
+    """
+    # Without clusters of several machines, which is what its name is about, a node is 127.0.0.1.
+    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+
+
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
     """Import Ray, which sends no statistics of its use unless it is set to.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: it is not installed, or too old to ask for a password.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import_module("ray.data")
-        return import_module("ray")
+        ray = import_module("ray")
     except ImportError as error:
         raise MissingExtraError("ray[data]", "ray", "--engine ray") from error
+    if tuple(map(int, ray.__version__.split(".")[:2])) < _LEAST_VERSION:
+        raise MissingExtraError(
+            f"ray[data] 2.52 or later, not {ray.__version__}, which lets anybody in", "ray",
+            "--engine ray",
+        )  # fmt: skip
+    return ray

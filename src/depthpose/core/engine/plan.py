@@ -6,7 +6,9 @@ Inputs are found in folders, patterns, manifests and tar shards; blocks are fixe
 import csv
 import io
 import json
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import PurePosixPath
@@ -214,6 +216,11 @@ class Block:
         row = {"shard": self.shard, "items": [[i.name, *i.files] for i in self.items]}
         return json.dumps(row if self.tar is None else {"shard": self.shard, "tar": self.tar})
 
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of what it is made of."""
+        return zlib.crc32(self.to_json().encode())
+
     @classmethod
     def from_json(cls, line: str) -> "Block":
         """Read what :meth:`to_json` wrote."""
@@ -261,9 +268,9 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
 
 
 def _read_plan(url: str) -> list[Block]:
-    if not exists(url):
-        return []
-    try:
-        return [Block.from_json(line) for line in read_from(url).decode().splitlines()]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{url}: not a plan of blocks ({error}); choose another folder") from error
+    """Read a plan up to where it is damaged; what follows is planned again."""
+    blocks: list[Block] = []
+    with suppress(ValueError, KeyError, TypeError, AttributeError):
+        for line in read_from(url).splitlines() if exists(url) else ():
+            blocks.append(Block.from_json(line.decode()))  # noqa: PERF401  those before the damage
+    return blocks

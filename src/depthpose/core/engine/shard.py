@@ -113,11 +113,22 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """Read the files of a tar shard, plain or compressed, from its beginning to its end.
 
     Raises:
-        InputError: it is not there, or no intact tar file.
+        InputError: it is not there, is no intact tar file, or holds a link or one name twice.
     """
+    seen: set[str] = set()
     try:
         with opened(url) as file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:
+                if not (member.isfile() or member.isdir()):
+                    raise InputError(
+                        f"{url}: {member.name!r} is a link or device, and no file; pack the files "
+                        "themselves (tar --dereference --hard-dereference)"
+                    )
+                if member.isfile() and member.name in seen:
+                    raise InputError(
+                        f"{url}: holds {member.name!r} twice; keep one of the two, and pack it anew"
+                    )
+                seen.add(member.name)
                 content = tar.extractfile(member) if member.isfile() else None
                 if content is not None:
                     yield member.name, content.read()

@@ -13,7 +13,16 @@ from depthpose.core.engine.plan import Block, Files, Item, refuse_name
 from depthpose.core.engine.shard import ShardFormat, read_tar, shard_writer
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_write
-from depthpose.core.files.store import exists, join, local_copy, publish, publish_bytes, read_from
+from depthpose.core.files.store import (
+    exists,
+    join,
+    local_copy,
+    local_path,
+    publish,
+    publish_bytes,
+    read_from,
+)
+from depthpose.core.results import file_stamp
 
 SHARDS = "shards"
 
@@ -67,11 +76,15 @@ class Done:
         shard: name of the shard, with its suffix.
         entries: name and "" or the reason of its failure, for each input.
         endings: that the files of a result may have.
+        stamp: size, time and checksum of the shard (:func:`depthpose.core.results.file_stamp`).
+        block: checksum of the inputs.
     """
 
     shard: str
     entries: tuple[tuple[str, str], ...]
     endings: tuple[str, ...] = ()
+    stamp: tuple[int, ...] = ()
+    block: int | None = None
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -87,7 +100,13 @@ class Done:
         """Read what :meth:`to_json` wrote."""
         row = json.loads(text)
         entries = tuple((name, reason) for name, reason in row["entries"])
-        return cls(shard=row["shard"], entries=entries, endings=tuple(row["endings"]))
+        return cls(
+            shard=row["shard"],
+            entries=entries,
+            endings=tuple(row["endings"]),
+            stamp=tuple(row.get("stamp", ())),
+            block=row.get("block"),
+        )
 
 
 class Runner:
@@ -121,8 +140,16 @@ class Runner:
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.{self._form}"
             entries = tuple(self._write(block, file, Path(scratch)))
-            publish(file, join(self._out, SHARDS, file.name))
-        done = Done(shard=file.name, entries=entries, endings=tuple(self._work.endings))
+            url = join(self._out, SHARDS, file.name)
+            publish(file, url)
+            stamp = tuple(file_stamp(local_path(url) or file))
+        done = Done(
+            shard=file.name,
+            entries=entries,
+            endings=tuple(self._work.endings),
+            stamp=stamp,
+            block=block.checksum,
+        )
         publish_bytes(done.to_json().encode(), record)
         return done
 

@@ -213,6 +213,29 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
     return [f"{prefix}{p}" for p in kept]
 
 
+def list_sizes(folder: str) -> dict[str, int]:
+    """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder.
+
+    Raises:
+        InputError: the store does not answer.
+    """
+    with _refused(folder, "listed"):
+        fs, inner = url_to_fs(folder)
+        fs.invalidate_cache()
+        return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
+
+
+def remove(url: str) -> None:
+    """Remove a file.
+
+    Raises:
+        InputError: it cannot be.
+    """
+    with _refused(url, "removed"):
+        fs, inner = url_to_fs(url)
+        fs.rm_file(inner)
+
+
 def list_tree(url: str) -> dict[str, str]:
     """List all files below a folder: their URLs by their names in it; none without a folder.
 
@@ -228,11 +251,14 @@ def list_tree(url: str) -> dict[str, str]:
 
 
 def _entries(fs: Any, folder: str) -> list[str]:  # noqa: ANN401  fsspec carries no types
+    return [entry["name"] for entry in _details(fs, folder)]
+
+
+def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401
     try:
-        entries = fs.ls(folder, detail=True)
+        return [entry for entry in fs.ls(folder, detail=True) if entry["type"] == "file"]
     except FileNotFoundError:
         return []
-    return [entry["name"] for entry in entries if entry["type"] == "file"]
 
 
 def _shown(path: str) -> bool:

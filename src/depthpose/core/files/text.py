@@ -86,7 +86,7 @@ def read_json(path: AnyPath) -> object:
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
             text,
-            parse_constant=_refuse_number,
+            parse_constant=refuse_number,
             parse_float=_finite,
             object_pairs_hook=_once_each,
         )
@@ -178,7 +178,8 @@ def write_json(path: AnyPath, obj: object) -> None:
     """
     try:
         text = json.dumps(obj, indent=2, allow_nan=False, ensure_ascii=False)
-        data = f"{text}\n".encode()
+        # A name that is not UTF-8 is kept as JSON's escapes of its bytes, which are read back.
+        data = f"{text}\n".encode(errors="backslashreplace")
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: cannot be written as JSON: {error}; use null for NaN") from error
     write_bytes(path, data)
@@ -219,13 +220,14 @@ def _numbers(text: str) -> list[float]:
         return []
 
 
-def _refuse_number(text: str) -> NoReturn:
+def refuse_number(text: str) -> NoReturn:
+    """Refuse NaN and infinity, which Python's parser of JSON would take."""
     raise ValueError(f"{text} is not a JSON number")
 
 
 def _finite(text: str) -> float:
     value = float(text)
-    return value if math.isfinite(value) else _refuse_number(text)
+    return value if math.isfinite(value) else refuse_number(text)
 
 
 def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -23,5 +23,6 @@ from depthpose.depth.datasets.packed import pack_frames as pack_frames
 from depthpose.depth.datasets.splits import Split as Split
 from depthpose.depth.datasets.splits import read_split as read_split
 from depthpose.depth.datasets.writer import RawFrame as RawFrame
+from depthpose.depth.datasets.writer import has_calibration as has_calibration
 from depthpose.depth.datasets.writer import has_raw_frame as has_raw_frame
 from depthpose.depth.datasets.writer import write_raw_frame as write_raw_frame

@@ -10,7 +10,11 @@ from torch import Tensor
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
-from depthpose.core.files import atomic_write, read_text, write_disparity_png, write_image
+from depthpose.core.files import read_text, write_disparity_png, write_image
+from depthpose.core.files.disk import write_bytes
+from depthpose.core.results import is_whole, note_result
+
+_CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,8 +43,14 @@ class RawFrame:
 
 
 def has_raw_frame(folder: Path, drive: str, number: int) -> bool:
-    """Whether a frame is there as a whole: what is written last is there."""
-    return _disparity_file(folder, drive, number).is_file()
+    """Whether a frame is there, and every file of it as it was written."""
+    last = _disparity_file(folder, drive, number).relative_to(folder).as_posix()
+    return is_whole(folder, f"{drive}/{number:010d}", [last])
+
+
+def has_calibration(folder: Path, date: str) -> bool:
+    """Whether the calibration of a date is there as it was written."""
+    return is_whole(folder, date, [f"{date}/{name}" for name in _CALIBRATION])
 
 
 def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> None:
@@ -60,24 +70,32 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
         InputError: the date already has another calibration, or the disk refuses.
     """
     home = folder / drive[:10] / drive
-    _write_calibration(home.parent, frame)
+    _write_calibration(folder, drive[:10], frame)
     name = f"{number:010d}"
-    write_image(home / "image_02/data" / f"{name}.png", frame.left)
-    write_image(home / "image_03/data" / f"{name}.png", frame.right)
+    written: list[Path] = []
+
+    def new(place: str, suffix: str = ".png") -> Path:
+        written.append(home / place / f"{name}{suffix}")
+        return written[-1]
+
+    write_image(new("image_02/data"), frame.left)
+    write_image(new("image_03/data"), frame.right)
     if frame.points is not None:
-        with atomic_write(home / "velodyne_points/data" / f"{name}.bin") as part:
-            part.write_bytes(frame.points.float().contiguous().numpy().astype("<f4").tobytes())
-    write_image(home / "sky" / f"{name}.png", frame.is_sky.float().expand(3, -1, -1))
+        scan = frame.points.float().contiguous().numpy().astype("<f4")
+        write_bytes(new("velodyne_points/data", ".bin"), scan.tobytes())
+    write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
     seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)
-    write_disparity_png(home / "disp_noc" / f"{name}.png", seen_by_both)
-    write_disparity_png(_disparity_file(folder, drive, number), frame.disparity_px)
+    write_disparity_png(new("disp_noc"), seen_by_both)
+    write_disparity_png(new("disp_occ"), frame.disparity_px)
+    note_result(folder, f"{drive}/{name}", written)
 
 
 def _disparity_file(folder: Path, drive: str, number: int) -> Path:
     return folder / drive[:10] / drive / "disp_occ" / f"{number:010d}.png"
 
 
-def _write_calibration(date: Path, frame: RawFrame) -> None:
+def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
+    """Write the calibration of a date once; one that is not as it was written, again."""
     rig, eye = frame.rig, np.eye(3)
     left = np.zeros((3, 4))
     left[:, :3] = rig.K.numpy()
@@ -88,20 +106,20 @@ def _write_calibration(date: Path, frame: RawFrame) -> None:
     cameras = {"S_rect_02": size, "R_rect_00": eye, "P_rect_02": left,
                "S_rect_03": size, "P_rect_03": right}  # fmt: skip
     transform = frame.camera_from_velodyne
-    _write_once(date / "calib_cam_to_cam.txt", cameras)
-    _write_once(date / "calib_velo_to_cam.txt", {"R": transform[:3, :3], "T": transform[:3, 3]})
-
-
-def _write_once(path: Path, matrices: dict[str, np.ndarray]) -> None:
-    lines = [
-        f"{name}: " + " ".join(f"{value:.12e}" for value in matrix.ravel())
-        for name, matrix in matrices.items()
-    ]
-    text = "\n".join(lines) + "\n"
-    if not path.is_file():
-        with atomic_write(path) as part:
-            part.write_text(text)
-    elif read_text(path) != text:
-        raise InputError(
-            f"{path}: belongs to frames of another rig or scale; write these to another folder"
-        )
+    poses = {"R": transform[:3, :3], "T": transform[:3, 3]}
+    is_there = has_calibration(folder, date)
+    files = [folder / date / name for name in _CALIBRATION]
+    for path, matrices in zip(files, (cameras, poses), strict=True):
+        lines = [
+            f"{name}: " + " ".join(f"{value:.12e}" for value in matrix.ravel())
+            for name, matrix in matrices.items()
+        ]
+        text = "\n".join(lines) + "\n"
+        if not is_there:
+            write_bytes(path, text.encode())
+        elif read_text(path) != text:
+            raise InputError(
+                f"{path}: belongs to frames of another rig or scale; write these to another folder"
+            )
+    if not is_there:
+        note_result(folder, date, files)

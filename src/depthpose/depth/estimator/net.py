@@ -18,7 +18,7 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
 from depthpose.depth.estimator.far import match_to_infinity
@@ -193,7 +193,8 @@ class FakestereoNet:
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = False) -> DepthEstimate:
         """Estimate depth of one input whose images are read already."""
         if pair.right is None:
-            return self._estimate_alone([pair])[0]
+            with refused_memory(pair.name):
+                return self._estimate_alone([pair])[0]
         right = usable_right(pair)
         if self.matcher is None:
             raise InputError(
@@ -204,8 +205,9 @@ class FakestereoNet:
             )
         if with_check:
             refuse_unrectified(pair)
-        match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
-        return from_pair(pair, match)
+        with refused_memory(pair.name):
+            match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
+            return from_pair(pair, match)
 
     @torch.no_grad()
     def estimate_many(
@@ -232,7 +234,8 @@ class FakestereoNet:
         for sizes, group in groupby(inputs, self._sizes_alone):
             alike = list(group)
             is_alone = sizes is not None
-            found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
+            with refused_memory(alike[0].name):
+                found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
         return found
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from depthpose.core.checkpoint import (
     Checkpoint,
     file_sha256,
-    read_torch_file,
+    read_published,
     save_checkpoint,
 )
 from depthpose.core.config import config_to_dict
@@ -118,13 +118,7 @@ def import_psmnet(file: Path, out: Path, *, align_corners: bool) -> None:
     Raises:
         InputError: not a checkpoint of the published network.
     """
-    content = read_torch_file(file)
-    state = content.get("state_dict", content)
-    if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(
-            f"{file}: holds no 'state_dict' of tensors, so it is not a checkpoint of PSMNet. Its "
-            f"entries are {', '.join(map(repr, list(content)[:5]))}."
-        )
+    state = read_published(file, "checkpoint of PSMNet")
     try:
         network = psmnet_from_published(state, align_corners=align_corners)
     except InputError as error:

@@ -68,6 +68,12 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         if size > _MOST_SCENE_BYTES:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
         scene: Any = json.loads(data[20 : 20 + size])
+        for link in filter(None, (buffer.get("uri") for buffer in scene.get("buffers", []))):
+            if not link.startswith("data:"):
+                raise InputError(
+                    f"{path}: its numbers are in another file, {link[:60]!r}, and a GLB is read "
+                    "alone; export it as one file, with its buffers inside"
+                )
         accessors = scene.get("accessors", [])
         values = [_values(accessor) for accessor in accessors]
         placed = sum(

@@ -15,7 +15,7 @@ from depthpose.core.checkpoint import (
     build_network,
     file_sha256,
     read_checkpoint,
-    read_torch_file,
+    read_published,
     save_checkpoint,
 )
 from depthpose.core.config import config_from_dict, config_to_dict
@@ -66,10 +66,7 @@ def import_fcgf(file: Path, out: Path, *, classes: int | None = None) -> None:
     Raises:
         InputError: not such a checkpoint, or outputs that no whole number of keypoints fills.
     """
-    content = read_torch_file(file)
-    state = content.get("state_dict", content)
-    if not isinstance(state, Mapping):
-        raise InputError(f"{file}: 'state_dict' is a {type(state).__name__}, not a mapping.")
+    state = read_published(file, "checkpoint of FCGF's network")
     try:
         network = resunet_from_published(state, classes=classes)
     except InputError as error:

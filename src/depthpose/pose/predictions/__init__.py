@@ -12,6 +12,7 @@ from depthpose.pose.predictions.records import Place as Place
 from depthpose.pose.predictions.records import Prediction as Prediction
 from depthpose.pose.predictions.records import is_finished as is_finished
 from depthpose.pose.predictions.records import is_started as is_started
+from depthpose.pose.predictions.records import kept_predictions as kept_predictions
 from depthpose.pose.predictions.records import parse_prediction as parse_prediction
 from depthpose.pose.predictions.records import place_of as place_of
 from depthpose.pose.predictions.records import prediction_row as prediction_row

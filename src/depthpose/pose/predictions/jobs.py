@@ -16,8 +16,8 @@ from depthpose.pose.predictions.records import (
     Prediction,
     is_finished,
     is_started,
+    kept_predictions,
     place_of,
-    read_predictions,
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate, ViewInput
@@ -68,7 +68,7 @@ def predict(
     """
     claim_folder(folder, settings, [POSES])
     wanted = list(jobs)
-    done = {p.estimate.name: p for p in read_predictions(folder)} if is_started(folder) else {}
+    done = {p.estimate.name: p for p in kept_predictions(folder)}
     finished = {name for name, prediction in done.items() if is_finished(prediction)}
     yield from (job.name for job in wanted if job.name in finished)
     left = [job for job in wanted if job.name not in finished]

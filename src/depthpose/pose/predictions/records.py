@@ -1,6 +1,7 @@
 """``poses.json``: every estimate and refusal with all that is known of it."""
 
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple, cast, get_args
 import torch
 from torch import Tensor
 
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import Instance
@@ -86,6 +87,15 @@ def read_predictions(folder: Path) -> list[Prediction]:
             raise InputError(f"{path}: two estimates are called {name!r}; keep one of them")
         names.add(name)
     return found
+
+
+def kept_predictions(folder: Path) -> list[Prediction]:
+    """Read what earlier runs of this folder left; a damaged file is as none, and a notice."""
+    try:
+        return read_predictions(folder) if is_started(folder) else []
+    except InputError as error:
+        warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
+        return []
 
 
 def score_of(estimate: PoseEstimate) -> float:
