@@ -180,14 +180,12 @@ def _command(given: list[str]) -> int:
             return _run(name, rest)
     except (InputError, MissingExtraError) as error:
         return _fail(f"error: {error}")
-    except OSError as error:
-        return _end_for(error)
-    except (MemoryError, RuntimeError, ImportError) as error:
-        if not is_of_memory(error):
-            raise
-        return _fail(f"error: {full_memory(error)}; what was finished is kept")
     except KeyboardInterrupt as stop:
         return _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
+    except Exception as error:
+        if (said := _explained(error)) is None:
+            raise
+        return _fail(f"error: {said}")
     finally:
         if (lock := sys.modules.get("depthpose.core.lock")) is not None:
             lock.release_folders(but=before)
@@ -198,15 +196,12 @@ def _fail(reason: str, code: int = 2) -> int:
     return code
 
 
-def _end_for(error: OSError) -> int:
+def _explained(error: Exception) -> str | None:
+    """Say in a line that memory or disk is full, or a path unusable; None of any other error."""
     if is_of_memory(error):
-        return _fail(f"error: {full_memory(error)}; what was finished is kept")
-    if error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
-        raise error
-    return _fail(f"error: {_message_of(error)}")
-
-
-def _message_of(error: OSError) -> str:
+        return f"{full_memory(error)}; what was finished is kept"
+    if not isinstance(error, OSError) or error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
+        return None
     from tempfile import gettempdir
 
     place = error.filename or f"a temporary file in {gettempdir()}"
@@ -262,9 +257,11 @@ def _run(name: str, rest: list[str]) -> int:
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
 
     from depthpose.cli.help import in_words_of, refuse_empty, refuse_missing
+    from depthpose.cli.ignored import refuse_ignored_options
 
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:
+        refuse_ignored_options(name, rest)
         refuse_missing(signature(command).bind(*words, **options).arguments)
         code = command(*words, **options)
         sys.stdout.flush()

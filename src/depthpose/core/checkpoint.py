@@ -300,8 +300,8 @@ def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         is_finite = not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()
         if not is_finite and (bad := tensor.numel() - int(tensor.isfinite().sum())):
             raise InputError(
-                f"{path}: {bad} of the {tensor.numel()} numbers of {name!r} are NaN or infinite, so "
-                "its training diverged or the file is damaged; take other weights"
+                f"{path}: {bad} of the {tensor.numel()} numbers of {name!r} are NaN or infinite, "
+                "so its training diverged or the file is damaged; take other weights"
             )
         if name.endswith("running_var") and (tensor < 0).any():
             raise InputError(

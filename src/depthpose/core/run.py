@@ -105,7 +105,10 @@ def environment() -> dict[str, str]:
 
 
 def claim_folder(
-    folder: Path, settings: Mapping[str, Any], results: Iterable[str | Path] = ()
+    folder: Path,
+    settings: Mapping[str, Any],
+    results: Iterable[str | Path] = (),
+    remedy: str = "choose another, or delete this one",
 ) -> None:
     """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
@@ -117,6 +120,7 @@ def claim_folder(
         settings: JSON values that decide the results; compared with those of an earlier run.
         results: files and folders that the run will write. They are its own where an earlier run
             has left its record; without a record, something else wrote what is there.
+        remedy: what to do about a folder of other settings.
 
     Raises:
         InputError: the folder holds a run with other settings (the first difference is named), or
@@ -138,13 +142,23 @@ def claim_folder(
             (folder / _SOURCES).unlink(missing_ok=True)
             rewrite_record(record, run_record(settings))
             return
-    refuse_other_settings(folder, read_json(record), settings)
+    refuse_other_settings(folder, _read_record(record), settings, remedy)
     if lock_folder(record, is_shared=not is_alone):
         remove_parts(folder)
 
 
+def _read_record(record: Path) -> object:
+    try:
+        return read_json(record)
+    except InputError as error:
+        raise InputError(
+            f"{error}. What made the results is not known any more: choose another folder, or "
+            "delete this one"
+        ) from error
+
+
 def _has_other_settings(record: Path, settings: Mapping[str, Any]) -> bool:
-    earlier = read_json(record)
+    earlier = _read_record(record)
     there = earlier.get("settings") if isinstance(earlier, dict) else None
     return isinstance(there, dict) and _flat(there) != _flat(settings)
 
@@ -312,7 +326,12 @@ def _results_there(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
     }
 
 
-def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[str, Any]) -> None:
+def refuse_other_settings(
+    folder: Path | str,
+    record: object,
+    settings: Mapping[str, Any],
+    remedy: str = "choose another, or delete this one",
+) -> None:
     """Refuse a folder whose record has other settings.
 
     Raises:
@@ -328,8 +347,7 @@ def refuse_other_settings(folder: Path | str, record: object, settings: Mapping[
         if before.get(name) != now.get(name) and not is_off:
             raise InputError(
                 f"{folder}: holds results made with {name} = {before.get(name)!r}, but now it is "
-                f"{now.get(name)!r}. Two settings never share a folder: choose another, or "
-                "delete this one."
+                f"{now.get(name)!r}. Two settings never share a folder: {remedy}."
             )
 
 

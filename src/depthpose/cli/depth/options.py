@@ -14,7 +14,7 @@ from depthpose.cli.options import Device
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
+_POWERS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 
 
 @group
@@ -247,14 +247,14 @@ def refuse_ignored(weights: Sequence[str], matching: MatcherOptions) -> None:
 
 
 def parse_bytes(text: str | None) -> int | None:
-    """Read a size such as ``1GB``, ``800MB`` or ``1500000`` (bytes); decimal units.
+    """Read a size such as ``1GB``, ``800M`` or ``1500000`` (bytes); ``1GiB`` is 1024**3.
 
     Raises:
         InputError: not a number with such a unit.
     """
     if text is None:
         return None
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMG]?B)?\s*", text, re.IGNORECASE)
-    if found is None:
-        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB or 800MB.")
-    return int(float(found[1]) * _UNITS[(found[2] or "").upper()])
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
+    if found is None or (found[3] and not found[2]):
+        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
+    return int(float(found[1]) * (1024 if found[3] else 1000) ** _POWERS[found[2].upper()])

@@ -61,7 +61,13 @@ class Run:
         decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
         settings["loop"] = decisive | {"processes": find_rank().world}
         kept = {k: v for k, v in settings.items() if k not in without}
-        claim_folder(self.folder, kept, [file for name in weights for file in run_files(name)])
+        files = [file for name in weights for file in run_files(name)]
+        remedy = "choose another, or delete this one"
+        for path in (self.folder / f"{name}.safetensors" for name in weights):
+            if path.is_file():
+                option = "--start" if hasattr(config, "start") else "--generator"
+                remedy += f"; to train on from its weights, give a new --out and {option} {path}"
+        claim_folder(self.folder, kept, files, remedy)
         write_config(self.folder / "config.yaml", config)
 
     def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
