@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 
 class Output:
@@ -15,7 +15,7 @@ class Output:
         stream: what is written to; None where the process began without.
     """
 
-    def __init__(self, stream: TextIO | None) -> None:
+    def __init__(self, stream: Any) -> None:  # noqa: ANN401  whatever stands in its place
         self._is_closed = stream is None
         self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: PTH123, SIM115
         self.failure: OSError | None = None
@@ -62,7 +62,7 @@ def lasting_streams() -> Iterator[Output]:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
     sys.stdin = sys.stdin or open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
     output, errors = Output(sys.stdout), Output(sys.stderr)
-    sys.stdout, sys.stderr = output, errors  # pyright: ignore[reportAttributeAccessIssue]
+    sys.stdout, sys.stderr = output, errors
     try:
         yield output
         output.flush()

@@ -1,14 +1,63 @@
 """What this machine computes on, and in which arithmetic."""
 
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from functools import cache, partial
+from typing import TypeVar, cast
 
 import torch
 
 from depthpose.core.errors import InputError, Notice
 
+Made = TypeVar("Made")
+
 
 class PrecisionNotice(Notice):
     """A precision was asked for that this machine does not compute in; another is taken."""
+
+
+@contextmanager
+def own_arithmetic() -> Iterator[None]:
+    """Compute in float32 on the processor where nothing else is said, whatever the caller has set.
+
+    Around a caller's autocast, default dtype or default device, weights and inputs would be of two
+    kinds. In a process that was forked from one that has computed, one thread computes: OpenMP's
+    others did not come along, and would be waited for without end.
+    """
+    _threads_after_fork()
+    dtype = torch.get_default_dtype()
+    device = torch.get_default_device()
+    on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
+    if dtype != torch.float32:
+        torch.set_default_dtype(torch.float32)
+    kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+    try:
+        with on_cpu, ExitStack() as off:
+            for kind in kinds:
+                off.enter_context(torch.autocast(kind, enabled=False))
+            yield
+    finally:
+        if dtype != torch.float32:
+            torch.set_default_dtype(dtype)
+
+
+def each_in_own_arithmetic(made: Iterator[Made]) -> Iterator[Made]:
+    """Give what a generator makes, each in :func:`own_arithmetic`."""
+    nothing = object()
+    while True:
+        with own_arithmetic():
+            one = next(made, nothing)
+        if one is nothing:
+            return
+        yield cast(Made, one)
+
+
+@cache
+def _threads_after_fork() -> None:
+    if hasattr(os, "register_at_fork"):  # not on Windows
+        os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 def usable_device(name: str | torch.device) -> torch.device:

@@ -162,12 +162,21 @@ def small_size(path: Path) -> tuple[int, int]:
         InputError: it has more pixels than this page takes.
     """
     width, height = image_size(path)
+    refuse_large(path.name, width, height)
+    return width, height
+
+
+def refuse_large(name: str, width: int, height: int) -> None:
+    """Refuse a picture or map of more pixels than this page takes.
+
+    Raises:
+        InputError: it has more.
+    """
     if width * height > MOST_PIXELS:
         raise InputError(
-            f"{path.name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
+            f"{name} has {width}x{height} pixels, more than the {MOST_PIXELS / 1e6:g} million "
             "that this page takes; scale it down, or use the command line"
         )
-    return width, height
 
 
 def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:

@@ -25,7 +25,7 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInpu
 from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
 from depthpose.report.pose import pose_facts, pose_scene, pose_sentence, pose_tables
 from depthpose.report.scene import Scene
-from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
+from depthpose.web.answer import Answer, Form, Shown, read_files, refuse_large, small_size
 
 OWN_CAD = "cad"
 """The value of the field ``object`` that means the CAD file."""
@@ -159,6 +159,7 @@ def _size(depth: Path) -> tuple[int, int]:
     if depth.suffix.lower() == ".png":
         return small_size(depth)
     height, width = read_map(depth).shape
+    refuse_large(depth.name, width, height)
     return width, height
 
 

@@ -18,6 +18,7 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
+from depthpose.core.devices import own_arithmetic
 from depthpose.core.errors import InputError, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
@@ -102,6 +103,7 @@ class FakestereoNet:
         return f"FakestereoNet({', '.join(said + sorted(devices))})"
 
     @classmethod
+    @own_arithmetic()
     def load(
         cls,
         weights: str | Path | None = None,
@@ -153,6 +155,7 @@ class FakestereoNet:
     from_pretrained = load
     """The same as :meth:`load`."""
 
+    @own_arithmetic()
     def estimate(
         self,
         image: Picture,
@@ -190,6 +193,7 @@ class FakestereoNet:
         return self.estimate_pair(pair, with_check=with_check)
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_pair(self, pair: StereoInput, *, with_check: bool = False) -> DepthEstimate:
         """Estimate depth of one input whose images are read already."""
         if pair.right is None:
@@ -210,6 +214,7 @@ class FakestereoNet:
             return from_pair(pair, match)
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_many(
         self,
         images: Sequence[StereoInput] | Sequence[Picture] | Picture,

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from depthpose.core.camera import AnyCamera, choose_lens
+from depthpose.core.devices import each_in_own_arithmetic, own_arithmetic
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, Unit
@@ -73,6 +74,7 @@ class PoseEstimator(ABC):
         """Estimate inputs of which most do not show their object."""
         return self.estimate_many(inputs)
 
+    @own_arithmetic()
     def estimate(
         self,
         *,
@@ -116,6 +118,7 @@ class PoseEstimator(ABC):
         estimates = self._try_many([replace(given, object=name) for name in names])
         return which_object(estimates, self.refusal)
 
+    @own_arithmetic()
     def estimate_instances(
         self,
         *,
@@ -149,6 +152,7 @@ class PoseEstimator(ABC):
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
 
+    @own_arithmetic()
     def find(
         self,
         depth: AnyArray,
@@ -180,6 +184,7 @@ class PoseEstimator(ABC):
         view = view_input(depth, None, camera, names[0], _NAME, unit)
         return self.find_in(view, names)
 
+    @own_arithmetic()
     def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view; its mask limits where is looked."""
         known = SearchTargets(
@@ -250,7 +255,7 @@ class PoseEstimator(ABC):
             icp=self.config.icp,
             look=lambda given: self._look(given, object),
         )
-        return track(frames, followed, first)
+        return each_in_own_arithmetic(track(frames, followed, first))
 
     def _look(self, given: AnyInput, object: str) -> PoseEstimate:
         """Find the object in a frame of which nothing else is known."""

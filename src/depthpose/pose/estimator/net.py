@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.core.devices import usable_device
+from depthpose.core.devices import own_arithmetic, usable_device
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -119,6 +119,7 @@ class GeoPoseNet(PoseEstimator):
         )
 
     @classmethod
+    @own_arithmetic()
     def load(
         cls, weights: str | Path = "parts", config: EstimateConfig | None = None
     ) -> "GeoPoseNet":
@@ -160,6 +161,7 @@ class GeoPoseNet(PoseEstimator):
         return self.weights.refusal
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate many at once, of any objects: the network is called for all of them together.
 
@@ -178,6 +180,7 @@ class GeoPoseNet(PoseEstimator):
         ]
 
     @torch.no_grad()
+    @own_arithmetic()
     def _try_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         return self._in_order(inputs, is_likely=False)
 
@@ -195,6 +198,7 @@ class GeoPoseNet(PoseEstimator):
         return replace(best, seconds={**doubted.seconds, "registration": spent_s})
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, Voted | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 

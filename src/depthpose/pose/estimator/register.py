@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
+from depthpose.core.devices import own_arithmetic
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import local_planes
@@ -109,6 +110,7 @@ class Registration(PoseEstimator):
         self._tables: dict[int, PairTable] = {}
 
     @classmethod
+    @own_arithmetic()
     def load(
         cls, *cad: str | Path, unit: Unit, config: EstimateConfig | None = None
     ) -> "Registration":
@@ -144,6 +146,7 @@ class Registration(PoseEstimator):
             self._table(number)
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate one after the other; a model is prepared when it is first asked for.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
-from depthpose.core.devices import usable_device
+from depthpose.core.devices import own_arithmetic, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
@@ -48,6 +48,7 @@ class DepthImageRegressor:
         self._surfaces: dict[int, Surface] = {}
 
     @classmethod
+    @own_arithmetic()
     def load(
         cls, weights: str | Path, config: EstimateConfig | None = None
     ) -> "DepthImageRegressor":
@@ -66,6 +67,7 @@ class DepthImageRegressor:
         return tuple(self._numbers)
 
     @torch.no_grad()
+    @own_arithmetic()
     def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
         """Estimate one after the other.
 
