@@ -20,6 +20,7 @@ from depthpose.core.checkpoint import (
     join_terms,
     load_weights,
     read_checkpoint,
+    read_published,
     read_torch_file,
     save_checkpoint,
 )
@@ -251,3 +252,44 @@ def test_a_network_is_built_without_drawing_its_weights() -> None:
     before = torch.get_rng_state()
     build_network(lambda: nn.Linear(3, 2), plain, "w")
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.bfloat16])
+def test_weights_that_are_no_numbers_are_refused_by_name(
+    tmp_path: Path, value: float, dtype: torch.dtype
+) -> None:
+    state = {"a.weight": torch.ones(3, 4, dtype=dtype), "a.bias": torch.zeros(5, dtype=dtype)}
+    state["a.bias"][2] = value
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(path, Checkpoint(kind="toy", config={}, state=state))
+    torch.save({"state_dict": state}, tmp_path / "w.pth")
+    save_file(state, tmp_path / "published.safetensors")
+    said = r"1 of the 5 numbers of 'a\.bias' are NaN or infinite"
+    with pytest.raises(InputError, match=said):
+        read_checkpoint(path)
+    for name in ("w.pth", "published.safetensors"):
+        with pytest.raises(InputError, match=said):
+            read_published(tmp_path / name, "toy")
+
+
+def test_a_sum_beyond_float32_is_no_damage(tmp_path: Path) -> None:
+    state = {"large": torch.full((8,), 3e38), "count": torch.tensor(3)}
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(path, Checkpoint(kind="toy", config={}, state=state))
+    assert torch.equal(read_checkpoint(path).state["large"], state["large"])
+
+
+def test_a_variance_below_zero_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    state = {"norm.running_var": torch.tensor([1.0, -1.0])}
+    save_checkpoint(path, Checkpoint(kind="toy", config={}, state=state))
+    with pytest.raises(InputError, match=r"'norm\.running_var' holds a variance below 0"):
+        read_checkpoint(path)
+
+
+def test_a_setting_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(path, Checkpoint(kind="toy", config={"limit": float("nan")}, state={}))
+    with pytest.raises(InputError, match=r"its 'config' is not JSON \(NaN is not a JSON number\)"):
+        read_checkpoint(path)

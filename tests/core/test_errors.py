@@ -3,7 +3,15 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core.errors import InputError, MissingExtraError, import_open3d, nearest_name
+from depthpose.core.errors import (
+    InputError,
+    MissingExtraError,
+    full_memory,
+    import_open3d,
+    is_of_memory,
+    nearest_name,
+    refused_memory,
+)
 
 
 def test_the_nearest_name_is_offered() -> None:
@@ -39,3 +47,31 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"is installed and does not load: libusb-1\.0\.so\.0: "):
         import_open3d("registration")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:1] DefaultCPUAllocator: can't allocate memory"
+        ),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes."),
+        RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        OSError(12, "Cannot allocate memory"),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+        RuntimeError("std::bad_alloc"),
+    ],
+    ids=str,
+)
+def test_a_full_memory_is_said_whoever_meets_it(error: Exception) -> None:
+    assert is_of_memory(error)
+    assert full_memory(error).startswith("the memory is full (")
+
+
+def test_an_input_that_is_too_large_for_the_memory_is_named() -> None:
+    said = r"^a\.png: the memory is full \(no more is given\); end"
+    with pytest.raises(InputError, match=said), refused_memory("a.png"):
+        raise MemoryError
+    with pytest.raises(RuntimeError, match="another"), refused_memory("a.png"):
+        raise RuntimeError("another")

@@ -1,5 +1,6 @@
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -83,3 +84,10 @@ def test_yaml_may_refer_to_what_stands_above(tmp_path: Path) -> None:
 def test_yaml_beyond_bounds_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         parse_yaml(tmp_path / "x.yaml", text)
+
+
+def test_a_name_that_is_not_utf8_goes_through_json(tmp_path: Path) -> None:
+    name = os.fsdecode(b"n\xfe.png")
+    write_json(tmp_path / "a.json", {name: "ä"})
+    assert read_json(tmp_path / "a.json") == {name: "ä"}
+    assert (tmp_path / "a.json").read_text(encoding="utf-8").count("\\udcfe") == 1

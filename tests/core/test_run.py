@@ -1,10 +1,13 @@
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
 from depthpose.core.devices import computes_bf16, usable_device
 from depthpose.core.errors import InputError
+from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
@@ -217,3 +220,45 @@ def test_the_reason_of_a_missing_device_is_one_sentence(name: str) -> None:
     with pytest.raises(InputError, match="cannot be used here") as error:
         usable_device(name)
     assert len(str(error.value)) < 200
+
+
+@pytest.mark.parametrize("content", [None, "", '{"a": ['])
+def test_results_of_which_the_source_is_lost_are_made_again(
+    tmp_path: Path, content: str | None
+) -> None:
+    out, source = tmp_path / "out", tmp_path / "a.png"
+    source.write_bytes(b"1")
+    claim_folder(out, {"x": 1})
+    claim_names(out, {"a": source}, [".npy"])
+    (out / "a.npy").write_bytes(b"2")
+    note_result(out, "a", [out / "a.npy"])
+    claim_names(out, {"a": source}, [".npy"])
+    assert is_whole(out, "a", ["a.npy"])
+    record = out / "sources.json"
+    record.unlink() if content is None else record.write_text(content)
+    claim_names(out, {"a": source}, [".npy"])
+    assert not is_whole(out, "a", ["a.npy"])
+    assert read_sources(out) == {"a": source}
+
+
+def test_a_damaged_record_of_settings_says_what_to_do(tmp_path: Path) -> None:
+    claim_folder(tmp_path / "out", {"x": 1})
+    (tmp_path / "out" / "run.json").write_text("{")
+    with pytest.raises(InputError, match="not known any more: choose another folder, or delete"):
+        claim_folder(tmp_path / "out", {"x": 1})
+
+
+@dataclass(frozen=True)
+class TrainedConfig:
+    start: str | None = None
+    loop: LoopConfig = field(default_factory=lambda: LoopConfig(steps=5))
+
+
+def test_a_finished_training_says_how_to_train_on(tmp_path: Path) -> None:
+    run = Run(folder=tmp_path)
+    run.claim(TrainedConfig(), ("net",))
+    (tmp_path / "net.safetensors").write_bytes(b"1")
+    longer = TrainedConfig(loop=LoopConfig(steps=9))
+    said = rf"train on from its weights, give a new --out and --start {tmp_path}/net\.safetensors"
+    with pytest.raises(InputError, match=said):
+        run.claim(longer, ("net",))

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.datasets import read_results
 from depthpose.pose.predictions import (
     Job,
     Place,
     Prediction,
+    kept_predictions,
     predict,
     read_predictions,
     write_bop_results,
@@ -156,3 +157,13 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps([row, row]))
     with pytest.raises(InputError, match="two estimates are called 'a'; keep one of them"):
         read_predictions(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["", "[{", "{}", '[{"name": 1}]'])
+def test_damaged_results_are_made_again_with_a_notice(tmp_path: Path, content: str) -> None:
+    assert kept_predictions(tmp_path) == []
+    write_predictions(tmp_path, [Prediction(estimate=answer())])
+    assert len(kept_predictions(tmp_path)) == 1
+    (tmp_path / "poses.json").write_text(content)
+    with pytest.warns(Notice, match=r"poses\.json.* it is damaged, and made again"):
+        assert kept_predictions(tmp_path) == []

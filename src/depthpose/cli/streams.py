@@ -3,8 +3,8 @@
 import errno
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 
@@ -12,19 +12,19 @@ class Output:
     """A standard stream that remembers why it could not be written, in place of raising it.
 
     Args:
-        stream: what is written to; None where the process began without.
+        stream: what is written to.
+        is_lost: the process began without it, and ``stream`` only stands in its place.
     """
 
-    def __init__(self, stream: Any) -> None:  # noqa: ANN401  whatever stands in its place
-        self._is_closed = stream is None
-        self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: PTH123, SIM115
+    def __init__(self, stream: Any, *, is_lost: bool = False) -> None:  # noqa: ANN401
+        self._stream, self._is_lost = stream, is_lost
         self.failure: OSError | None = None
-        if (reconfigure := getattr(self._stream, "reconfigure", None)) is not None:
+        if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
             reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
 
     def write(self, text: str) -> int:
         """Write text, unless an earlier write has failed."""
-        if self._is_closed and self.failure is None:
+        if self._is_lost and self.failure is None:
             self.failure = OSError(errno.EBADF, "it is closed")
         self._try(lambda: self._stream.write(text))
         return len(text)
@@ -37,14 +37,14 @@ class Output:
         """Give what the stream has."""
         return getattr(self._stream, name)
 
-    def _try(self, write: Any) -> None:  # noqa: ANN401
+    def _try(self, write: Callable[[], object]) -> None:
         if self.failure is not None:
             return
         try:
             write()
         except OSError as error:
             self.failure = error
-            with open(os.devnull, "w", encoding="utf-8") as nothing:  # noqa: PTH123
+            with suppress(OSError), open(os.devnull, "wb") as nothing:  # noqa: PTH123
                 os.dup2(nothing.fileno(), self._stream.fileno())  # for what is buffered
 
 
@@ -54,18 +54,20 @@ def lasting_streams() -> Iterator[Output]:
 
     The numbers of closed streams are taken, so that no file gets them and is written into.
     """
-    before = sys.stdout, sys.stderr
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
-    sys.stdin = sys.stdin or open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
-    output, errors = Output(sys.stdout), Output(sys.stderr)
-    sys.stdout, sys.stderr = output, errors
-    try:
-        yield output
-        output.flush()
-        errors.flush()
-    finally:
-        sys.stdout, sys.stderr = (old or new for old, new in zip(before, (output, errors)))  # noqa: B905
+    before = sys.stdin, sys.stdout, sys.stderr
+    with ExitStack() as opened:
+        names = zip(before, "rww", strict=True)
+        real = [s or opened.enter_context(open(os.devnull, mode)) for s, mode in names]  # noqa: PTH123
+        output, errors = (Output(real[k], is_lost=before[k] is None) for k in (1, 2))
+        sys.stdin, sys.stdout, sys.stderr = real[0], output, errors
+        try:
+            yield output
+            output.flush()
+            errors.flush()
+        finally:
+            sys.stdin, sys.stdout, sys.stderr = before

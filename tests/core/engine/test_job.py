@@ -4,13 +4,20 @@ import io
 import json
 import os
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from tests.core.engine.doubles import InProcessEngine, ReverseWork, unpacked, write_texts
 
-from depthpose.core.engine import Done, Job, find_items, read_results, run_job
+from depthpose.core.engine import (
+    Done,
+    Job,
+    find_items,
+    read_results,
+    result_items,
+    run_job,
+)
 from depthpose.core.engine.plan import Block
 from depthpose.core.engine.shard import ShardFormat, read_shard
 from depthpose.core.engine.work import Work
@@ -168,14 +175,22 @@ def test_two_samples_of_one_name_are_said(tmp_path: Path) -> None:
         run_job(job_of(tmp_path, [], tars=tars), InProcessEngine())
 
 
-def test_a_damaged_plan_or_record_is_refused(tmp_path: Path) -> None:
-    folder = write_texts(tmp_path / "in", {"a": "one"})
+def test_a_damaged_plan_is_made_again_and_a_damaged_record_of_settings_refused(
+    tmp_path: Path,
+) -> None:
+    folder = write_texts(tmp_path / "in", {"b": "one", "c": "two", "d": "three"})
+    run_job(job_of(tmp_path, [str(folder)]), InProcessEngine())
+    plan = tmp_path / "out" / "plan.jsonl"
+    for text in ("no plan\n", plan.read_text()[:-5]):
+        plan.write_text(text)
+        before = len(calls(tmp_path))
+        run_job(job_of(tmp_path, [str(folder)]), InProcessEngine())
+        assert calls(tmp_path)[before:] == [], "the same blocks, and their shards are there"
+    plan.unlink()
+    write_texts(tmp_path / "in", {"a": "new"})
     job = job_of(tmp_path, [str(folder)])
     run_job(job, InProcessEngine())
-    plan = tmp_path / "out" / "plan.jsonl"
-    plan.write_text("no plan\n")
-    with pytest.raises(InputError, match="not a plan of blocks"):
-        run_job(job, InProcessEngine())
+    assert unpacked(tmp_path / "out").keys() == {"a", "b", "c", "d"}, "blocks are others now"
     (tmp_path / "out" / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run.json: no JSON"):
         run_job(job, InProcessEngine())
@@ -215,3 +230,65 @@ def test_a_full_disk_for_temporary_files_is_named(
     monkeypatch.setattr("depthpose.core.engine.work.shard_writer", refuse)
     with pytest.raises(InputError, match=r"depthpose-.*cannot be written: No space left on device"):
         run_job(job, InProcessEngine())
+
+
+def flip(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[600] ^= 1
+    file.write_bytes(data)
+    os.utime(file, ns=(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [("shards/000001.tar", flip)]
+    + [
+        (f"shards/000001.{kind}", damage)
+        for kind in ("tar", "json")
+        for damage in (Path.unlink, lambda p: os.truncate(p, 40), lambda p: p.write_bytes(b""))
+    ],
+)
+def test_a_damaged_shard_or_record_is_made_again_and_no_other(
+    tmp_path: Path, name: str, damage: Callable[[Path], object]
+) -> None:
+    folder = write_texts(tmp_path / "in", {"a": "one", "b": "two", "c": "three"})
+    job = job_of(tmp_path, [str(folder)])
+    run_job(job, InProcessEngine())
+    path = tmp_path / "out" / name
+    good, shard = unpacked(tmp_path / "out"), (tmp_path / "out/shards/000001.tar").read_bytes()
+    damage(path)
+    before = len(calls(tmp_path))
+    run_job(job, InProcessEngine())
+    assert calls(tmp_path)[before:] == ["start", "c"]
+    assert unpacked(tmp_path / "out") == good
+    assert (tmp_path / "out/shards/000001.tar").read_bytes() == shard
+
+
+def test_a_job_that_was_copied_is_not_done_again(tmp_path: Path) -> None:
+    folder = write_texts(tmp_path / "in", {"a": "one", "b": "two", "c": "three"})
+    job = job_of(tmp_path, [str(folder)])
+    run_job(job, InProcessEngine())
+    names = [item.name for item in result_items(str(tmp_path / "out"))]
+    for shard in (tmp_path / "out" / "shards").glob("*.tar"):
+        os.utime(shard, ns=(1, 1))
+    before = len(calls(tmp_path))
+    run_job(job, InProcessEngine())
+    assert calls(tmp_path)[before:] == []
+    assert [item.name for item in result_items(str(tmp_path / "out"))] == names
+
+
+def test_links_and_names_that_are_there_twice_are_said(tmp_path: Path) -> None:
+    twice, link = tmp_path / "twice.tar", tmp_path / "link.tar"
+    with tarfile.open(twice, "w") as tar:
+        for text in (b"one", b"two"):
+            info = tarfile.TarInfo("1.txt")
+            info.size = len(text)
+            tar.addfile(info, io.BytesIO(text))
+    with tarfile.open(link, "w") as tar:
+        for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
+            info = tarfile.TarInfo("2.txt")
+            info.type, info.linkname = kind, "/etc/passwd"
+            tar.addfile(info)
+    (one, other) = run_job(job_of(tmp_path, [], tars=[str(twice), str(link)]), InProcessEngine())
+    assert "holds '1.txt' twice; keep one of the two" in one.failures[-1][1]
+    assert "'2.txt' is a link or device, and no file" in other.failures[-1][1]

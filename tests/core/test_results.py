@@ -1,0 +1,92 @@
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from depthpose.core import results
+from depthpose.core.results import RESULTS, is_whole, note_result, noted_files
+
+
+def make(folder: Path, name: str = "a") -> list[Path]:
+    files = [folder / f"{name}.npy", folder / "sub" / f"{name}.png"]
+    for number, file in enumerate(files):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(bytes(range(100 + number)))
+    note_result(folder, name, files)
+    return files
+
+
+def flip(file: Path) -> None:
+    """Change a byte; size and name stay."""
+    data = bytearray(file.read_bytes())
+    data[50] ^= 1
+    file.write_bytes(data)
+    os.utime(file, ns=(1, 1))
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "deleted": Path.unlink,
+    "emptied": lambda file: file.write_bytes(b""),
+    "cut": lambda file: os.truncate(file, 99),
+    "grown": lambda file: file.write_bytes(file.read_bytes() + b"x"),
+    "flipped": flip,
+    "a folder": lambda file: (file.unlink(), file.mkdir()),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+@pytest.mark.parametrize("which", [0, 1])
+def test_whatever_is_damaged_is_noticed(
+    tmp_path: Path, damage: Callable[[Path], object], which: int
+) -> None:
+    files = make(tmp_path)
+    make(tmp_path, "other")
+    assert is_whole(tmp_path, "a", ["a.npy"])
+    damage(files[which])
+    assert not is_whole(tmp_path, "a", ["a.npy"])
+    assert is_whole(tmp_path, "other", ["other.npy"])
+
+
+def test_a_result_without_a_note_is_finished_where_its_last_file_is(tmp_path: Path) -> None:
+    (tmp_path / "b.npy").write_bytes(b"1")
+    assert is_whole(tmp_path, "b", ["b.npy"])
+    assert not is_whole(tmp_path, "b", ["b.npy", "b.ply"])
+
+
+def test_what_was_not_noted_is_not_finished_with_it(tmp_path: Path) -> None:
+    make(tmp_path)
+    (tmp_path / "a.ply").write_bytes(b"of another run")
+    assert not is_whole(tmp_path, "a", ["a.npy", "a.ply"])
+
+
+def test_files_are_read_again_once_after_a_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = make(tmp_path)
+    read: list[Path] = []
+    checksum = results._checksum
+    monkeypatch.setattr(results, "_checksum", lambda path: (read.append(path), checksum(path))[1])
+    assert is_whole(tmp_path, "a", ["a.npy"])
+    assert read == [], "sizes and times are enough"
+    os.utime(files[0], ns=(5, 5))
+    assert is_whole(tmp_path, "a", ["a.npy"])
+    assert is_whole(tmp_path, "a", ["a.npy"])
+    assert read == files[:1]
+
+
+def test_what_a_killed_process_left_of_its_line_harms_no_other(tmp_path: Path) -> None:
+    make(tmp_path)
+    with (tmp_path / RESULTS).open("ab") as file:
+        file.write(b'{"name": "half", "fil')
+    files = make(tmp_path, "next")
+    assert noted_files(tmp_path, "half") == []
+    assert noted_files(tmp_path, "next") == files
+    (tmp_path / RESULTS).write_bytes(b"\xff\x00 [1]\n3\n")
+    assert noted_files(tmp_path, "next") == []
+
+
+def test_a_result_can_be_marked_as_to_be_made_again(tmp_path: Path) -> None:
+    make(tmp_path)
+    note_result(tmp_path, "a", [])
+    assert not is_whole(tmp_path, "a", ["a.npy"])

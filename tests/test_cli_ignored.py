@@ -1,0 +1,139 @@
+"""Options that would be ignored, and streams that cannot be written."""
+
+import errno
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from depthpose.cli import main
+from depthpose.cli.depth.options import parse_bytes
+from depthpose.cli.ignored import refuse_ignored_options
+from depthpose.cli.streams import Output, lasting_streams
+from depthpose.core.errors import InputError
+
+IGNORED = [
+    ("pose predict", "--method register --cad p.stl --weights parts", "--weights"),
+    ("pose predict", "--voting least-squares --method=register", "--voting"),
+    ("pose track", "--method register --weights ycb", "--weights"),
+    ("pose track", "--method register --device cuda", "--device"),
+    ("pose predict", "--voting least-squares --hypotheses 64", "--hypotheses"),
+    ("pose predict", "--hypotheses=64 --voting=least-squares", "--hypotheses"),
+    ("pose predict", "--depth d.png --camera c.json --batch 4", "--batch"),
+    ("pose predict", "--cloud c.ply --engine ray --view live", "--view"),
+    ("pose track", "--depth d --camera c --split test", "--split"),
+    ("pose evaluate", "--bop b --csv a.csv --no-icp --masks truth", "--masks and --no-icp"),
+    ("pose evaluate", "--bop b --weights register open3d --voting ransac", "--voting"),
+    ("pose calibrate", "w --negatives 0 --max-negative-share 0.1", "--max-negative-share"),
+    ("depth predict", "a.png --engine ray --view a.rrd", "--view"),
+    ("depth predict", "a.png --answer own --max_memory 1GB", "--max_memory"),
+    ("depth match", "l r --engine ray --worker-gpus 1", "--worker-gpus"),
+    ("depth evaluate", "--weights a --holes leave", "--holes"),
+    ("depth evaluate", "--weights a --train t", "--train"),
+    ("depth evaluate", "--baseline rows --train-without a", "--train-without"),
+    ("depth evaluate", "--weights quick:a fine:b --speed fine", "--speed"),
+    ("depth evaluate", "--weights own:a --precision bf16", "--precision"),
+    ("depth evaluate", "--protocol kitti-2015 --cap 50", "--cap"),
+    ("data export-depth", "r --format colmap --files npy", "--files"),
+    ("weights complete", "w --models . --unit m", "--unit"),
+    ("reproduce all", "--linemod l --split all", "--split"),
+]
+USED = [
+    ("pose predict", "--voting ransac --hypotheses 64"),
+    ("pose predict", "--depth d.png --mask m.png --camera c.json --batch 4"),
+    ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),
+    ("depth predict", "a.png --engine ray --worker-gpus 0.5 --device cuda:1"),
+    ("depth predict", "a.png --view live"),
+    ("depth evaluate", "--matcher sgbm --holes leave --baseline rows --train t"),
+    ("depth evaluate", "--weights quick:a b --speed fine --protocol eigen-raw --cap 50"),
+    ("reproduce all", "--kitti k --split all"),
+]
+
+
+@pytest.mark.parametrize(("command", "words", "named"), IGNORED)
+def test_an_option_without_effect_is_refused(command: str, words: str, named: str) -> None:
+    with pytest.raises(InputError, match=rf"^{named}: has no effect here; .* Leave {named} out$"):
+        refuse_ignored_options(command, words.split())
+
+
+@pytest.mark.parametrize(("command", "words"), USED)
+def test_an_option_with_effect_is_not(command: str, words: str) -> None:
+    refuse_ignored_options(command, words.split())
+
+
+def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["pose", "track", "--cloud", "x", "--split", "test", "--out", "o"]
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("depthpose: error: --split: has no effect here; it is of a data set")
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1G", 10**9), ("1GB", 10**9), ("800m", 8 * 10**8), ("1.5GiB", 3 * 2**29), ("2Ki", 2048),
+     (" 7 ", 7), ("12 B", 12), ("1T", 10**12)],
+)  # fmt: skip
+def test_sizes_are_read_as_people_write_them(text: str, size: int) -> None:
+    assert parse_bytes(text) == size
+
+
+class Full(io.StringIO):
+    """A stream on a full disk."""
+
+    def __init__(self, error: type[OSError], number: int) -> None:
+        super().__init__()
+        self.error = error(number, "what the system says")
+
+    def write(self, _: str, /) -> int:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("stream", "code", "said"),
+    [
+        (lambda: Full(OSError, errno.ENOSPC), 1, "cannot be written: what the system says"),
+        (lambda: Full(BrokenPipeError, errno.EPIPE), 141, ""),
+        (lambda: None, 1, "cannot be written: it is closed"),
+    ],
+)
+def test_a_command_ends_its_work_though_nobody_can_read_it(
+    stream: Callable[[], object],
+    code: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    made: list[Path] = []
+
+    def work() -> int:
+        sys.stdout.write("before\n")
+        (tmp_path / "result").write_text("whole")
+        made.append(tmp_path / "result")
+        sys.stdout.write("after\n")
+        return 0
+
+    monkeypatch.setattr("depthpose.cli._command", lambda _: work())
+    monkeypatch.setattr(sys, "stdout", stream())
+    assert main(["anything"]) == code
+    assert made[0].read_text() == "whole"
+    errors = capsys.readouterr().err
+    assert said in errors
+    assert errors.count("\n") == bool(said)
+
+
+def test_messages_that_nobody_can_read_stop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for stream in (None, Full(OSError, errno.ENOSPC)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with lasting_streams() as output:
+            sys.stderr.write("a message\n")
+        assert output.failure is None
+
+
+def test_a_name_that_is_not_utf8_is_printed() -> None:
+    written = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    Output(written).write("n\udcfe.png")
+    written.flush()
+    assert written.buffer.getvalue() == rb"n\udcfe.png"  # pyright: ignore[reportAttributeAccessIssue]
