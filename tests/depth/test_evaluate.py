@@ -219,6 +219,30 @@ def test_a_frame_without_right_view_and_prediction_is_skipped(
     assert result.skipped == {"a": "no right view to match, and no prediction"}
 
 
+def test_a_prediction_of_which_a_file_is_damaged_is_made_again(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    calls: list[int] = []
+
+    def answer(left: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        return torch.full(tuple(left.shape[-2:]), 3.0)
+
+    net = FakestereoNet(CallableMatcher(answer))
+    sources = {frame.name: frame.left for frame in pairs.frames}
+    readers = {name: lambda i=i: pairs.read_input(i) for i, name in enumerate(sources)}
+    list(predict(net, readers, tmp_path, {}, sources))
+    files = {path: path.read_bytes() for path in sorted(tmp_path.glob("a.*"))}
+    assert len(files) == 4
+    for path, good in files.items():
+        for damaged in (None, good[: len(good) // 2], b"", good[:-1] + b"?"):
+            path.unlink() if damaged is None else path.write_bytes(damaged)
+            calls.clear()
+            list(predict(net, readers, tmp_path, {}, sources))
+            assert len(calls) == 1, "this frame, and no other"
+            assert path.read_bytes() == good
+
+
 def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> None:
     calls: list[int] = []
 

@@ -1,5 +1,6 @@
 """Pseudo-truth of pairs: what both views agree on, and nothing else."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from depthpose import FakestereoNet
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.depth.datasets import open_dataset
-from depthpose.depth.labels import LabelConfig, label_pair, label_pairs
+from depthpose.depth.labels import LabelConfig, _refuse_bytes, label_pair, label_pairs
 from depthpose.depth.stereo import CallableMatcher
 
 
@@ -154,3 +155,32 @@ def test_labels_of_two_folders_go_into_one_if_their_names_differ(tmp_path: Path)
     list(label_pairs(brightness_matcher(), open_dataset(other), LabelConfig(), out, {}))
     found = open_dataset(out)
     assert [found.read_input(index).name for index in range(2)] == ["00", "02"]
+
+
+@pytest.mark.parametrize("place", ["left", "right", "disp_occ"])
+def test_a_label_of_which_a_file_is_damaged_is_made_again(tmp_path: Path, place: str) -> None:
+    dataset = open_dataset(write_pairs(tmp_path / "pairs", (0.1, 0.1)))
+    out = tmp_path / "out"
+
+    def label() -> list[str]:
+        made = label_pairs(brightness_matcher(), dataset, LabelConfig(), out, {})
+        return [name for name, _ in made]
+
+    first, other = label()
+    file = out / place / f"{first}.png"
+    good = file.read_bytes()
+    for damaged in (None, good[:-9], b""):
+        file.unlink() if damaged is None else file.write_bytes(damaged)
+        assert label() == [first]
+        assert file.read_bytes() == good
+    calibration = (out / "calib.txt").read_text()
+    (out / "calib.txt").write_text(calibration[:-30])
+    assert label() == []
+    assert (out / "calib.txt").read_text() == calibration
+    assert other != first
+
+
+def test_a_name_that_is_not_utf8_is_refused_by_itself(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a name in UTF-8, as calib.txt needs; rename"):
+        _refuse_bytes(os.fsdecode(b"n\xfe"))
+    _refuse_bytes("größe 5")

@@ -10,6 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.datasets import (
     RawFrame,
+    has_calibration,
     has_raw_frame,
     lidar_truth,
     open_dataset,
@@ -88,6 +89,13 @@ def test_one_date_has_one_calibration(tmp_path: Path) -> None:
         else:
             with pytest.raises(InputError, match="another rig or scale"):
                 write_raw_frame(tmp_path, drive, 4, raw)
+    assert has_raw_frame(tmp_path, drive, 3)
+    assert has_calibration(tmp_path, drive[:10])
+    left = tmp_path / drive[:10] / drive / "image_02/data/0000000003.png"
+    good = left.read_bytes()
+    left.write_bytes(good[:-5])
+    assert not has_raw_frame(tmp_path, drive, 3)
+    left.write_bytes(good)
     assert has_raw_frame(tmp_path, drive, 3)
     assert not has_raw_frame(tmp_path, drive, 4)
     rig = open_dataset(tmp_path).read_rig(0)

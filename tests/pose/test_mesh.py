@@ -1,3 +1,4 @@
+import json
 import math
 from pathlib import Path
 
@@ -44,6 +45,20 @@ def stone(scale: float = 1) -> trimesh.Trimesh:
     """Make a body whose points have no equal distances: nothing about it is a matter of chance."""
     points = np.random.default_rng(0).normal(size=(20, 3)) * [0.05, 0.08, 0.1] * scale
     return trimesh.convex.convex_hull(points)
+
+
+@pytest.mark.parametrize("link", ["stone.bin", "https://example.org/stone.bin"])
+def test_a_glb_whose_numbers_are_elsewhere_is_named(tmp_path: Path, link: str) -> None:
+    path = tmp_path / "stone.glb"
+    data = stone().export(file_type="glb")
+    assert isinstance(data, bytes)
+    size = int.from_bytes(data[12:16], "little")
+    scene = json.loads(data[20 : 20 + size])
+    scene["buffers"][0]["uri"] = link
+    head = json.dumps(scene).encode()
+    path.write_bytes(data[:12] + len(head).to_bytes(4, "little") + data[16:20] + head)
+    with pytest.raises(InputError, match=rf"numbers are in another file, {link!r}, .* buffers in"):
+        read_model(path, "m")
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])

@@ -20,6 +20,8 @@ from starlette.testclient import TestClient
 from tests.depth.constant_selection import sure_of
 from tests.web.samples import PART, write_street, write_view
 
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_map
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher, LightMatcher
@@ -334,6 +336,19 @@ def test_a_picture_of_too_many_pixels_is_refused(
 ) -> None:
     monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
     assert "scale it down" in refusal(ask(page, "depth", samples, {"image": "left.png"}))[1]
+
+
+@pytest.mark.parametrize("suffix", ["npy", "pfm"])
+def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
+    path = tmp_path / f"d.{suffix}"
+    write_map(path, torch.ones(20, 50))
+    assert pose_tab._size(path) == (50, 20)
+    write_map(path, torch.ones(20, 51))
+    with pytest.raises(InputError, match=r"d\.\w+ has 51x20 pixels, more than the 0\.001 million"):
+        pose_tab._size(path)
 
 
 def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
