@@ -181,6 +181,6 @@ def test_a_label_of_which_a_file_is_damaged_is_made_again(tmp_path: Path, place:
 
 
 def test_a_name_that_is_not_utf8_is_refused_by_itself(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a name in UTF-8, as calib.txt needs; rename"):
+    with pytest.raises(InputError, match=r"not a name in UTF-8, as calib\.txt needs; rename"):
         _refuse_bytes(os.fsdecode(b"n\xfe"))
     _refuse_bytes("größe 5")
