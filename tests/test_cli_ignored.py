@@ -136,4 +136,4 @@ def test_a_name_that_is_not_utf8_is_printed() -> None:
     written = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     Output(written).write("n\udcfe.png")
     written.flush()
-    assert written.buffer.getvalue() == rb"n\udcfe.png"  # pyright: ignore[reportAttributeAccessIssue]
+    assert written.buffer.getvalue() == rb"n\udcfe.png"
