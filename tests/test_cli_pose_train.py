@@ -111,7 +111,7 @@ def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--cad", "."], "--cad without --unit: no file says its unit; give --unit mm"),
+        (["--cad", "."], "no unit is given, and such a file does not say its own; give --unit mm"),
         ([], "there is no object to learn; name its CAD file (--cad FILE --unit mm)"),
         (["--data", "."], "--data .: the config learns from no data set"),
         (

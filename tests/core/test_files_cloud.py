@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, read_cloud, read_points_bin, write_cloud
 from depthpose.core.files.pcd import decompress_lzf
 
@@ -158,3 +159,68 @@ def test_velodyne_rows(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(rows.numpy().astype("<f4").tobytes())
     assert torch.equal(read_points_bin(tmp_path / "x.bin"), rows)
     assert torch.equal(read_points_bin(tmp_path / "x.bin", columns=3), rows.reshape(4, 3))
+
+
+SCAN = [[0.1, 0.25, 1.5], [-0.2, 0.3, 1.6], [0.05, -0.07, 1.4], [0.3, 0.12, 1.55]]
+
+
+def scan_rows(between: str = " ", *, decimal: str = ".", first: int | None = None) -> str:
+    """The points of a scan, a row each; with a column that counts them."""
+    lines = [between.join(f"{v:.2f}".replace(".", decimal) for v in point) for point in SCAN]
+    if first is not None:
+        lines = [f"{first + k}{between}{line}" for k, line in enumerate(lines)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        scan_rows(","),
+        scan_rows(", "),
+        scan_rows(decimal=","),
+        scan_rows("\t", decimal=","),
+        scan_rows(";", decimal=","),
+        scan_rows("; ", decimal=","),
+        scan_rows(", ", decimal=","),
+        scan_rows(first=0),
+        scan_rows(";", decimal=",", first=1),
+        "x y z\n" + scan_rows(),
+        '"ID";"X";"Y";"Z"\n' + scan_rows(";", decimal=",", first=77),
+        "//X Y Z\n" + scan_rows(),
+        "4\n" + scan_rows(),
+        "-nan(ind) 1.#QNAN -1.#IND00\n" + scan_rows() + "nan(0x8) 2 3 # far\n",
+    ],
+)
+def test_text_as_other_programs_write_it(tmp_path: Path, text: str) -> None:
+    (tmp_path / "x.txt").write_text(text)
+    assert torch.allclose(read_cloud(tmp_path / "x.txt").points, torch.tensor(SCAN))
+
+
+def test_columns_are_taken_by_their_names_and_a_count_is_none(tmp_path: Path) -> None:
+    turned = "".join(f"{z} 7 {x} {y}\n" for x, y, z in SCAN)
+    (tmp_path / "x.txt").write_text("z i x y\n" + turned)
+    assert torch.allclose(read_cloud(tmp_path / "x.txt").points, torch.tensor(SCAN))
+    np.save(tmp_path / "x.npy", np.c_[np.arange(1, 5), SCAN])
+    assert torch.allclose(read_cloud(tmp_path / "x.npy").points, torch.tensor(SCAN))
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "x.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n"
+        "1 2 3\n-nan(ind) 1.#QNAN 0\n"
+    )
+    assert read_cloud(tmp_path / "x.ply").points.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (scan_rows(",", decimal=","), "commas both part numbers and are decimal signs"),
+        ("a b c\n" + scan_rows(), "begins by 'a b c', neither numbers nor names of columns"),
+        ("x y z r\n" + scan_rows(), "names 4 columns, but rows have 3"),
+        ("5\n" + scan_rows(), "declares 5 points but 4 rows follow"),
+        ("1.#INF 2 3\n" + scan_rows(), "a coordinate is infinite"),
+    ],
+)
+def test_text_that_cannot_be_understood_is_named(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "x.xyz").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_cloud(tmp_path / "x.xyz")

@@ -1,5 +1,5 @@
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -286,3 +286,41 @@ def test_turns_about_an_axis_of_revolution_are_no_error() -> None:
         assert torch.allclose(found.t_m, copy.t_m, atol=1e-9)
     tilted = nearest_copy(true @ tilt, true, symmetry_transforms(bottle), bottle)
     assert float(rotation_error_rad(true @ tilt, tilted)) > 0.5, "a bottle may not be tilted"
+
+
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda p: Rigid(p.R, p.t_m / 1000), "were if t were 1000 times larger (is it in metres?"),
+        (lambda p: Rigid(p.R, p.t_m / 10), "were if t were 10 times larger (is it in centimetres?"),
+        (lambda p: Rigid(p.R, p.t_m * 1000), "were if t were 1000 times smaller (is it in mm?"),
+        (lambda p: Rigid(p.R.mT, p.t_m), "were if R were transposed"),
+        (lambda p: p.inverse(), "were if poses were inverted"),
+        (lambda p: Rigid(p.inverse().R, p.inverse().t_m / 1000),
+         "BOP's csv has millimetres) and poses were inverted"),
+        (lambda p: Rigid(FLIP @ p.R.double(), FLIP @ p.t_m.double()), "OpenGL's are y up"),
+        (lambda p: Rigid(p.R, p.t_m + p.t_m.new_tensor([0.1, 0, 0])), None),
+        (lambda p: p, None),
+    ],
+)  # fmt: skip
+def test_poses_by_another_convention_are_named(
+    synthetic: BopDataset, change: Callable[[Rigid], Rigid], said: str | None
+) -> None:
+    poses = predictions_of(synthetic, lambda i: change(i.camera_from_model))
+    found = evaluate(synthetic, poses, EvaluationConfig(with_vsd=False))
+    if said is None:
+        assert found.advice is None
+        return
+    assert found.rows[-1].success == 0
+    assert found.advice is not None
+    assert found.advice.startswith("0 of 6 answers that were tried are right, but 6 were if")
+    assert said in found.advice
+
+
+def test_a_csv_of_a_header_alone_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "none.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n")
+    with pytest.raises(InputError, match=r"none\.csv: holds no pose, so there is nothing to meas"):
+        read_any(tmp_path / "none.csv")

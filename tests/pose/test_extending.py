@@ -26,7 +26,7 @@ from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
 from depthpose.pose.mesh import mesh_suffixes, read_model
-from depthpose.pose.mesh.models import MESH_READERS
+from depthpose.pose.mesh.files import MESH_READERS
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.train import PoseTraining
 from depthpose.web.answer import KINDS

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
-from depthpose.core.files import write_depth_png
+from depthpose.core.files import read_map, write_depth_png
 from depthpose.pose.estimator.given import view_input
 
 K = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], dtype=torch.float64)
@@ -96,3 +97,24 @@ def test_depth_of_any_type_of_number(kind: str) -> None:
     camera = Camera(width=6, height=4, K=torch.tensor([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]).double())
     view = view_input(depth, None, camera, "cup", "x", "m")
     assert torch.equal(view.depth_m, torch.full((4, 6), 2.0))
+
+
+def test_whole_numbers_of_any_file_need_their_unit(tmp_path: Path) -> None:
+    units = whole(0.001).numpy()
+    np.save(tmp_path / "d.npy", units.astype(np.uint16))
+    Image.fromarray(units.astype(np.uint16)).save(tmp_path / "d.tif")
+    for name in ("d.npy", "d.tif"):
+        view = view_input(tmp_path / name, MASK, K, "part", "view", "mm")
+        torch.testing.assert_close(view.depth_m, DEPTH_M, atol=6e-4, rtol=0)
+        with pytest.raises(InputError, match=r"in whole numbers, and nothing says of what; give"):
+            view_input(tmp_path / name, MASK, K, "part", "view")
+    Image.fromarray(DEPTH_M.numpy()).save(tmp_path / "m.tiff")
+    assert torch.equal(view_input(tmp_path / "m.tiff", MASK, K, "part", "view").depth_m, DEPTH_M)
+    with pytest.raises(InputError, match=r"holds uint16, .* / 1000 are metres"):
+        read_map(tmp_path / "d.npy")
+
+
+def test_a_normalised_matrix_is_named() -> None:
+    normalised = K / torch.tensor([[64.0], [48.0], [1.0]])
+    with pytest.raises(InputError, match=r"K has fx 0\.78125 for 64x48 .* looks normalised"):
+        view_input(DEPTH_M, MASK, normalised, "part", "view")

@@ -3,12 +3,22 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from depthpose.cli.pose.inputs import view_jobs
 from depthpose.core.errors import InputError
-from depthpose.pose.datasets import encode_rle, mask_from_rle, read_mask
+from depthpose.core.files import write_depth_png
+from depthpose.pose.datasets import (
+    encode_rle,
+    mask_from_rle,
+    number_objects,
+    read_labels,
+    read_mask,
+)
+from depthpose.pose.estimator.given import split_instances, view_input
 
 MASK = torch.tensor([[False, True, False], [True, False, False]])
 # Column by column: one of the background, two of the object, three of the background.
@@ -51,3 +61,65 @@ def test_what_is_not_one_mask_is_refused(tmp_path: Path, content: object, said: 
     (tmp_path / "m.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=said):
         read_mask(tmp_path / "m.json")
+
+
+LABELS = np.zeros((60, 80), np.uint8)
+LABELS[10:30, 10:30] = 1
+LABELS[20:50, 40:70] = 2
+ONE = LABELS == 1
+FULL = np.full((60, 80), 255, np.uint8)
+PHOTO = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        LABELS,
+        LABELS * 100,
+        LABELS.astype(np.uint16) * 1000,
+        np.stack([LABELS * 100] * 3, -1),
+        np.stack([LABELS == 1, LABELS == 2, LABELS == 3], -1).astype(np.uint8) * 255,
+        np.stack([*[LABELS * 100] * 3, FULL], -1),
+    ],
+    ids=["1 2", "100 200", "16 bit", "grey as RGB", "colours", "opaque"],
+)
+def test_a_label_map_is_several_masks_and_never_one(tmp_path: Path, values: np.ndarray) -> None:
+    Image.fromarray(values).save(tmp_path / "m.png")
+    labels = read_labels(tmp_path / "m.png")
+    assert sorted(int((labels == k).sum()) for k in labels.unique()[1:]) == [400, 900]
+    assert [int(mask.sum()) for mask in split_instances(labels)] == [900, 400]
+    with pytest.raises(InputError, match=r"shows 2 objects, numbered .* px\), .* mask is of one"):
+        read_mask(tmp_path / "m.png")
+
+
+def test_soft_borders_and_compression_make_no_labels(tmp_path: Path) -> None:
+    wide = Image.fromarray(ONE.astype(np.uint8) * 255).resize((160, 120), Image.Resampling.BICUBIC)
+    wide.save(tmp_path / "m.png")
+    assert read_labels(tmp_path / "m.png").unique().tolist() == [0, 1]
+    Image.fromarray(ONE.astype(np.uint8) * 255).save(tmp_path / "m.jpg", quality=50)
+    assert read_mask(tmp_path / "m.jpg").numpy().sum() == pytest.approx(400, abs=8)
+    soft = Image.fromarray(LABELS * 120).resize((160, 120), Image.Resampling.BILINEAR)
+    assert number_objects(np.asarray(soft)).unique().tolist() == [0, 120, 240]
+
+
+@pytest.mark.parametrize("colour", [np.zeros((60, 80, 3), np.uint8), PHOTO, PHOTO * 0 + 255])
+def test_a_mask_in_an_alpha_channel(tmp_path: Path, colour: np.ndarray) -> None:
+    Image.fromarray(np.dstack([colour, FULL * ONE])).save(tmp_path / "m.png")
+    assert np.array_equal(read_mask(tmp_path / "m.png").numpy(), ONE)
+
+
+def test_an_array_of_labels_asks_which(tmp_path: Path) -> None:
+    K = torch.tensor([[80.0, 0, 39.5], [0, 80, 29.5], [0, 0, 1]], dtype=torch.float64)
+    depth_m = torch.full((60, 80), 0.7)
+    with pytest.raises(InputError, match=r"numbered 1 \(400 px\), 2 \(900 px\), where one mask"):
+        view_input(depth_m, LABELS.astype(np.int32), K, "part", "view")
+    view = view_input(depth_m, LABELS == 2, K, "part", "view")
+    assert int(view.mask.sum()) == 900
+    # Of a file on the command line each number is an input, with its own name.
+    Image.fromarray(LABELS).save(tmp_path / "m.png")
+    write_depth_png(tmp_path / "d.png", depth_m, 0.001)
+    (tmp_path / "camera.txt").write_text("80 80 39.5 29.5\n")
+    given = (tmp_path / "d.png", tmp_path / "m.png", tmp_path / "camera.txt")
+    jobs = view_jobs(given, "part", "mm", tmp_path / "out")
+    assert [job.name for job in jobs] == ["d_1", "d_2"]
+    assert [int(job.read().mask.sum()) for job in jobs] == [400, 900]

@@ -531,7 +531,7 @@ def test_models_come_from_one_source(tmp_path: Path) -> None:
         read_models(ModelsConfig())
     with pytest.raises(InputError, match="cad and parts are given; take the models from one"):
         read_models(ModelsConfig(cad=(file,), parts=("mug",)))
-    with pytest.raises(InputError, match=r"flange.stl'\] without models.unit, and no file says"):
+    with pytest.raises(InputError, match=r"flange.stl: no unit is given, .* unit: mm in a config"):
         read_models(ModelsConfig(cad=(file,)))
     with pytest.raises(InputError, match="two models are called 'flange'"):
         read_models(ModelsConfig(cad=(file, file), unit="mm"))

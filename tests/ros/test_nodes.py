@@ -148,6 +148,9 @@ class KnowsPose:
             object=object, camera_from_model=self.pose, is_ok=is_ok, reason="the mask is empty"
         )
 
+    def estimate_instances(self, *, mask: np.ndarray, object: str, **_: object) -> list[Any]:
+        return [self.estimate(mask=mask == k, object=object) for k in np.unique(mask[mask > 0])]
+
 
 def depth_messages(street: StereoSample, recorded: dict[str, Any]) -> tuple[Any, Any]:
     topics = [f"/{s}/{t}" for t in ("image_rect", "camera_info") for s in ("left", "right")]
@@ -173,6 +176,9 @@ def test_poses_bear_the_depths_stamp_and_a_refusal_says_why(
         Poses(net, "cup")(depth, info, mask)
     pixels[0, 0] = 1
     assert Poses(net, "cup")(depth, info, mask)[0][0] == "cup"
+    # Numbers are instances: a pose of each.
+    pixels[10:20, 10:20], pixels[30:40, 10:20] = 1, 2
+    assert [name for name, _ in Poses(net, "cup")(depth, info, mask)] == ["cup", "cup"]
 
 
 def test_parts_are_posed_from_messages(after_demo: Path) -> None:

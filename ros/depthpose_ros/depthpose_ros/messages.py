@@ -90,13 +90,13 @@ def depth_of(message: Any) -> np.ndarray:  # noqa: ANN401
 
 
 def mask_of(message: Any) -> np.ndarray:  # noqa: ANN401
-    """Give a mask (H, W), true where the image is not 0.
+    """Give a mask (H, W), 0 outside the object, or a number for each of several.
 
     Raises:
         InputError: another encoding than mono8 and 8UC1, or too few bytes.
     """
     refuse_unknown("encoding of a mask", message.encoding, ["mono8", "8UC1"])
-    return _rows(message, np.uint8, 1)[..., 0] > 0
+    return _rows(message, np.uint8, 1)[..., 0]
 
 
 def image_from_depth(header: Header, depth_m: torch.Tensor, encoding: str) -> Image:

@@ -7,6 +7,7 @@ from typing import Any
 
 from depthpose import FakestereoNet, GeoPoseNet
 from depthpose.core.errors import InputError
+from depthpose.pose.datasets import number_objects
 from depthpose_ros.messages import (
     Image,
     Pose,
@@ -73,20 +74,22 @@ class Poses:
     def __call__(self, depth: Any, info: Any, mask: Any = None) -> list[tuple[str, Pose]]:  # noqa: ANN401
         """Give name and pose of what was found, the surest first; stamp and frame are the depth's.
 
+        A mask that numbers several objects (1, 2, ...) shows an instance of one object a number.
+
         Raises:
-            InputError: what the messages lack; with a mask, also why its object has no pose.
+            InputError: what the messages lack; with a mask, also why nothing in it has a pose.
         """
         depth_m, camera = depth_of(depth), camera_of(info)
         if mask is None:
             wanted = None if self.object is None else [self.object]
             found = self.net.find(depth_m, camera, wanted)
         else:
-            found = [
-                self.net.estimate(
-                    depth=depth_m, mask=mask_of(mask), camera=camera, object=self.object
-                )
-            ]
-            if not found[0].is_ok:
+            given = {"depth": depth_m, "mask": mask_of(mask), "camera": camera}
+            if int(number_objects(given["mask"]).max()) > 1:
+                found = self.net.estimate_instances(**given, object=self.object)
+            else:
+                found = [self.net.estimate(**given, object=self.object)]
+            if not any(one.is_ok for one in found):
                 raise InputError(f"{found[0].object}: no pose: {found[0].reason}")
         header = copied_header(depth)
         poses = [(one.object, one.camera_from_model) for one in found]

@@ -28,6 +28,7 @@ from depthpose.core.files import (
     read_map,
 )
 from depthpose.core.files.images import opened_image
+from depthpose.core.files.maps import read_numbers
 from depthpose.pose.cloud import frame_advice
 from depthpose.pose.datasets import mask_from_rle
 from depthpose.pose.mesh import exact_diameter, mesh_suffixes, read_geometry, unit_advice
@@ -186,6 +187,10 @@ def _of_depth(path: Path, units: Tensor) -> Seen:
 
 def _of_map(path: Path) -> Seen:
     if path.suffix.lower() == ".npy":
+        stored = read_numbers(path)
+        if stored.dtype.kind != "f" and stored.ndim == 2:
+            units = torch.from_numpy(stored.astype("float32"))
+            return _of_depth(path, torch.where(units > 0, units, torch.nan))
         try:
             values = read_map(path)
         except InputError as error:

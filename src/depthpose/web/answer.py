@@ -10,7 +10,7 @@ from typing import Any
 from depthpose.core.camera import CAMERA_SUFFIXES, Camera, read_camera
 from depthpose.core.draw import Scale
 from depthpose.core.errors import InputError
-from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, image_size, write_json
+from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.pose.mesh import mesh_suffixes
 from depthpose.report.scene import Scene
@@ -71,8 +71,8 @@ MOST_PIXELS = 12_500_000
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", IMAGES),
     "right": ("a picture", IMAGES),
-    "depth": ("a depth image", (".png", *MAP_SUFFIXES)),
-    "mask": ("a mask", (".png", ".jpg", ".jpeg", ".bmp")),
+    "depth": ("a depth image", DEPTH_SUFFIXES),
+    "mask": ("a mask", IMAGES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", cloud_suffixes()),
     "cad": ("a model file", mesh_suffixes()),

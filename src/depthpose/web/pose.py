@@ -8,13 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_map, write_cloud, write_image
+from depthpose.core.files import MAP_SUFFIXES, read_stored_depth, write_cloud, write_image
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import (
+    FIXED_UNITS,
     gap_to_surface_m,
     read_model,
     sample_surface,
@@ -117,7 +118,8 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
         if not known:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
         return _Target(model=known[0], net=net, how="network, by the weights' own model")
-    model = read_model(form.file("cad"), _unit(form, "cad_unit"))
+    cad = form.file("cad")
+    model = read_model(cad, FIXED_UNITS.get(cad.suffix.lower()) or _unit(form, "cad_unit"))
     for own in models:
         if _is_same(own, model):
             how = f"network; the CAD file is the weights' {own.name!r}"
@@ -144,21 +146,20 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
         return cloud_input(path, _unit(form, "cloud_unit"), model.name, path.stem)
     depth = form.file("depth")
     mask = form.file("mask") if "mask" in form.files else None
-    is_picture = depth.suffix.lower() == ".png"
     if mask is not None:
         small_size(mask)
     size = _size(depth)
     camera = form.camera({} if "camera" in form.files else _keys(form, size), size)
-    if camera.depth_unit_m is None and is_picture:
+    if camera.depth_unit_m is None:
         # Files of ROS, OpenCV and KITTI do not have it.
         camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
 
 
 def _size(depth: Path) -> tuple[int, int]:
-    if depth.suffix.lower() == ".png":
+    if depth.suffix.lower() not in MAP_SUFFIXES:
         return small_size(depth)
-    height, width = read_map(depth).shape
+    height, width = read_stored_depth(depth).shape
     refuse_large(depth.name, width, height)
     return width, height
 

@@ -1,5 +1,6 @@
 """The work behind ``depthpose pose evaluate``."""
 
+import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -68,7 +69,10 @@ def measure_each(
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
         _refuse_others(path, dataset)
-        found.append(evaluate(dataset, read_any(path), config, show).of(origin))
+        one = evaluate(dataset, read_any(path), config, show).of(origin)
+        if one.advice is not None:
+            print(f"{path}: {one.advice}", file=sys.stderr)
+        found.append(one)
     return found
 
 
@@ -78,6 +82,7 @@ def join(each: Sequence[Evaluation]) -> Evaluation:
         rows=[row for one in each for row in one.rows],
         per_instance=[row for one in each for row in one.per_instance],
         risk=[row for one in each for row in one.risk],
+        advice="; ".join(one.advice for one in each if one.advice) or None,
     )
 
 
@@ -156,10 +161,11 @@ def measure(
     each = measure_each(dataset, predictions, config)
     measured = join(each)
     rows = table_of(measured.rows)
+    said = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     write_table(out, rows)
     write_details(measured, out)
     sections = [
-        Section(title="Success by masks", text=HOW, rows=success_by_masks(measured.rows)),
+        Section(title="Success by masks", text=said, rows=success_by_masks(measured.rows)),
         Section(title="All numbers", rows=rows),
         *instance_sections(dataset, predictions, [one.per_instance for one in each]),
         *detail_sections(measured),

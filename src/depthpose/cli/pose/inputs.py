@@ -2,7 +2,9 @@
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,13 +16,13 @@ from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import cloud_suffixes, list_images
+from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, list_images
 from depthpose.core.files.names import natural_order
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import refuse_among_inputs
 from depthpose.pose.config import Unit
-from depthpose.pose.datasets import BopDataset, object_names
-from depthpose.pose.estimator.given import cloud_input, rigid_input, view_input
+from depthpose.pose.datasets import BopDataset, encode_rle, object_names, read_labels
+from depthpose.pose.estimator.given import AnyMask, cloud_input, rigid_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Place
 
@@ -102,12 +104,14 @@ def view_jobs(
 ) -> list[Job[Any]]:
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
+    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ...
+
     Raises:
         InputError: there is none, two have one name, a depth image has no mask, or a folder is
             ``out`` too.
     """
     depth, mask, camera = given
-    depths, pictures = list_images(depth), _list_masks(mask)
+    depths, pictures = _list_depths(depth), _list_masks(mask)
     refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
@@ -119,12 +123,31 @@ def view_jobs(
         raise InputError(
             f"{mask}: no mask called {lost[0]!r}; a mask has the name of its depth image"
         )
-    pairs = [(path, masks[path.stem]) for path in depths]
-    return [
-        input_job(p.stem, object, partial(view_input, p, m, camera, object, p.stem, unit),
-                  source=(p, m))
-        for p, m in pairs
+    jobs = [
+        input_job(p.stem + end, object,
+                  partial(view_input, p, one, camera, object, p.stem + end, unit),
+                  source=(p, masks[p.stem]))
+        for p in depths for end, one in _masks_of(masks[p.stem]).items()
     ]  # fmt: skip
+    twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{depth}: two results would be called {twice[0]!r}, the name of a depth image and a "
+            "number of its mask; rename the other"
+        )
+    return jobs
+
+
+def _masks_of(path: Path) -> dict[str, AnyMask]:
+    """Give the mask of each object that a picture numbers, by what its name ends in."""
+    with suppress(InputError):  # it will be said where the mask is read
+        labels = read_labels(path)
+        numbers = labels[labels != 0].unique().tolist()
+        if len(numbers) > 1:
+            runs = {f"_{k}": encode_rle(labels == k) for k in numbers}
+            size = list(labels.shape)
+            return {end: {"size": size, "counts": list(r[0])} for end, r in runs.items()}
+    return {"": path}
 
 
 def frame_jobs(
@@ -135,10 +158,21 @@ def frame_jobs(
     Raises:
         InputError: there is none, two have one name, or the folder is ``out`` too.
     """
-    depths = list_images(depth)
+    depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
     _refuse_one_name(depths)
     return [_file_job(p, object, view_input, None, camera, object, p.stem, unit) for p in depths]
+
+
+def _list_depths(depth: Path) -> list[Path]:
+    """List depth images: pictures, or the maps of a folder without such."""
+    try:
+        return list_images(depth)
+    except InputError:
+        maps = [p for p in depth.glob("*") if p.suffix.lower() in MAP_SUFFIXES]
+        if not maps:
+            raise
+        return sorted(maps, key=natural_order)
 
 
 def _list_masks(mask: Path) -> list[Path]:

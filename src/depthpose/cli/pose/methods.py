@@ -20,6 +20,7 @@ from depthpose.pose.config import EstimateConfig, Unit
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
 from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.mesh import FIXED_UNITS, unit_of
 from depthpose.pose.predictions import (
     predict,
     read_predictions,
@@ -187,8 +188,11 @@ def source_of(
         return MethodSource(config=config, weights=weights)
     if bop is not None:
         return MethodSource(config=config, models=tuple(open_bop(*bop).objects.values()))
-    unit = register.cad_unit or unit
-    models = Registration.load(*register.cad, unit=unit).models if register.cad and unit else ()
+    models = (
+        Registration.load(*register.cad, unit=_cad_unit(register, unit)).models
+        if register.cad
+        else ()
+    )
     return MethodSource(config=config, models=tuple(models))
 
 
@@ -204,11 +208,14 @@ def _refuse_contradictions(
         raise InputError("--cad-unit is the unit of --cad, and no CAD file is given; leave it out")
     if register.cad and bop is not None:
         raise InputError("--cad: the models of --bop are taken; leave --cad out")
-    if register.cad and not (register.cad_unit or unit):
-        raise InputError(
-            "--cad without a unit: no file says its unit; give --unit mm, of CAD and clouds, or "
-            "--cad-unit mm"
-        )
+    for path in register.cad:
+        unit_of(path, _cad_unit(register, unit))
+
+
+def _cad_unit(register: RegisterOptions, unit: Unit | None) -> Unit | None:
+    """Give the unit of the CAD files; that of clouds is not of files that have their own."""
+    has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in register.cad)
+    return register.cad_unit or (None if has_own else unit)
 
 
 def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:

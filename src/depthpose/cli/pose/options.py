@@ -94,7 +94,7 @@ class RegisterOptions:
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
     own models."""
     cad_unit: Unit | None = None
-    """of the CAD files; as --unit by default."""
+    """of the CAD files; as --unit by default, and of GLB metres."""
 
 
 def refuse_mixture(given: OneObjectOptions, dataset: DataSetOptions) -> None:

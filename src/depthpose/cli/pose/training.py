@@ -96,12 +96,13 @@ def train(
     """
     from depthpose.core.loop import Run
     from depthpose.core.run import find_rank
+    from depthpose.pose.mesh import unit_of
     from depthpose.pose.train import STAGES
 
     kind, run_stage = STAGES[learnt.what]
     chosen = training.read(config, kind, default=learnt.default(), workers=workers)
-    if learnt.cad and learnt.unit is None:
-        raise InputError("--cad without --unit: no file says its unit; give --unit mm, or m")
+    for path in learnt.cad:
+        unit_of(path, learnt.unit)
     chosen = learnt.applied(chosen)
     is_first = find_rank().rank == 0
     with progress_bar(training.view) as on_step:

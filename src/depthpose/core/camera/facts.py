@@ -162,6 +162,7 @@ def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) ->
     Raises:
         InputError: that is so, or the point lies outside the image.
     """
+    _refuse_normalised(K, width, height)
     refuse_outside(K, width, height)
     cx, cy = float(K[0, 2]), float(K[1, 2])
     across, down = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
@@ -227,14 +228,18 @@ def _distorted(facts: CameraFacts, size: Size | None) -> InputError:
     )
 
 
+def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    if K[0, 0] <= _NORMALISED_FX < width / 10:
+        raise InputError(
+            f"K has fx {float(K[0, 0]):g} for {width}x{height} pixels, so it looks normalised; "
+            "multiply its first row by the width and its second by the height"
+        )
+
+
 def _refuse_units(camera: Camera) -> None:
     fx = float(camera.K[0, 0])
     size = f"{camera.width}x{camera.height}"
-    if fx <= _NORMALISED_FX < camera.width / 10:
-        raise InputError(
-            f"K has fx {fx:g} for {size} pixels, so it looks normalised; multiply its first row by "
-            "the width and its second by the height"
-        )
+    _refuse_normalised(camera.K, camera.width, camera.height)
     if fx < _MM_FX_SHARE * camera.width:
         raise InputError(
             f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "

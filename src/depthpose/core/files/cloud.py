@@ -1,8 +1,10 @@
 """Point clouds: PLY, PCD, NPY, text and KITTI's binary scans."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +14,24 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from depthpose.core.errors import InputError, import_open3d
-from depthpose.core.files.disk import AnyPath, refused_suffix, write_bytes
+from depthpose.core.files.disk import AnyPath, refused_as, refused_suffix, write_bytes
 from depthpose.core.files.maps import read_npy, to_float32
 from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
-from depthpose.core.files.points import Columns, encode_ply, parse_rows, read_ply
+from depthpose.core.files.points import (
+    Columns,
+    encode_ply,
+    parse_rows,
+    plain_numbers,
+    read_ply,
+)
 from depthpose.core.files.shards import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
+_PARTS = re.compile(r"[\s,;]+")
+_LOOKED_AT = 100
+"""Rows of text by which it is understood."""
 _MAX_SCAN_BYTES = 2**26
 """Of one scan of a LiDAR, thirty times KITTI's."""
 
@@ -54,8 +65,10 @@ class Cloud:
 def read_cloud(path: AnyPath) -> Cloud:
     """Read a point cloud: ``.ply``, ``.pcd``, ``.npy`` or text (``.xyz``, ``.txt``).
 
-    NPY and text hold a point a row; columns after the third are left out. Points with a NaN
-    coordinate, which organised clouds put where the sensor saw nothing, are left out too.
+    NPY and text hold a point a row; columns after the third are left out, and so is a first one
+    that counts the points. Text may have a line of names (``x y z`` among them) or the number of
+    points before it, and decimal commas where blanks or semicolons part the numbers. Points with a
+    NaN coordinate, which organised clouds put where the sensor saw nothing, are left out too.
 
     Raises:
         InputError: the file is missing, damaged, without x, y and z, or no point is finite; a
@@ -118,7 +131,11 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
 def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
-    return _finite_cloud(path, to_float32(table[:, :3]), None)
+    # A column that counts the points is none of their coordinates.
+    column = table[:, 0]
+    is_long = table.shape[1] > 3 and len(table) > 3 and bool(np.isfinite(column).all())
+    first = int(is_long and column[0] % 1 == 0 and bool((np.diff(column) == 1).all()))
+    return _finite_cloud(path, to_float32(table[:, first : first + 3]), None)
 
 
 def _color(path: AnyPath, columns: Columns) -> np.ndarray | None:
@@ -148,10 +165,52 @@ def _finite_cloud(path: AnyPath, points: np.ndarray, color: np.ndarray | None) -
 
 
 def _read_text(path: AnyPath) -> Cloud:
-    data = read_bytes(path, MAX_TEXT_BYTES)
-    lines = (line.partition("#")[0] for line in TextIOWrapper(BytesIO(data), "utf-8-sig"))
-    rows = (line.replace(",", " ").replace(";", " ") for line in lines)
-    return _from_rows(path, parse_rows(path, (row for row in rows if row.strip())))
+    text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
+    lines = (plain_numbers(line).partition("#")[0].strip() for line in text if not line.isspace())
+    rows = (line for line in lines if line and not line.startswith("//"))
+    with refused_as(path, "text", "save it as UTF-8"):
+        head = list(islice(rows, _LOOKED_AT))
+    first = [word.strip("\"'").lower() for word in _PARTS.split(head[0])] if head else []
+    names = [] if all(map(_is_number, first)) else first
+    if names and not set("xyz") <= set(names):
+        raise InputError(
+            f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, y "
+            "and z; take that line out"
+        )
+    head = head[1:] if names else head
+    is_count = len(head) > 1 and head[0].isdecimal() and len(_PARTS.split(head[1])) > 2
+    count = int(head[0]) if is_count else None
+    rows = chain(head[1:] if is_count else head, rows)
+    table = parse_rows(path, map(_blank_separated(path, head), rows))
+    if count not in (None, len(table)):
+        raise InputError(f"{path}: declares {count} points but {len(table)} rows follow")
+    if not names:
+        return _from_rows(path, table)
+    if table.shape[1] != len(names):
+        raise InputError(f"{path}: names {len(names)} columns, but rows have {table.shape[1]}")
+    return _from_rows(path, table[:, [names.index(axis) for axis in "xyz"]])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return not word
+    return True
+
+
+def _blank_separated(path: AnyPath, head: list[str]) -> Callable[[str], str]:
+    """Understand by the first rows what commas mean; give what makes blanks of separators."""
+    text = " ".join(head)
+    commas = [word.rstrip(",").count(",") for word in re.split(r"[\s;]+", text)]
+    if "." not in text and max(commas) == 1:
+        return lambda row: re.sub(r",(?=\s|$)|;", " ", row).replace(",", ".")
+    if "." not in text and max(commas) and re.search(r"(?<!\d)0\d", text):
+        raise InputError(
+            f"{path}: commas both part numbers and are decimal signs ({head[-1][:60]!r}); "
+            "save it with decimal points"
+        )
+    return lambda row: row.replace(",", " ").replace(";", " ")
 
 
 CLOUD_READERS: dict[str, Callable[[AnyPath], Cloud]] = {

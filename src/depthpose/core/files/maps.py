@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Shaped
 from PIL import Image
 from torch import Tensor
 
@@ -23,6 +23,8 @@ from depthpose.core.files.shards import read_bytes
 
 MAP_SUFFIXES = (".npy", ".pfm")
 """Of files that hold a map of floats."""
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", *MAP_SUFFIXES)
+"""Of depth images of a sensor."""
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -83,20 +85,34 @@ def read_npy(path: AnyPath) -> np.ndarray:
     Raises:
         InputError: the file is missing, damaged, or of another type than float16, 32 or 64.
     """
+    array = read_numbers(path)
+    if array.dtype.kind != "f":
+        raise InputError(
+            f"{path}: holds {array.dtype}, not float16, 32 or 64; save floats in the unit that is "
+            "meant (millimetres as whole numbers: .astype('float32') / 1000 are metres)"
+        )
+    return to_float32(array)
+
+
+def read_numbers(path: AnyPath) -> np.ndarray:
+    """Read an array of floats or whole numbers of any shape as it is; never unpickles.
+
+    Raises:
+        InputError: the file is missing, damaged, or of another type.
+    """
     stream = BytesIO(read_bytes(path))
     with refused_as(path, "NPY file", "save it again with numpy.save"):
         version = np.lib.format.read_magic(stream)
         if version not in _HEADER_READERS:
             raise InputError(f"{path}: NPY version {version}; save plain floats with numpy.save")
         shape, is_fortran, dtype = _HEADER_READERS[version](stream)
-        if dtype.kind != "f" or dtype.itemsize > 8:
+        if dtype.kind not in "fiu" or dtype.itemsize > 8:
             raise InputError(
                 f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
             )
         body = stream.getbuffer()[stream.tell() :]
         _check_shape(path, shape, dtype, len(body))
-        array = np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
-        return to_float32(array)
+        return np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
 
 
 def _check_shape(path: AnyPath, shape: tuple[int, ...], dtype: np.dtype, have: int) -> None:
@@ -165,6 +181,30 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     return _read_units(path, unit_m)
 
 
+def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
+    """Read depth as it is stored: whole numbers of a 16-bit PNG, TIFF or NPY; floats of the others.
+
+    Whole numbers are 0 where there is no reading, floats NaN.
+
+    Raises:
+        InputError: the file is missing, damaged, no map, or a picture of one.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise refused_suffix(path, "depth image", DEPTH_SUFFIXES)
+    if suffix == ".npy" and (array := read_numbers(path)).dtype.kind != "f":
+        if array.ndim != 2:
+            raise InputError(f"{path}: depth is (H, W), got {array.shape}; save one channel alone")
+        return torch.from_numpy(array.astype(np.int64))
+    if suffix in MAP_SUFFIXES:
+        return read_map(path)
+    if suffix != ".png":
+        with opened_image(path) as image:
+            if image.mode in ("F", "I"):
+                return torch.from_numpy(np.array(image))
+    return read_depth_png(path, 1.0).nan_to_num(0.0).int()
+
+
 def write_depth_png(
     path: AnyPath, depth_m: Float[Tensor, "h w"], unit_m: float = KITTI_UNIT
 ) -> None:
@@ -197,7 +237,7 @@ def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> No
 def _read_units(path: AnyPath, unit: float) -> Float32[Tensor, "h w"]:
     _check_unit(path, unit)
     with opened_image(path) as image:
-        if image.format not in ("PNG", "TIFF") or image.mode != "I;16":
+        if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
             raise InputError(
                 f"{path}: a {image.format} of mode {image.mode}, where depth or disparity needs a "
                 "16-bit greyscale PNG; an 8-bit or colour file is a picture of it, not the data"

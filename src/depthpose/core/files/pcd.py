@@ -6,7 +6,14 @@ import numpy as np
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath
-from depthpose.core.files.points import Columns, Field, need_bytes, split_records, split_rows
+from depthpose.core.files.points import (
+    Columns,
+    Field,
+    need_bytes,
+    split_records,
+    split_rows,
+    text_rows,
+)
 from depthpose.core.files.shards import read_bytes
 
 _CODES = {
@@ -37,7 +44,7 @@ def read_pcd(path: AnyPath) -> Columns:
         return split_records(path, body, fields, count)
     if end[1] == b"binary_compressed":
         return _split_compressed(path, body, fields, count)
-    return split_rows(path, body, fields, count)
+    return split_rows(path, text_rows(path, body), fields, count)
 
 
 def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:

@@ -1,13 +1,15 @@
-"""PLY point files (Turk 1994), and the named columns that all binary point files share.
+"""PLY files (Turk 1994), and the named columns that all binary point files share.
 
 Text and binary of both byte orders are read; little-endian binary is written.
 """
 
 import re
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO, TextIOWrapper
 from itertools import accumulate, islice
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from depthpose.core.files.disk import AnyPath, refused_as
 from depthpose.core.files.shards import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
+_WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1\.#(?:QNAN|SNAN|IND|INF)\w*)")
 Columns = dict[str, np.ndarray]
 """One array a name, all equally long."""
 
@@ -28,11 +31,21 @@ class Field:
         name: as the file names it.
         code: numpy's type code without byte order, such as ``f4``.
         count: numbers a record; a field of several is stepped over.
+        size_code: of a list, the type of the number of its values; None: it is no list.
     """
 
     name: str
     code: str
     count: int = 1
+    size_code: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Ragged:
+    """Lists of differing length: how many values each has, and all values one after the other."""
+
+    sizes: np.ndarray
+    values: np.ndarray
 
 
 def split_records(
@@ -51,34 +64,37 @@ def split_records(
     return {f.name: records[f"{i}"][:, 0] for i, f in enumerate(fields)}
 
 
-def split_rows(
-    path: AnyPath, body: memoryview, fields: list[Field], count: int, first: int = 0
-) -> Columns:
-    """Take ``count`` rows of text apart into columns of the declared types.
-
-    Args:
-        path: of the file, for errors.
-        body: what follows the header.
-        fields: the columns.
-        count: how many rows.
-        first: rows before them that are stepped over; empty ones do not count.
+def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
+    """Give the lines of a body in text; empty ones do not count.
 
     Raises:
-        InputError: rows are missing or ragged, a value does not fit its type, or there is more
-            text than is read.
+        InputError: there is more text than is read.
     """
     if len(body) > MAX_TEXT_BYTES:
         raise InputError(
             f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
             "binary"
         )
-    lines = (line for line in TextIOWrapper(BytesIO(body), "latin-1") if line.strip())
-    table = parse_rows(path, islice(lines, first, first + count))
+    lines = TextIOWrapper(BytesIO(body), "latin-1")
+    return (plain_numbers(line) for line in lines if line.strip())
+
+
+def plain_numbers(line: str) -> str:
+    """Write ``nan`` and ``inf`` for the words by which Microsoft's C library prints them."""
+    if "#" not in line and "(" not in line:
+        return line
+    return _WORDS.sub(lambda found: "inf" if "INF" in found[0] else "nan", line)
+
+
+def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
+    """Take the next ``count`` rows of text apart into columns of the declared types.
+
+    Raises:
+        InputError: rows are missing or ragged, or a value does not fit its type.
+    """
+    table = parse_rows(path, islice(rows, count))
     if len(table) < count:
-        raise InputError(
-            f"{path}: declares {count} points but {len(table)} rows follow; it is truncated, save "
-            "it again"
-        )
+        raise _truncated(path, f"{count} points", len(table))
     width = sum(f.count for f in fields)
     if count and table.shape[1] != width:
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
@@ -90,13 +106,19 @@ def split_rows(
     }
 
 
+def _truncated(path: AnyPath, what: str, rows: int) -> InputError:
+    return InputError(
+        f"{path}: declares {what} but {rows} rows follow; it is truncated, save it again"
+    )
+
+
 def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
     """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time.
 
     Raises:
         InputError: a value is no number, or the rows are ragged.
     """
-    with refused_as(path, "table of numbers", "give every row the same number of values"):
+    with refused_as(path, "table of numbers", "give every row as many values, with decimal points"):
         table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
     return table if table.size else np.empty((0, 0))
 
@@ -129,7 +151,11 @@ _CODES = {
 }
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 2**16
-_END = re.compile(rb"(?:^|\n)end_header[ \t]*(?:\r\n|\n|\r)")
+_END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
+
+
+_MOST_RUNS = 500_000
+"""Of binary lists of one length, which are read together; more take over ten seconds."""
 
 
 @dataclass(kw_only=True)
@@ -137,32 +163,141 @@ class _Element:
     name: str
     count: int
     fields: list[Field] = field(default_factory=list)
-    has_list: bool = False
-
-    @property
-    def row_bytes(self) -> int:
-        return sum(np.dtype(f.code).itemsize for f in self.fields)
 
 
 def read_ply(path: AnyPath) -> Columns:
-    """Read the columns of the ``vertex`` element; faces and other elements are stepped over.
+    """Read the columns of the ``vertex`` element alone.
 
     Raises:
-        InputError: the file is missing, truncated, damaged, or lays its vertices behind lists.
+        InputError: the file is missing, truncated or damaged.
+    """
+    return read_ply_elements(path, "vertex")[0]
+
+
+def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
+    """Read the columns of the ``vertex`` element, and the lists of the others.
+
+    Args:
+        path: the file.
+        last: the element behind which nothing is read; None: every byte must belong to one.
+
+    Returns:
+        The columns; the lists by ``ELEMENT PROPERTY``.
+
+    Raises:
+        InputError: the file is missing, damaged, or shorter or longer than its header says.
     """
     data = read_bytes(path)
     end = _END.search(data, 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: no PLY header ('ply' ... 'end_header'); is it a PLY file?")
     order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
-    before, vertex = _find_vertex(path, elements)
+    _refuse_vertices(path, elements)
     body = memoryview(data)[end.end() :]
-    if order:
-        skipped = _bytes_of(path, before)
-        need_bytes(path, len(body), skipped, "elements before the vertices")
-        return split_records(path, body[skipped:], vertex.fields, vertex.count, order)
-    first = sum(e.count for e in before)
-    return split_rows(path, body, vertex.fields, vertex.count, first)
+    rows = None if order else text_rows(path, body)
+    columns: Columns = {}
+    lists: dict[str, Ragged] = {}
+    for element in elements:
+        if element.name == "vertex" and rows is None:
+            columns = split_records(path, body, element.fields, element.count, order)
+            row_bytes = sum(np.dtype(f.code).itemsize for f in element.fields)
+            body = body[element.count * row_bytes :]
+        elif element.name == "vertex":
+            assert rows is not None
+            columns = split_rows(path, rows, element.fields, element.count)
+        elif rows is None:
+            found, used = _binary_lists(path, body, element, order)
+            body, lists = body[used:], lists | found
+        else:
+            lists |= _text_lists(path, rows, element)
+        if element.name == last:
+            return columns, lists
+    more = len(body) if rows is None else sum(1 for _ in rows)
+    if more > (3 if rows is None else 0):  # a line end behind binary data does no harm
+        raise InputError(
+            f"{path}: {more} {'bytes' if rows is None else 'rows'} follow what its header declares "
+            f"({', '.join(f'{e.count} {e.name}' for e in elements)}); correct it, or save it again"
+        )
+    return columns, lists
+
+
+def _binary_lists(
+    path: AnyPath, body: memoryview, element: _Element, order: str
+) -> tuple[dict[str, Ragged], int]:
+    """Read the lists of an element, rows of equal lists at once; say how many bytes it takes."""
+    what = f"{element.count} {element.name}"
+    steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
+             for f in element.fields]  # fmt: skip
+    found: list[np.ndarray] = []
+    known: dict[tuple[int, ...], np.dtype] = {}
+    at, left, ahead = 0, element.count, 64
+    while left:
+        lengths, end = [], at
+        for f, size, value in steps:
+            length = 1
+            if f.size_code:
+                need_bytes(path, len(body), end + size.itemsize, what)
+                length = int(np.frombuffer(body, size, 1, end)[0])
+                if length < 0:
+                    raise InputError(f"{path}: a list of {what} has {length} values; save it anew")
+                end += size.itemsize
+            lengths.append(length)
+            end += length * value.itemsize
+        need_bytes(path, len(body), end, what)
+        key = tuple(lengths)
+        if key not in known:
+            kinds: list[Any] = []
+            for (f, size, value), length in zip(steps, key, strict=True):
+                kinds += [(f"{f.name} size", size)] if f.size_code else []
+                kinds.append((f.name, value, (length,)))
+            known[key] = np.dtype(kinds)
+        dtype = known[key]
+        rows = min(left, ahead, (len(body) - at) // dtype.itemsize)
+        records = np.frombuffer(body, dtype, rows, at)
+        sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
+        is_equal = np.array([size == size[0] for size in sizes] or [[True]]).all(0)
+        records = records if is_equal.all() else records[: int(is_equal.argmin())]
+        found.append(records)
+        if len(found) > _MOST_RUNS:
+            raise InputError(f"{path}: {what} of ever other lengths; export triangles alone")
+        at, left, ahead = at + records.nbytes, left - len(records), 2 * len(records) + 64
+    return {
+        f"{element.name} {f.name}": Ragged(
+            sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in found)]),
+            values=np.concatenate([np.empty(0, f.code), *(r[f.name].reshape(-1) for r in found)]),
+        )
+        for f in element.fields
+        if f.size_code
+    }, at
+
+
+def _text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> dict[str, Ragged]:
+    sizes = {f.name: array("q") for f in element.fields if f.size_code}
+    values = {name: array("d") for name in sizes}
+    there = 0
+    for there, row in enumerate(islice(rows, element.count), 1):
+        words, at = row.split(), 0
+        try:
+            for f in element.fields:
+                if f.size_code:
+                    count = int(words[at])
+                    sizes[f.name].append(count)
+                    values[f.name].extend(map(float, words[at + 1 : at + 1 + count]))
+                    at += max(count, 0)
+                at += 1
+        except (ValueError, IndexError, OverflowError):
+            at = -1
+        if at != len(words):
+            raise InputError(
+                f"{path}: row {there} of {element.name}, {row.strip()[:60]!r}, is not what the "
+                "header declares (the number of values, then as many); save it again"
+            )
+    if there < element.count:
+        raise _truncated(path, f"{element.count} {element.name}", there)
+    return {
+        f"{element.name} {name}": Ragged(np.array(sizes[name], np.int64), np.array(values[name]))
+        for name in sizes
+    }
 
 
 def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
@@ -188,10 +323,14 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 pass
             case ["format", form, "1.0"] if form in _ORDERS:
                 order = _ORDERS[form]
-            case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
                 elements.append(_Element(name=name, count=int(count)))
-            case ["property", "list", size, kind, _] if {size, kind} <= _CODES.keys() and elements:
-                elements[-1].has_list = True
+            case ["property", "list", size, kind, name] if (
+                {size, kind} <= _CODES.keys() and _CODES[size][0] != "f" and elements
+            ):
+                elements[-1].fields.append(
+                    Field(name=name, code=_CODES[kind], size_code=_CODES[size])
+                )
             case ["property", kind, name] if kind in _CODES and elements:
                 elements[-1].fields.append(Field(name=name, code=_CODES[kind]))
             case _:
@@ -203,22 +342,15 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
     return order, elements
 
 
-def _find_vertex(path: AnyPath, elements: list[_Element]) -> tuple[list[_Element], _Element]:
+def _refuse_vertices(path: AnyPath, elements: list[_Element]) -> None:
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
-    vertex = elements[names.index("vertex")]
-    properties = [f.name for f in vertex.fields]
-    if vertex.has_list or not properties or len(set(properties)) != len(properties):
-        raise InputError(
-            f"{path}: vertex properties {properties} are none, a list or repeat a name; give each "
-            "vertex x, y and z"
-        )
-    return elements[: names.index("vertex")], vertex
-
-
-def _bytes_of(path: AnyPath, elements: list[_Element]) -> int:
-    lists = [e.name for e in elements if e.has_list]
-    if lists:
-        raise InputError(f"{path}: binary lists {lists} lie before the vertices; put them behind")
-    return sum(e.count * e.row_bytes for e in elements)
+    for one in elements:
+        properties = [f.name for f in one.fields]
+        has_list = one.name == "vertex" and any(f.size_code for f in one.fields)
+        if has_list or not properties or len(set(properties)) != len(properties):
+            raise InputError(
+                f"{path}: {one.name} properties {properties} are none, a list or repeat a name; "
+                "give each vertex x, y and z"
+            )

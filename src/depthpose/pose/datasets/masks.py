@@ -7,7 +7,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -17,27 +17,88 @@ from depthpose.pose.datasets.parse import integer, number, read_rows
 
 Runs = tuple[tuple[int, ...], int, int]
 """Run lengths, height and width."""
+_MOST_LABELS, _HALF = 64, 127
 _MOST_BITS = 40
 """Of a run length in text: no image has as many pixels."""
 
 
 def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
-    """Read a mask image of any kind, where what is not black is the object, or run lengths.
-
-    A ``.json`` file holds COCO's run lengths (``size`` and ``counts``, compressed or not), an
-    annotation or a detection with such a ``segmentation``, or a list of one of these.
+    """Read the mask of one object, as :func:`read_labels` reads it.
 
     Raises:
-        InputError: it is missing, no picture, or not of one mask.
+        InputError: it is missing, no picture, or shows several objects.
+    """
+    return one_mask(read_labels(path), str(path))
+
+
+def read_labels(path: Path) -> Int64[Tensor, "mask_h mask_w"]:
+    """Read a mask image of any kind: 0 where it is black or transparent, a number for each object.
+
+    Of a picture in colour they are 1, 2, ... in the order of the colours. Where an alpha channel
+    leaves a photograph or one colour, what is opaque is the object. A ``.json`` file holds COCO's
+    run lengths (``size`` and ``counts``, compressed or not), an annotation or a detection with such
+    a ``segmentation``, or a list of one of these.
+
+    Raises:
+        InputError: it is missing, no picture, or no list of one mask.
     """
     if path.suffix.lower() == ".json":
-        return _read_json_mask(path)
+        return _read_json_mask(path).long()
     with opened_image(path) as image:
-        values = np.asarray(image.convert("RGB") if image.mode == "P" else image)
-        if values.ndim == 3 and values.shape[2] in (2, 4):
-            values = values[:, :, :-1]  # opaque black is not the object
-    is_object = values != 0
-    return torch.from_numpy(is_object if is_object.ndim == 2 else is_object.any(-1))
+        if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
+            pixels = np.asarray(image.convert("RGBA")).astype(np.int64)
+        elif image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
+            pixels = np.asarray(image).astype(np.int64)[..., None]
+        else:
+            pixels = np.asarray(image.convert("RGB")).astype(np.int64)
+        if image.format == "JPEG":  # what compression leaves about an edge is no object
+            pixels = np.where(pixels > _HALF, 255, 0)
+    values = pixels[..., 0]
+    if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
+        colours, places = np.unique(pixels[..., :3] @ [2**16, 2**8, 1], return_inverse=True)
+        values = places.reshape(values.shape) + (colours[0] != 0)
+    is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
+    if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
+        is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
+        values = np.where(is_opaque, 1 if is_shape else values, 0)
+    return number_objects(values)
+
+
+def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
+    """Give each object of a mask (h, w) of whole numbers its number; 1 where there is one alone.
+
+    A number is an object where it fills a square of three pixels: between the values of a mask
+    with soft borders lie others, which do not. Of more than 64 numbers all are one object.
+    """
+    shown = values[values != 0]
+    if len(shown) == 0 or (shown == shown[0]).all():
+        return torch.from_numpy(values != 0).long()
+    middle = values[1:-1, 1:-1]
+    is_solid = middle != 0
+    for row, column in np.ndindex(3, 3):
+        height, width = middle.shape
+        is_solid &= values[row : row + height, column : column + width] == middle
+    found = np.unique(middle[is_solid])
+    if not 2 <= len(found) <= _MOST_LABELS:
+        return torch.from_numpy(values != 0).long()
+    return torch.from_numpy(np.where(np.isin(values, found), values, 0)).long()
+
+
+def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
+    """Take the mask of one object.
+
+    Raises:
+        InputError: there are several; which, and how large they are.
+    """
+    found, pixels = labels[labels != 0].unique(return_counts=True)
+    if len(found) > 1:
+        said = [f"{k} ({n} px)" for k, n in zip(found.tolist(), pixels.tolist(), strict=True)]
+        raise InputError(
+            f"{name}: shows {len(found)} objects, numbered {', '.join(said[:5])}"
+            f"{', ...' if len(said) > 5 else ''}, where one mask is of one; give that of one "
+            "(mask == 1), or take each as an instance (estimate_instances, pose predict)"
+        )
+    return labels != 0
 
 
 def _read_json_mask(path: Path) -> Bool[Tensor, "h w"]:

@@ -17,6 +17,7 @@ from depthpose.pose.estimator.given import (
     AnyArray,
     AnyMask,
     cloud_input,
+    labels_input,
     rigid_input,
     split_instances,
     view_input,
@@ -92,7 +93,8 @@ class PoseEstimator(ABC):
             cloud: points of the object alone, in the camera frame (x right, y down, z forward).
             unit: of the cloud, metres by default; of a depth image, where its camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
-            mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths.
+            mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths. One that
+                numbers several objects (1, 2, ...) is refused: ``mask == 1`` is one of them.
             camera: of the depth image, its file of any format that is read, a dict of what such a
                 file has, or the 3x3 matrix K.
             focal_px: the focal length alone [px], in place of a camera.
@@ -129,9 +131,10 @@ class PoseEstimator(ABC):
         object: str | None = None,
         unit: Unit | None = None,
     ) -> list[PoseEstimate]:
-        """Estimate every instance of one object in one mask, the largest piece first.
+        """Estimate every instance of one object in one mask, the largest first.
 
-        The mask is split into connected pieces; instances that touch in the image stay one piece.
+        A mask that numbers its objects (1, 2, ...) shows one instance a number. Any other is split
+        into connected pieces; instances that touch in the image stay one piece.
 
         Args:
             depth: as for :meth:`estimate`.
@@ -147,8 +150,9 @@ class PoseEstimator(ABC):
         lens = choose_lens(camera, focal_px)
         if lens is None:
             raise InputError("estimate_instances: give camera= or focal_px=")
-        view = view_input(depth, mask, lens, self._object(object), _NAME, unit)
-        pieces = split_instances(view.mask) or [view.mask]
+        labels = labels_input(mask, _NAME)
+        view = view_input(depth, labels != 0, lens, self._object(object), _NAME, unit)
+        pieces = split_instances(labels) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
         return self.estimate_many(views)
 

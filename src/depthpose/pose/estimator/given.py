@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from depthpose.core.camera import (
@@ -20,11 +20,10 @@ from depthpose.core.camera import (
 )
 from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError
-from depthpose.core.files import MAP_SUFFIXES, read_cloud, read_depth_png, read_map
-from depthpose.core.files.disk import refused_suffix
+from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import Unit, metres_of
-from depthpose.pose.datasets import mask_from_rle, read_mask
+from depthpose.pose.datasets import mask_from_rle, number_objects, one_mask, read_labels
 from depthpose.pose.segmentation import label_parts
 from depthpose.pose.types import CloudInput, ViewInput
 
@@ -64,8 +63,8 @@ def view_input(
     """Take a depth image, a mask and a camera to a view in metres.
 
     Args:
-        depth: a file, whole numbers, or metres.
-        mask: the object's pixels; None: all.
+        depth: a file (16-bit PNG or TIFF; NPY, PFM or TIFF of floats), whole numbers, or metres.
+        mask: the object's pixels, of one object alone; None: all.
         camera: of the depth image.
         object: which one.
         name: of the view.
@@ -81,7 +80,10 @@ def view_input(
     known = camera_of(camera, (width, height)) if is_said else camera
     said_m = known.depth_unit_m if isinstance(known, Camera) else None
     depth_m = _metres(values, said_m, unit, str(depth) if isinstance(depth, str | Path) else name)
-    pixels = torch.ones(height, width).bool() if mask is None else _mask(mask, name)
+    pixels = torch.ones(height, width).bool()
+    if mask is not None:
+        said = str(mask) if isinstance(mask, str | Path) else name
+        pixels = one_mask(labels_input(mask, name), said)
     if tuple(pixels.shape) != (height, width):
         raise InputError(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "
@@ -115,33 +117,44 @@ def rigid_input(pose: Rigid | AnyArray) -> Rigid:
     return Rigid(R.contiguous(), matrix[:3, 3].contiguous())
 
 
-def split_instances(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
-    """Split a mask into its connected pieces, from the largest down; fragments are left out.
+def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
+    """Split a mask into one for each object, from the largest down.
 
-    Pixels that touch at a corner are connected. A piece below a fifth of the largest is a fragment.
+    Where it numbers several, they are these; else its connected pieces: pixels that touch at a
+    corner are connected, and a piece below a fifth of the largest is a fragment, left out.
     """
-    label, pixels = label_parts(mask)
+    numbers, pixels = labels[labels != 0].unique(return_counts=True)
+    if len(numbers) > 1:
+        order = pixels.argsort(descending=True, stable=True)
+        return [labels == number for number in numbers[order]]
+    label, pixels = label_parts(labels != 0)
     order = pixels.argsort(descending=True, stable=True)
     least = max(1, math.ceil(_SMALLEST_INSTANCE * int(pixels.max())))
     return [label == k for k in order if int(pixels[k]) >= least]
 
 
-def _mask(mask: AnyMask, name: str) -> Bool[Tensor, "_ _"]:
+def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
+    """Take a mask to the numbers of its objects, as :func:`read_labels` gives them.
+
+    Raises:
+        InputError: a file that cannot be read, or no mask.
+    """
     if isinstance(mask, str | Path):
-        return read_mask(Path(mask))
-    return mask_from_rle(mask, name) if isinstance(mask, Mapping) else _tensor(mask) != 0
+        return read_labels(Path(mask))
+    if isinstance(mask, Mapping):
+        return mask_from_rle(mask, name).long()
+    values = _tensor(mask)
+    is_whole = not values.is_floating_point() or bool((values % 1 == 0).all())
+    whole = values.long() if is_whole else (values != 0).long()
+    return number_objects(whole.numpy()) if whole.ndim == 2 else whole
 
 
 def _values(depth: AnyArray, name: str) -> Shaped[Tensor, "h w"]:
     """Read depth as it is stored: whole numbers of a PNG, or floats."""
-    if not isinstance(depth, str | Path):
-        return _refuse_no_picture(_tensor(depth), name)
-    suffix = Path(depth).suffix.lower()
-    if suffix not in (".png", *MAP_SUFFIXES):
-        raise refused_suffix(depth, "depth image", (".png", *MAP_SUFFIXES))
-    if suffix == ".png":
-        return read_depth_png(depth, 1.0).nan_to_num(0.0).int()
-    return _refuse_no_picture(read_map(Path(depth)), name)
+    values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
+    if values.ndim != 2:
+        raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
+    return values
 
 
 def _metres(
@@ -181,12 +194,6 @@ def _intrinsics(camera: AnyLens | None, width: int, height: int, name: str) -> F
             "cx and cy s times as large"
         ) from error
     return K
-
-
-def _refuse_no_picture(values: Tensor, name: str) -> Shaped[Tensor, "h w"]:
-    if values.ndim != 2:
-        raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
-    return values
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has

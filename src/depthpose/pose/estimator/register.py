@@ -112,17 +112,17 @@ class Registration(PoseEstimator):
     @classmethod
     @own_arithmetic()
     def load(
-        cls, *cad: str | Path, unit: Unit, config: EstimateConfig | None = None
+        cls, *cad: str | Path, unit: Unit | None = None, config: EstimateConfig | None = None
     ) -> "Registration":
         """Read CAD files; symmetries that are found in a part make its copies one answer.
 
         Args:
             cad: PLY, STL, OBJ, GLB; an object is called as its file.
-            unit: of the numbers in the files.
+            unit: of the numbers in the files; None where all are GLB, which has metres.
             config: as above.
 
         Raises:
-            InputError: no file, two of one name, one that cannot be read, or without a surface.
+            InputError: no file, two of one name, one that is not read, without a surface or unit.
         """
         if not all(isinstance(path, str | Path) for path in cad):
             raise InputError("Registration.load takes paths one by one: load(*files, unit=...)")

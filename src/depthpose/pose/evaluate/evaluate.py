@@ -7,6 +7,7 @@ from pathlib import Path
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance
+from depthpose.pose.evaluate.conventions import convention_advice
 from depthpose.pose.evaluate.errors import ErrorContext, make_ruler, match, measure
 from depthpose.pose.evaluate.rows import Conditions, InstanceRow, ObjectRow, Origin, RiskRow
 from depthpose.pose.evaluate.summary import (
@@ -38,15 +39,19 @@ class Evaluation:
             counts the same, and ``all`` over instances, as BOP pools them.
         per_instance: one an instance.
         risk: how many answers are wrong if only the surest are given.
+        advice: by which change of all predictions many more were right: another unit or convention
+            of poses; None where by none.
     """
 
     rows: list[ObjectRow]
     per_instance: list[InstanceRow]
     risk: list[RiskRow]
+    advice: str | None = None
 
     def of(self, origin: Origin) -> "Evaluation":
         """Say in each row whose predictions it measures."""
-        return Evaluation(
+        return replace(
+            self,
             rows=[replace(row, origin=origin) for row in self.rows],
             per_instance=[replace(row, origin=origin) for row in self.per_instance],
             risk=[replace(row, origin=origin) for row in self.risk],
@@ -57,9 +62,12 @@ def read_any(path: Path) -> list[Prediction]:
     """Read predictions: a folder with ``poses.json``, or anybody's BOP csv.
 
     Raises:
-        InputError: it is neither, or damaged.
+        InputError: it is neither, damaged, or holds no pose and no refusal.
     """
-    return read_predictions(path) if path.is_dir() else read_bop_results(path)
+    found = read_predictions(path) if path.is_dir() else read_bop_results(path)
+    if not found:
+        raise InputError(f"{path}: holds no pose, so there is nothing to measure; predict some")
+    return found
 
 
 def evaluate(
@@ -96,6 +104,7 @@ def evaluate(
         rows=[replace(row, conditions=conditions) for row in _sum_up(dataset, rows, rulers)],
         per_instance=rows,
         risk=[replace(row, conditions=conditions) for row in risk_rows(rows)],
+        advice=convention_advice(dataset, predictions, rulers, SUCCESS_SHARE),
     )
 
 

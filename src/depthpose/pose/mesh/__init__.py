@@ -1,11 +1,13 @@
 """Known objects: model files, diameter, keypoints, surface points, symmetries, units."""
 
+from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
+from depthpose.pose.mesh.files import mesh_suffixes as mesh_suffixes
+from depthpose.pose.mesh.files import read_geometry as read_geometry
+from depthpose.pose.mesh.files import unit_of as unit_of
 from depthpose.pose.mesh.mirror import is_mirror_alike as is_mirror_alike
 from depthpose.pose.mesh.mirror import mirror_deviation as mirror_deviation
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import make_model as make_model
-from depthpose.pose.mesh.models import mesh_suffixes as mesh_suffixes
-from depthpose.pose.mesh.models import read_geometry as read_geometry
 from depthpose.pose.mesh.models import read_model as read_model
 from depthpose.pose.mesh.models import refuse_one_name as refuse_one_name
 from depthpose.pose.mesh.near import NearSymmetry as NearSymmetry

@@ -267,11 +267,6 @@ def read_models(
 
 
 def _from_cad(config: ModelsConfig) -> tuple[ObjectModel, ...]:
-    if config.unit is None:
-        raise InputError(
-            f"models.cad is {list(config.cad)} without models.unit, and no file says its unit; "
-            "write unit: mm, or m"
-        )
     models = tuple(
         read_model(path, config.unit, number=number, config=config.mesh)
         for number, path in enumerate(config.cad, start=1)

@@ -124,7 +124,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
 def train_words(what: str, config: Any) -> str:  # noqa: ANN401
     """Give the command that trains this, with its CAD files, for the card."""
     cad = [word for path in config.models.cad for word in ("--cad", path)]
-    unit = ["--unit", config.models.unit] if cad else []
+    unit = ["--unit", config.models.unit] if cad and config.models.unit else []
     return shlex.join(["pose", "train", "--what", what, *cad, *unit])
 
 

@@ -1,0 +1,298 @@
+"""Model files to points and triangles: PLY, STL, OBJ and GLB; polygons are cut.
+
+What a file declares, or may grow to, is checked before it is read in full.
+"""
+
+import json
+import struct
+from array import array
+from codecs import BOM_UTF8
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from depthpose.core.errors import InputError
+from depthpose.core.files import AnyPath, cloud_suffixes, read_bytes, read_cloud
+from depthpose.core.files.disk import refused_as, refused_suffix
+from depthpose.core.files.points import Ragged, read_ply_elements
+from depthpose.pose.config import Unit
+from depthpose.pose.mesh.polygons import cut_polygons
+
+_MOST_VALUES = 2 * 10**7
+"""That the accessors of a GLB may declare: six million points."""
+_MOST_TEXT = 2**25
+"""Bytes of an OBJ or STL in text, which are read in some seconds."""
+_NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
+_MOST_NODES, _MOST_SCENE_BYTES = 10_000, 2**22
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
+"""How extensions of glTF begin that change no surface, or that trimesh reads."""
+_NO_AREA = 1e-12
+"""Of the square of the extent: a face of no more is a line or a point."""
+_LEAST_AREA = 1e-6
+"""Of the square of the extent: all faces of less are no surface. A wire has 0.003."""
+_FARTHEST = 1e9
+"""A coordinate beyond belongs to no model, in whatever unit, and overflows in float32."""
+
+
+FIXED_UNITS: dict[str, Unit] = {".glb": "m"}
+"""Of formats that fix theirs."""
+
+
+def unit_of(path: AnyPath, unit: Unit | None) -> Unit:
+    """Give the unit of a model file: what is said, else what its format fixes.
+
+    Raises:
+        InputError: neither.
+    """
+    found = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    if found is None:
+        raise InputError(
+            f"{path}: no unit is given, and such a file does not say its own; give --unit mm (of a "
+            "CAD file beside a cloud --cad-unit mm), or unit: mm in a config"
+        )
+    return found
+
+
+def read_geometry(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    """Read points and triangles of a model file in its own unit; bare points have no triangles.
+
+    Raises:
+        InputError: the file is missing, damaged or of another format, or has no surface.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_READERS:
+        if suffix not in cloud_suffixes():
+            known = dict.fromkeys((*mesh_suffixes(), *cloud_suffixes()))
+            raise refused_suffix(path, "model", tuple(known))
+        return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
+    vertices, faces = MESH_READERS[suffix](path)
+    if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
+        raise InputError(
+            f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
+            f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
+        )
+    if isinstance(faces, np.ndarray):
+        faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
+    triangles = cut_polygons(path, vertices, faces.sizes, faces.values.astype(np.int64))
+    return vertices, _sound_faces(path, vertices, triangles)
+
+
+def mesh_suffixes() -> tuple[str, ...]:
+    """Name the suffixes of model files that may have faces, in lower case."""
+    return tuple(MESH_READERS)
+
+
+def _sound_faces(path: AnyPath, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Drop faces without area, and all but the first of those on the same three points.
+
+    A face and its reverse would cancel in the normals. Holes are no flaw.
+    """
+    if len(faces) == 0:
+        return faces
+    corners = vertices[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
+    square = float(np.ptp(vertices, axis=0).max()) ** 2
+    if area.sum() <= _LEAST_AREA * square:
+        raise InputError(
+            f"{path}: its {len(faces)} faces have no area, so there is no surface to see; all are "
+            "lines or points. Export it again as triangles, or as points without faces."
+        )
+    # By place, not by number: STL repeats the points of every face.
+    _, place = np.unique(vertices, axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(place.reshape(-1)[faces], axis=-1), axis=0, return_index=True)
+    is_first = np.zeros(len(faces), bool)
+    is_first[first] = True
+    return faces[is_first & (area > _NO_AREA * square)]
+
+
+def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+    """Read vertices and faces; the list of a face has one of several names."""
+    columns, lists = read_ply_elements(path)
+    if not columns.keys() >= set("xyz"):
+        raise InputError(f"{path}: no x, y and z among {list(columns)}. Export it again.")
+    vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
+    faces = [name for name in lists if name.split()[0] in ("face", "tristrips")]
+    indices = [name for name in faces if name.startswith("face ") and "ind" in name]
+    named = [name for name in indices if "vert" in name] or indices
+    if faces and (len(named) != 1 or not _are_whole(lists[named[0]].values)):
+        raise InputError(
+            f"{path}: the lists of its faces are {faces}, where one 'face vertex_indices' of whole "
+            "numbers is needed. Export it again."
+        )
+    return vertices, lists[named[0]] if named else _NO_FACES
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    return bool((np.abs(values) < _FARTHEST).all()) and bool((values % 1 == 0).all())
+
+
+def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+    """Give the words of each line, however lines end, and its number; comments are left out."""
+    if len(data) > _MOST_TEXT:
+        raise InputError(
+            f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
+            "as binary PLY or STL"
+        )
+    before = b""
+    text = data.removeprefix(BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    for number, line in enumerate(BytesIO(text), 1):
+        if line.endswith(b"\\\n"):
+            before += line[:-2]
+            continue
+        words = (before + line).partition(b"#")[0].split()
+        before = b""
+        if words:
+            yield number, words
+
+
+def _place(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
+    """Take x, y and z of a line; what follows them is a weight or a colour."""
+    with suppress(ValueError):
+        place = [float(word) for word in words[1:4]]
+        if len(place) == 3:
+            return place
+    raise InputError(
+        f"{path}: line {line}, {b' '.join(words)[:60].decode('latin-1')!r}, does not give x, y and "
+        "z with decimal points; export it again"
+    )
+
+
+def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+    """Read triangles; text if it says so and its length is not that of its triangles."""
+    data = read_bytes(path)
+    (count,) = struct.unpack("<I", data[80:84]) if len(data) >= 84 else (0,)
+    there, more = divmod(len(data) - 84, 50)
+    head = data[: 2**16].removeprefix(BOM_UTF8).lstrip().lower()
+    is_text = head.startswith(b"solid") and b"facet" in head and b"\0" not in head
+    if is_text and (there, more) != (count, 0):
+        return _read_text_stl(path, data)
+    # Writers that stream leave the count at 0; a byte or two behind the last one do no harm.
+    if there < 1 or (there != count and (count or more)):
+        raise InputError(
+            f"{path}: declares {count} triangles, and {max(0, len(data) - 84)} bytes follow, those "
+            f"of {max(0, there)}; it is truncated or no STL. Export it again."
+        )
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
+    corners = np.frombuffer(data, record, there, 84)["corners"].reshape(-1, 3)
+    return corners.astype(np.float64), Ragged(np.full(there, 3), np.arange(3 * there))
+
+
+def _read_text_stl(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
+    """Read facets of one or more solids; a loop of four corners and more is a polygon."""
+    places, ends, last = array("d"), array("q", [0]), b""
+    for number, words in _rows_of(path, data):
+        last = words[0].lower()
+        if last == b"vertex":
+            places.extend(_place(path, number, words))
+        elif last == b"endloop":
+            ends.append(len(places) // 3)
+    if last != b"endsolid" or ends[-1] != len(places) // 3:
+        raise InputError(
+            f"{path}: STL in text that ends by {last.decode('latin-1')[:20]!r}, not by 'endsolid'; "
+            "it is truncated. Export it again."
+        )
+    return np.array(places).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
+
+
+def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+    """Read vertices and polygons; negative numbers count back from the line they stand in."""
+    places, sizes, corners, is_curved = array("d"), array("q"), array("q"), False
+    highest, highest_line = 0, 0
+    for number, words in _rows_of(path, read_bytes(path)):
+        if words[0] == b"v":
+            places.extend(_place(path, number, words))
+        elif words[0] == b"f":
+            there, named = len(places) // 3, [0]
+            with suppress(ValueError):
+                named = [int(word.partition(b"/")[0]) for word in words[1:]] or [0]
+            if 0 in named or min(named) < -there or max(named) > _MOST_TEXT:
+                raise InputError(
+                    f"{path}: line {number}, {b' '.join(words)[:60].decode('latin-1')!r}: a face "
+                    f"names points from 1 on, or back from -1 to -{there}; export it again"
+                )
+            if max(named) > highest:
+                highest, highest_line = max(named), number
+            sizes.append(len(named))
+            corners.extend(k - 1 if k > 0 else there + k for k in named)
+        is_curved |= words[0] in (b"surf", b"curv", b"curv2")
+    vertices = np.array(places).reshape(-1, 3)
+    if highest > len(vertices) or (is_curved and not sizes):
+        said = f"line {highest_line} names point {highest} of {len(vertices)}; it is damaged"
+        said = said if sizes else "holds free-form surfaces alone, and no triangles"
+        raise InputError(f"{path}: {said}. Export it again.")
+    return vertices, Ragged(np.array(sizes, np.int64), np.array(corners, np.int64))
+
+
+def _read_glb(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    data = read_bytes(path)
+    _refuse_scene(path, data)
+    with refused_as(path, "model", "export it again"):
+        import trimesh
+
+        loaded: Any = trimesh.load(
+            BytesIO(data), "glb", process=False, skip_materials=True, allow_remote=False
+        )
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_mesh()
+        faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
+        return np.asarray(loaded.vertices, np.float64).reshape(-1, 3), faces
+
+
+def _refuse_scene(path: AnyPath, data: bytes) -> None:
+    """Refuse a GLB by the JSON at its head: accessors without bytes hold as many zeros as said."""
+    with refused_as(path, "GLB", "export it again"):
+        (size,) = struct.unpack("<I", data[12:16])
+        if size > _MOST_SCENE_BYTES:
+            raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
+        scene: Any = json.loads(data[20 : 20 + size])
+        accessors = scene.get("accessors", [])
+        values = [_values(accessor) for accessor in accessors]
+        placed = sum(
+            values[part["attributes"]["POSITION"]]
+            for node in scene.get("nodes", [])
+            if "mesh" in node
+            for part in scene["meshes"][node["mesh"]]["primitives"]
+            if "POSITION" in part.get("attributes", {})
+        )
+        nodes = len(scene.get("nodes", []))
+        needed = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
+        parts = [part for mesh in scene.get("meshes", []) for part in mesh["primitives"]]
+        needed += ["TRIANGLE_FAN" for part in parts if part.get("mode") == 6]
+        places = [p["attributes"]["POSITION"] for p in parts if "POSITION" in p["attributes"]]
+        needed += ["normalized positions" for k in places if accessors[k].get("normalized")]
+        links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
+        outside = [link for link in links if not link.startswith("data:")]
+    if outside:
+        raise InputError(
+            f"{path}: its numbers are in another file, {outside[0][:60]!r}, and a GLB is read "
+            "alone; export it as one file, with its buffers inside"
+        )
+    if needed:
+        raise InputError(
+            f"{path}: needs {needed[0][:60]!r}, which is not read; export it as plain triangles, "
+            "uncompressed"
+        )
+    if max(sum(values), placed) > _MOST_VALUES or nodes > _MOST_NODES:
+        raise InputError(
+            f"{path}: declares {max(sum(values), placed)} numbers in {nodes} nodes, more than "
+            f"{_MOST_VALUES} and {_MOST_NODES}; export the part alone"
+        )
+
+
+def _values(accessor: Mapping[str, Any]) -> int:
+    return abs(int(accessor["count"])) * _WIDTHS[accessor["type"]]
+
+
+MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragged]]] = {
+    ".ply": _read_ply,
+    ".stl": _read_stl,
+    ".obj": _read_obj,
+    ".glb": _read_glb,
+}
+"""Suffix to reader of points (n, 3; float64) in the file's unit, and faces (f, corners; int64)."""
