@@ -228,7 +228,7 @@ def _binary_lists(
     what = f"{element.count} {element.name}"
     steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
              for f in element.fields]  # fmt: skip
-    found: list[np.ndarray] = []
+    found: list[Any] = []
     known: dict[tuple[int, ...], np.dtype] = {}
     at, left, ahead = 0, element.count, 64
     while left:
@@ -253,7 +253,7 @@ def _binary_lists(
             known[key] = np.dtype(kinds)
         dtype = known[key]
         rows = min(left, ahead, (len(body) - at) // dtype.itemsize)
-        records = np.frombuffer(body, dtype, rows, at)
+        records: Any = np.frombuffer(body, dtype, rows, at)
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
         is_equal = np.array([size == size[0] for size in sizes] or [[True]]).all(0)
         records = records if is_equal.all() else records[: int(is_equal.argmin())]
