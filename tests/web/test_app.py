@@ -422,7 +422,7 @@ def test_a_depth_image_without_a_mask_is_searched(
         (VIEW | {"mask": "left.png"}, {"object": PART}, "give the mask of this very image"),
         (VIEW, {"object": "teapot"}, "object 'teapot': the weights know"),
         (VIEW | {"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "mm"}, "choose one of"),
-        ({"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "feet"}, "choose m or mm"),
+        ({"cloud": "cloud.ply"}, {"object": PART, "cloud_unit": "feet"}, "Known: 'cm', 'm', 'mm'"),
         (VIEW, {"object": "cad", "cad_unit": "mm"}, "cad: no file; choose a model file"),
         (
             VIEW | {"cad": f"{PART}.stl"},

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import tyro
 
 from depthpose.core.errors import InputError
+from depthpose.core.units import Unit
 
 
 def list_weights(folder: Path | None = None) -> int:
@@ -181,7 +182,7 @@ def pack_weights(
 
 
 def complete_weights(
-    weights: tyro.conf.Positional[str], models: Path, out: Path, unit: Literal["m", "mm"] = "mm"
+    weights: tyro.conf.Positional[str], models: Path, out: Path, unit: Unit = "mm"
 ) -> int:
     """Add meshes to pose weights that came without, because the meshes may not be passed on.
 
@@ -205,7 +206,7 @@ def complete_weights(
     return show_weights(str(out))
 
 
-def _meshes_of(path: Path, models: Path, unit: Literal["m", "mm"]) -> Mapping[int, Any]:
+def _meshes_of(path: Path, models: Path, unit: Unit) -> Mapping[int, Any]:
     """Read the meshes of the objects that weights know, by number."""
     from depthpose.pose.datasets.models import read_bop_models
     from depthpose.pose.mesh import read_model

@@ -7,10 +7,10 @@ from typing import Any, cast
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files import MAP_SUFFIXES, read_stored_depth, write_cloud, write_image
+from depthpose.core.units import METRES, Unit
 from depthpose.pose.cloud import object_points
-from depthpose.pose.config import Unit
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
@@ -182,8 +182,7 @@ def _keys(form: Form, size: tuple[int, int]) -> dict[str, Any]:
 
 def _unit(form: Form, field: str) -> Unit:
     unit = form.fields.get(field, "")
-    if unit not in ("m", "mm"):
-        raise InputError(f"{field} is {unit!r}; choose m or mm")
+    refuse_unknown(field, unit, METRES)
     return cast(Unit, unit)
 
 

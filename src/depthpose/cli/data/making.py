@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
+from depthpose.core.units import Unit
 
 _FRAMES_A_SCENE = 50
 _SCENES_A_SEED = 1000
@@ -62,7 +63,7 @@ class StreetsOptions:
 class ObjectsOptions:
     """Which frames are rendered, and how."""
 
-    unit: Literal["m", "mm"] = "mm"
+    unit: Unit = "mm"
     """of the numbers in the files."""
     number: int = 100
     """how many frames."""

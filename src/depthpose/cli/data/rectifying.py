@@ -2,12 +2,13 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
 from depthpose.cli.help import group
 from depthpose.core.errors import InputError
+from depthpose.core.units import Unit, metres_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,8 +26,8 @@ _ASK = "were the cameras moved since, or are the images scaled or cropped? Calib
 class RectifyOptions:
     """What the calibration says, and what is kept of the images."""
 
-    unit: Literal["m", "mm"] = "m"
-    """of the translation between the cameras; mm if the calibration board was given in mm."""
+    unit: Unit = "m"
+    """of the translation between the cameras: that of the calibration board."""
     fisheye: bool = False
     """the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it."""
     keep: float = 0.0
@@ -38,8 +39,7 @@ class RectifyOptions:
         """Read the calibration of both cameras."""
         from depthpose.core.camera import read_raw_pair
 
-        unit_m = 0.001 if self.unit == "mm" else 1.0
-        return read_raw_pair(camera, unit_m=unit_m, is_fisheye=self.fisheye or None)
+        return read_raw_pair(camera, unit_m=metres_of(self.unit), is_fisheye=self.fisheye or None)
 
 
 def rectify(

@@ -11,6 +11,7 @@ from depthpose.cli.help import group
 from depthpose.cli.options import TrainingOptions, changed
 from depthpose.cli.training import progress_bar, say_trained
 from depthpose.core.errors import InputError
+from depthpose.core.units import Unit
 
 if TYPE_CHECKING:
     from depthpose.pose.train import PoseTraining
@@ -28,7 +29,7 @@ class LearntOptions:
 
     cad: tuple[str, ...] = ()
     """model files; one network learns them all."""
-    unit: Literal["m", "mm"] | None = None
+    unit: Unit | None = None
     """of the numbers in the files."""
     symmetries: Literal["none", "found"] | None = None
     """found: detect symmetries of the part and count equivalent poses as one; by default they are

@@ -6,24 +6,8 @@ from typing import Literal
 from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError, refuse_seed, refuse_unknown
 
-Unit = Literal["m", "mm"]
-"""Unit of a model or cloud file."""
-
 VotingMethod = Literal["least squares", "ransac"]
 InlierTest = Literal["angle", "distance"]
-
-METRES: dict[str, float] = {"m": 1.0, "mm": 0.001}
-"""Metres a unit."""
-
-
-def metres_of(unit: str) -> float:
-    """Give the metres of a unit.
-
-    Raises:
-        InputError: neither ``m`` nor ``mm``.
-    """
-    refuse_unknown("unit", unit, METRES)
-    return METRES[unit]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,21 @@
+"""Units of length that a file or a user may have."""
+
+from typing import Literal
+
+from depthpose.core.errors import refuse_unknown
+
+Unit = Literal["m", "cm", "mm"]
+"""Of the numbers in a model, a cloud, a depth image or a calibration."""
+
+METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Metres a unit."""
+
+
+def metres_of(unit: str) -> float:
+    """Give the metres of a unit.
+
+    Raises:
+        InputError: there is no unit of that name.
+    """
+    refuse_unknown("unit", unit, METRES)
+    return METRES[unit]
