@@ -71,7 +71,7 @@ def test_millimetres_become_metres(tmp_path: Path, drawn: DrawnPair) -> None:
     path = write_opencv(tmp_path / "stereo.yml", {**names, "T": 1000 * names["T"]})
     is_fisheye = drawn.pair.left.is_fisheye
     same(read_raw_pair(path, unit_m=0.001, is_fisheye=is_fisheye), drawn.pair, 5)
-    with pytest.raises(InputError, match=r"stand 120 m apart, .* give --unit mm"):
+    with pytest.raises(InputError, match=r"baseline_m is 120, .* millimetres.*--unit cm or mm"):
         read_raw_pair(path, is_fisheye=is_fisheye)
 
 
@@ -101,7 +101,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no distance": ({**GOOD, "T": [0, 0, 0]}, "both cameras stand in one place"),
     "exchanged": ({**GOOD, "T": [0.1, 0, 0]}, "second camera stands to the left of its first"),
     "one above the other": ({**GOOD, "T": [0, -0.1, 0]}, "turn the images by 90 degrees"),
-    "millimetres": ({**GOOD, "T": [-100, 0, 0]}, "looks like millimetres; give --unit mm"),
+    "millimetres": (
+        {**GOOD, "T": [-100, 0, 0]},
+        "looks like millimetres; divide by 1000 .--unit cm or mm",
+    ),
     "another model": ({**GOOD, "distortion_model": "fov"}, "model is 'fov'; known are radtan"),
     "transposed": (
         {**GOOD, "K1": [500, 0, 0, 0, 500, 0, 320, 240, 1]},

@@ -155,7 +155,7 @@ def _wide_baseline(home: Path) -> None:
         (_lone_right, "missing", "has no left view"),
         (_far_depth, "mismatch", "holds 250 m, beyond 200 m"),
         (_wide_disparity, "mismatch", "holds 21 px, beyond 20 px"),
-        (_wide_baseline, "mismatch", "a baseline of 54 m; is it in metres"),
+        (_wide_baseline, "unreadable", "baseline_m is 54, which looks like millimetres"),
     ],
 )
 def test_the_check_names_what_is_implausible(

@@ -4,7 +4,7 @@ The fields are those of ``std_msgs``, ``sensor_msgs`` and ``geometry_msgs``, so 
 rclpy is read as it is, and :mod:`depthpose_ros.nodes` copies an answer field by field.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.camera.facts import CameraFacts, camera_from_facts
+from depthpose.core.camera.storage import named
+from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.rigid import Rigid
 
@@ -120,41 +123,51 @@ def image_from_depth(header: Header, depth_m: torch.Tensor, encoding: str) -> Im
 def camera_of(info: Any) -> Camera:  # noqa: ANN401
     """Give the camera of rectified images: P of ``sensor_msgs/CameraInfo``, or K where P is empty.
 
+    It is that of the published image: cut to the ROI of the message, and binned.
+
     Raises:
-        InputError: no calibration, or K alone with distortion.
+        InputError: no calibration, K alone with distortion, or values that no camera has.
     """
-    P, K = (np.array(values, np.float64).reshape(3, -1) for values in (info.p, info.k))
-    if P[0, 0] > 0:
-        K = P[:, :3]
-    elif any(abs(k) > 0 for k in info.d):
-        raise InputError(
-            "camera_info has distortion and no P: calibrate, and give rectified images (image_proc)"
-        )
-    if not K[0, 0] > 0:
-        raise InputError("camera_info holds no K and no P: the camera is not calibrated")
-    return Camera(width=info.width, height=info.height, K=torch.from_numpy(K.copy()))
+    return camera_from_facts(_facts(info), None)
 
 
 def rig_of(left: Any, right: Any) -> StereoRig:  # noqa: ANN401
     """Give the rectified rig; the right camera's P holds -fx times the baseline.
 
     Raises:
-        InputError: as :func:`camera_of`, or no baseline.
+        InputError: as :func:`camera_of`, no baseline, or two infos of different rectifications.
     """
-    camera = camera_of(left)
+    _facts(left)
     P, Q = (np.array(info.p, np.float64).reshape(3, 4) for info in (left, right))
     if not Q[0, 0] > 0 or not P[0, 3] / max(P[0, 0], 1e-9) > Q[0, 3] / Q[0, 0]:
         raise InputError(
             "the right camera_info has no -fx * baseline in P[3]: is it of the left camera, or is "
             "the pair not calibrated?"
         )
-    return StereoRig(
-        width=camera.width,
-        height=camera.height,
-        K=camera.K,
-        baseline_m=float(P[0, 3] / P[0, 0] - Q[0, 3] / Q[0, 0]),
-        cx_right_minus_left_px=float(Q[0, 2] - P[0, 2]),
-    )
+    rig = camera_from_facts(facts_from_ros_pair(*map(_names, (left, right))), None)
+    assert isinstance(rig, StereoRig)
+    return rig
+
+
+def _names(info: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Name the values as files of ROS do; without the lens, which P is free of."""
+    roi = getattr(info, "roi", None)
+    window = {key: getattr(roi, key, 0) for key in ("x_offset", "y_offset", "width", "height")}
+    fields = {"width": info.width, "height": info.height, "p": list(info.p), "k": list(info.k)}
+    binning = {key: getattr(info, key, 0) for key in ("binning_x", "binning_y")}
+    return named({**fields, **binning, "roi": window})
+
+
+def _facts(info: Any) -> CameraFacts:  # noqa: ANN401
+    if not info.p[0] > 0 and any(abs(k) > 0 for k in info.d):
+        raise InputError(
+            "camera_info has distortion and no P: calibrate, and give rectified images (image_proc)"
+        )
+    if not (info.p[0] > 0 or info.k[0] > 0):
+        raise InputError("camera_info holds no K and no P: the camera is not calibrated")
+    found = facts_from_names(_names(info) | ({} if info.p[0] > 0 else {"p": None}))
+    assert found is not None
+    return replace(found, baseline_m=None)
 
 
 def pose_from_rigid(header: Header, pose: Rigid) -> Pose:

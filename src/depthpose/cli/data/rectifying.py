@@ -26,8 +26,8 @@ _ASK = "were the cameras moved since, or are the images scaled or cropped? Calib
 class RectifyOptions:
     """What the calibration says, and what is kept of the images."""
 
-    unit: Unit = "m"
-    """of the translation between the cameras: that of the calibration board."""
+    unit: Unit | None = None
+    """of the translation between the cameras: that of the calibration board (default m)."""
     fisheye: bool = False
     """the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it."""
     keep: float = 0.0
@@ -39,7 +39,11 @@ class RectifyOptions:
         """Read the calibration of both cameras."""
         from depthpose.core.camera import read_raw_pair
 
-        return read_raw_pair(camera, unit_m=metres_of(self.unit), is_fisheye=self.fisheye or None)
+        return read_raw_pair(
+            camera,
+            unit_m=metres_of(self.unit) if self.unit else None,
+            is_fisheye=self.fisheye or None,
+        )
 
 
 def rectify(

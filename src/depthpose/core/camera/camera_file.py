@@ -3,6 +3,7 @@
 What a caller has in place of a file, a matrix, a mapping or a focal length, becomes a camera too.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from depthpose.core.camera.facts import (
 )
 from depthpose.core.camera.pinhole import Camera, StereoRig, check_intrinsics
 from depthpose.core.camera.storage import Names, named, read_storage, scalar
-from depthpose.core.camera.stored_camera import facts_from_names, read_folder
+from depthpose.core.camera.stored_camera import facts_from_names, is_ros, read_folder
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_text, write_json
 from depthpose.core.files.text import MAX_LIST_BYTES
@@ -102,10 +103,11 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 def _read_facts(path: AnyPath) -> CameraFacts:
     if Path(path).is_dir():
         return read_folder(Path(path))
+    if Path(path).name == "cameras.bin":
+        raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)
-    if text.lstrip()[:1] in ("{", "["):
-        content = read_json(path)
-        return _storage_facts(content) or facts_from_json(content)
+    if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
+        return _json_facts(read_json(path))
     facts = facts_from_text(path, text)
     if facts is None:
         names = read_storage(path, text)
@@ -130,15 +132,19 @@ def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | Non
         if number is None:
             raise InputError(f"{key} is {value!r}; write a number")
         added[key] = number
-    return replace(facts, **added)
+    return replace(facts, **added, is_metric=facts.is_metric or "baseline_m" in added)
 
 
-def _storage_facts(content: object) -> CameraFacts | None:
-    """Take OpenCV's JSON, whose matrices are objects with ``data``; None for other JSON."""
-    if not isinstance(content, dict):
-        return None
-    is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
-    return facts_from_names(named(content)) if is_storage else None
+def _json_facts(content: object) -> CameraFacts:
+    """Take the names of ROS, OpenCV (whose matrices are objects with ``data``) or others."""
+    if isinstance(content, dict):
+        names = named(content)
+        is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
+        if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
+            facts = _with_own_keys(facts_from_names(names), names)
+            if facts is not None:
+                return facts
+    return facts_from_json(content)
 
 
 AnyCamera = (
@@ -205,6 +211,7 @@ def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
     values = K.detach().cpu().numpy() if isinstance(K, Tensor) else K
     try:
         matrix = torch.from_numpy(np.array("none" if K is None else values, dtype=np.float64))
+        matrix = matrix.reshape(3, 3) if matrix.shape == (9,) else matrix
     except (TypeError, ValueError) as error:
         raise InputError(
             f"camera is a {type(K).__name__}; give a Camera(width=, height=, K=), or a StereoRig "
@@ -221,7 +228,7 @@ def _from_matrix(K: object) -> CameraFacts:
 def _from_mapping(camera: Mapping[str, Any], size: Size) -> CameraFacts:
     keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
     if {"width", "height"} & keys.keys():
-        return facts_from_json(keys)
+        return _json_facts(keys)
     # Without a size of its own the matrix may be that of another resolution: that is checked.
-    facts = facts_from_json({"width": size[0], "height": size[1], **keys})
+    facts = _json_facts({"width": size[0], "height": size[1], **keys})
     return replace(facts, size=None)

@@ -9,8 +9,17 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections
+from depthpose.core.camera.facts import (
+    KNOWN_FILES,
+    SAME_DIFFERENCE_PX,
+    CameraFacts,
+    Size,
+    facts_from_projections,
+    refuse_apart,
+)
 from depthpose.core.camera.pinhole import MAX_SIDE_PX
+from depthpose.core.camera.storage import named
+from depthpose.core.camera.stored_camera import lens_of
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_key_values
 
@@ -20,6 +29,18 @@ _KITTI_NAMES = (("P2", "P3"), ("P_rect_02", "P_rect_03"), ("P0", "P1"), ("P_rect
 _KITTI = re.compile(r"^(?:P|P_rect_0)[0-3]\s*:\s*[-+.\d]", re.MULTILINE)
 _MIDDLEBURY = re.compile(r"^cam0\s*=", re.MULTILINE)
 _PLAIN = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
+_COLMAP = re.compile(r"^\d+ ([A-Z_]{3,}) (\d{1,7}) (\d{1,7}) ([-+.\deE ]+)$", re.MULTILINE)
+_FOREIGN = {
+    r"^\[(LEFT|RIGHT)_CAM_": "the factory calibration of a ZED, which is that of its raw images: "
+    "take fx, fy, cx, cy and the baseline of the rectified ones from its SDK "
+    "(calibration_parameters)",
+    r"^\s*Intrinsic of ": "a list of a RealSense's cameras: take that of your stream and size",
+}
+"""Signs of camera files that are not read."""
+_WRITE = (
+    'Write {"width": .., "height": .., "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}, and '
+    '"baseline_m" (metres) of a pair'
+)
 _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
 """Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
 _TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
@@ -37,6 +58,11 @@ def facts_from_text(path: AnyPath, text: str) -> CameraFacts | None:
         return _kitti_facts(path)
     if _PLAIN.search(text):
         return plain_facts(path, read_key_values(path))
+    if _COLMAP.search(text):
+        return _colmap_facts(text)
+    for sign, what in _FOREIGN.items():
+        if re.search(sign, text, re.MULTILINE):
+            raise InputError(f"{what}. {_WRITE}")
     return _bare_facts(text)
 
 
@@ -44,26 +70,50 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
     """Take Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size.
 
     Raises:
-        InputError: a value missing or not a number.
+        InputError: a value missing or not a number, or ``cam1`` contradicts the others.
     """
-    found = dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
+    found = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
     try:
-        rows = [row.split() for row in found["cam0"].strip().strip("[]").split(";")]
-        values = [float(value) for row in rows for value in row]
-        return CameraFacts(
-            kind="a Middlebury calibration",
-            K=torch.tensor(values, dtype=torch.float64).reshape(3, 3),
-            size=(int(found["width"]), int(found["height"])),
-            baseline_m=float(found["baseline"]) / 1000,
-            cx_right_minus_left_px=float(found["doffs"]),
+        K, right = (
+            _bracketed(found[name]) for name in ("cam0", "cam1" if "cam1" in found else "cam0")
         )
+        size = (
+            _whole({"width": float(found["width"])}, "width"),
+            _whole({"height": float(found["height"])}, "height"),
+        )
+        baseline_mm, difference_px = float(found["baseline"]), float(found["doffs"])
     except KeyError as error:
         raise InputError(
             f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
             "baseline, width and height."
         ) from error
-    except (ValueError, OverflowError, RuntimeError) as error:  # no 9 numbers have no 3x3
+    except (ValueError, OverflowError) as error:  # no 9 numbers have no 3x3
         raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
+    refuse_apart(K, right)
+    apart_px = right[0, 2] - K[0, 2]
+    if "cam1" in found and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
+        raise InputError(
+            f"{path}: doffs is {difference_px:g}, but cx of cam1 less that of cam0 is {apart_px:g}"
+            "; write the true one of the two"
+        )
+    if 0 < baseline_mm < 1:
+        raise InputError(
+            f"{path}: baseline is {baseline_mm:g}, and Middlebury's is in millimetres; where it is "
+            f"in metres, write {1000 * baseline_mm:g}"
+        )
+    return CameraFacts(
+        kind="a Middlebury calibration",
+        K=torch.from_numpy(K),
+        size=size,
+        baseline_m=baseline_mm / 1000,
+        cx_right_minus_left_px=difference_px,
+        is_metric=True,
+    )
+
+
+def _bracketed(text: str) -> Matrix:
+    """Take the 3x3 matrix of ``[a b c; ...]``, commas or not."""
+    return np.array(re.sub(r"[\[\];,]", " ", text).split(), dtype=np.float64).reshape(3, 3)
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
@@ -88,6 +138,7 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
         else None,
         baseline_m=baseline_m,
         cx_right_minus_left_px=_number(path, keys, shift) if shift in keys else 0.0,
+        is_metric=True,
     )
 
 
@@ -124,6 +175,29 @@ def _kitti_facts(path: AnyPath) -> CameraFacts:
         kitti_matrix(path, keys, left, (3, 4)),
         kitti_matrix(path, keys, right, (3, 4)) if right in keys else None,
         kitti_size(keys, left[-2:]),
+    )
+
+
+def _colmap_facts(text: str) -> CameraFacts:
+    """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
+    found = {match.groups() for match in _COLMAP.finditer(text)}
+    if len(found) > 1:
+        raise InputError(
+            f"a cameras.txt of COLMAP with {len(found)} different cameras; keep the line of one"
+        )
+    model, width, height, listed = found.pop()
+    values = [float(word) for word in listed.split()]
+    if model.startswith(("SIMPLE_", "RADIAL")):
+        values.insert(0, values[0])
+    if len(values) < 4:
+        raise InputError(f"a camera of COLMAP with {len(values)} parameters; copy it anew")
+    fx, fy, cx, cy = values[:4]
+    return CameraFacts(
+        kind=f"a {model} camera of COLMAP",
+        K=_intrinsics(fx, fy, cx - 0.5, cy - 0.5),
+        size=(int(width), int(height)),
+        distortion=tuple(values[4:]),
+        undistort="colmap image_undistorter",
     )
 
 
@@ -176,7 +250,17 @@ def facts_from_json(content: object) -> CameraFacts:
     Raises:
         InputError: it is none of them, or a value is wrong.
     """
+    if isinstance(content, list) and len(content) in (3, 9):
+        return CameraFacts(kind="a matrix", K=_matrix(content))
     if isinstance(content, dict) and "K" not in content:
+        inner = content.get("intrinsic", content)
+        if isinstance(inner, dict) and "intrinsic_matrix" in inner:
+            K = _matrix(inner["intrinsic_matrix"])
+            is_by_columns = isinstance(inner["intrinsic_matrix"][0], int | float)
+            size = _size(inner) if {"width", "height"} <= inner.keys() else None
+            return CameraFacts(
+                kind="a camera of Open3D", K=K.T.contiguous() if is_by_columns else K, size=size
+            )
         if content.keys() >= set(_BOP):
             return _from_bop(content)
         if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
@@ -191,6 +275,7 @@ def _from_keys(keys: dict[str, Any]) -> CameraFacts:
         size=_size(keys),
         baseline_m=_json_number(keys, "baseline_m") if "baseline_m" in keys else None,
         cx_right_minus_left_px=_json_number({_RIG[1]: 0, **keys}, _RIG[1]),
+        is_metric=True,
         depth_unit_m=_json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None,
     )
 
@@ -200,9 +285,10 @@ def _from_bop(keys: dict[str, Any]) -> CameraFacts:
     fx, fy, cx, cy = (_json_number(keys, key) for key in _BOP)
     return CameraFacts(
         kind="a camera of BOP",
-        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        K=_intrinsics(fx, fy, cx, cy),
         size=_size(keys) if {"width", "height"} <= keys.keys() else None,
         depth_unit_m=_bop_unit_m(keys),
+        distortion=lens_of(named(keys)),
     )
 
 
@@ -219,7 +305,7 @@ def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
         raise InputError(f"'cam_K' is {flat!r:.80}, where 9 numbers belong")
     return CameraFacts(
         kind="a scene_camera.json of BOP",
-        K=_matrix([flat[0:3], flat[3:6], flat[6:9]]),
+        K=_matrix(flat),
         depth_unit_m=_bop_unit_m(first),
     )
 
@@ -234,6 +320,9 @@ def _check_keys(content: object) -> dict[str, Any]:
             f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
             f"not a {type(content).__name__}"
         )
+    if not content.keys() & set(_KEYS):
+        keys = ", ".join(map(repr, content))
+        raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
     for key in content:
         if key not in _KEYS:
             raise InputError(f"unknown key {key!r}; {nearest_name(key, _KEYS)}")
@@ -251,9 +340,9 @@ def _size(keys: dict[str, Any]) -> Size:
 
 def _whole(keys: dict[str, Any], key: str) -> int:
     value = keys[key]
-    if not isinstance(value, int) or isinstance(value, bool) or abs(value) > MAX_SIDE_PX:
+    if not _is_number(value) or value != int(value) or abs(value) > MAX_SIDE_PX:
         raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
-    return value
+    return int(value)
 
 
 def _json_number(keys: dict[str, Any], key: str) -> float:
@@ -265,6 +354,8 @@ def _json_number(keys: dict[str, Any], key: str) -> float:
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
     rows = value if isinstance(value, list) else []
+    if len(rows) == 9:
+        rows = [rows[k : k + 3] for k in (0, 3, 6)]
     is_square = len(rows) == 3 and all(isinstance(row, list) and len(row) == 3 for row in rows)
     if not is_square or not all(_is_number(x) for row in rows for x in row):
         shown = repr(value)[:80]

@@ -18,15 +18,29 @@ Size = tuple[int, int]
 KNOWN_FILES = (
     "our JSON (width, height, K), BOP's camera.json, KITTI's calibration (P2 or P_rect_02), "
     "Middlebury's calib.txt, TUM's 'fx fy cx cy', a matrix of 9 numbers, focal_px lines, "
-    "camera_info of ROS (YAML), FileStorage of OpenCV (YAML, XML, JSON), settings of ORB-SLAM"
+    "camera_info of ROS, FileStorage of OpenCV (YAML, XML, JSON), settings of ORB-SLAM, intrinsics "
+    "of RealSense and Open3D (JSON), COLMAP's cameras.txt"
 )
 """Formats of camera files, for errors."""
 
 _NORMALISED_FX = 2
 _MM_FX_SHARE = 0.1
 """A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
-_FILE_BASELINE_M = 10
+_MAX_FX_SHARE = 200
+_LEAST_UNIT_M = 1e-6
+"""At a smaller one 16 bits of depth end before 7 cm."""
+_FILE_BASELINE_M = 10.0
 """Millimetres of common rigs (50 to 120) pass as metres in a plane's rig, never in a file."""
+WIDE_BASELINE_M = 2.0
+"""Wider than cars' rigs; centimetres, or squares of a board, in a file that names no unit."""
+MIN_BASELINE_M = 1e-3
+_MAX_CM = 30
+"""A longer baseline, less the unit, is in millimetres."""
+_SAME_FOCAL = 1e-3
+_SAME_ROW_PX = 0.5
+SAME_DIFFERENCE_PX = 1.0
+_MAX_SQUEEZE = 1.8
+"""Of fx to fy, or inverse: a picture of KITTI squeezed to 512x256 has 1.66."""
 _NO_DISTORTION = 1e-8
 _OFF_CENTRE = 0.1
 """Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
@@ -47,6 +61,7 @@ class CameraFacts:
         size: of the image, where the file has it.
         baseline_m: where there is a rig.
         cx_right_minus_left_px: difference of the principal points of a rig.
+        is_metric: whether the format says the unit of the baseline.
         depth_unit_m: metres per unit of the depth images, where the file has it.
         distortion: coefficients of the lens; none, or zeros, for a pinhole.
         undistort: what takes the distortion out of an image.
@@ -57,6 +72,7 @@ class CameraFacts:
     size: Size | None = None
     baseline_m: float | None = None
     cx_right_minus_left_px: float = 0.0
+    is_metric: bool = False
     depth_unit_m: float | None = None
     distortion: tuple[float, ...] = ()
     undistort: str = "cv2.undistort(image, K, distortion)"
@@ -74,13 +90,15 @@ def facts_from_projections(
     OpenCV from the left one.
 
     Raises:
-        InputError: a focal length is not positive, or the pair stands one above the other.
+        InputError: a focal length is not positive, the two are not those of one rectified pair, or
+            the pair stands one above the other.
     """
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
         return CameraFacts(kind=kind, K=K, size=size)
     if not (left[0, 0] > 0 and right[0, 0] > 0):
         raise InputError("the focal lengths of the two projections are not positive; copy it anew")
+    refuse_apart(left, right)
     with np.errstate(all="ignore"):  # what overflows is refused as a baseline
         baseline_m = left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]
         down_m = left[1, 3] / left[1, 1] - right[1, 3] / right[1, 1]
@@ -96,6 +114,23 @@ def facts_from_projections(
     )
 
 
+def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
+    """Refuse two matrices that are not those of one rectified pair: only cx may differ.
+
+    Raises:
+        InputError: fx, fy or cy differ.
+    """
+    within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
+              "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
+    for name, (at, most) in within.items():
+        if abs(left[at] - right[at]) > most:
+            raise InputError(
+                f"{name} of the left camera is {left[at]:g} and of the right one {right[at]:g}, "
+                "but a rectified pair shares fx, fy and cy; are they of two calibrations, "
+                "or of raw images ('depthpose data rectify')? Copy both of one rectification"
+            )
+
+
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
 
@@ -109,7 +144,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
         raise _distorted(facts, size)
     camera = make_camera(facts, size)
-    _refuse_units(camera)
+    _refuse_units(camera, is_metric=facts.is_metric)
     if facts.size is None:
         refuse_other_resolution(camera.K, camera.width, camera.height)
     return camera
@@ -236,8 +271,35 @@ def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None
         )
 
 
-def _refuse_units(camera: Camera) -> None:
-    fx = float(camera.K[0, 0])
+def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M) -> None:
+    """Refuse a distance between two cameras that no rig has.
+
+    Args:
+        length: what was taken for metres.
+        remedy: how to correct it, where ``most_m`` allows more than what is common.
+        most_m: from which on it is too long.
+
+    Raises:
+        InputError: it is too short, or too long: the likely unit is said.
+    """
+    if length < MIN_BASELINE_M:
+        raise InputError(
+            f"baseline_m is {length:g}, less than two lenses can stand apart; write metres, once "
+            f"({length * 1000:g} if it was divided by 1000 without need)"
+        )
+    if length < most_m:
+        return
+    unit = "millimetres; divide by 1000"
+    if length < _MAX_CM:
+        unit = (
+            f"centimetres; divide by 100 ({length / 100:g}). If it is in millimetres, divide by "
+            "1000; if in squares of the calibration board, multiply by the side of one in metres"
+        )
+    raise InputError(f"baseline_m is {length:g}, which looks like {unit} ({remedy})")
+
+
+def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
+    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
     size = f"{camera.width}x{camera.height}"
     _refuse_normalised(camera.K, camera.width, camera.height)
     if fx < _MM_FX_SHARE * camera.width:
@@ -245,11 +307,36 @@ def _refuse_units(camera: Camera) -> None:
             f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
             "width of a pixel in mm"
         )
-    refuse_outside(camera.K, camera.width, camera.height)
-    if isinstance(camera, StereoRig) and camera.baseline_m >= _FILE_BASELINE_M:
+    if fx > _MAX_FX_SHARE * camera.width:
         raise InputError(
-            f"baseline_m is {camera.baseline_m:g}, which looks like millimetres; divide by 1000 "
-            "(a rig that is truly this wide is made in Python, as a StereoRig)"
+            f"K has fx {fx:g} for {size} pixels, which sees less than 0.3 degrees; give it in "
+            "pixels of this image"
+        )
+    if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
+        raise InputError(
+            f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
+            "longer than wide; multiply both by what its direction was scaled by. Where pixels "
+            "truly are so, scale the image, and K with it, until they are square"
+        )
+    refuse_outside(camera.K, camera.width, camera.height)
+    if isinstance(camera, StereoRig):
+        if is_metric:
+            said = "a rig that is truly this wide is made in Python, as a StereoRig"
+            refuse_baseline(camera.baseline_m, said, _FILE_BASELINE_M)
+        else:
+            said = (
+                'a rig that is truly this wide is written as ours: width, height, K, "baseline_m"'
+            )
+            refuse_baseline(camera.baseline_m, said)
+        if abs(camera.cx_right_minus_left_px) >= camera.width:
+            raise InputError(
+                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
+                f"the image of {size} is wide; are both cameras of one size? Copy them anew"
+            )
+    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
+            "unit: 0.001 means millimetres"
         )
     if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
         raise InputError(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from depthpose.core.camera.facts import Size
+from depthpose.core.camera.facts import WIDE_BASELINE_M, Size, refuse_baseline
 from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.camera.storage import Names, matrix, named, numbers, read_storage
 from depthpose.core.camera.stored_camera import is_ros, read_two_files, size_of
@@ -37,7 +37,7 @@ _MODELS = {
 }  # fmt: skip
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
-_MAX_BASELINE_M = 10
+_MAX_BASELINE_M = 10.0
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -77,12 +77,15 @@ class RawPair:
     size: Size | None
 
 
-def read_raw_pair(path: AnyPath, *, unit_m: float = 1.0, is_fisheye: bool | None = None) -> RawPair:
+def read_raw_pair(
+    path: AnyPath, *, unit_m: float | None = None, is_fisheye: bool | None = None
+) -> RawPair:
     """Read the calibration of a pair: of OpenCV, ROS or Kalibr, recognised by its content.
 
     Args:
         path: the file, or the folder of the pair's two files.
-        unit_m: metres a unit of the translation between the cameras.
+        unit_m: metres a unit of the translation between the cameras; None: metres, unless the
+            cameras would then stand farther apart than those of common rigs.
         is_fisheye: the kind of the lenses, for files that do not name it (OpenCV's); pinholes by
             default.
 
@@ -91,7 +94,11 @@ def read_raw_pair(path: AnyPath, *, unit_m: float = 1.0, is_fisheye: bool | None
             another model, or a value cannot be right: the rotation, the distance, the order.
     """
     try:
-        pair = _read(Path(path), unit_m, is_fisheye)
+        pair = _read(Path(path), unit_m or 1.0, is_fisheye)
+        said = "--unit cm or mm scales it, and --unit m says that it is in metres"
+        length = float(pair.right_from_left.t_m.norm())
+        if length:
+            refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
         _refuse_unlikely(pair)
     except InputError as error:
         said = str(error)
@@ -253,13 +260,8 @@ def _refuse_unlikely(pair: RawPair) -> None:
     if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
         raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
     x, y, z = pair.right_from_left.inverse().t_m.tolist()
-    length = float(pair.right_from_left.t_m.norm())
-    if length == 0:
+    if not pair.right_from_left.t_m.any():
         raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
-    if length >= _MAX_BASELINE_M:
-        raise InputError(
-            f"the cameras stand {length:g} m apart, which looks like millimetres; give --unit mm"
-        )
     if abs(x) < max(abs(y), abs(z)):
         raise InputError(
             f"the second camera stands at ({x:g}, {y:g}, {z:g}) m of the first, above or before it "

@@ -8,17 +8,17 @@ import numpy as np
 import torch
 
 from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections
-from depthpose.core.camera.storage import Names, matrix, numbers, read_storage, scalar
+from depthpose.core.camera.storage import Names, matrix, named, numbers, read_storage, scalar
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 from depthpose.core.files.disk import refused_as
 from depthpose.core.files.text import MAX_LIST_BYTES
 
 _SUFFIXES = (".yaml", ".yml", ".xml")
-CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt")
+CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt", ".conf")
 """Of files that a camera may be read from."""
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
-_D = ("d", "d1", "d2")
+_D = ("d", "d1", "d2", "coeffs")
 _P = ("p", "projectionmatrix", "p1")
 _WIDTH, _HEIGHT = ("width", "imagewidth"), ("height", "imageheight")
 _ROS = ("projectionmatrix", "distortionmodel", "p")
@@ -48,8 +48,8 @@ def facts_from_names(names: Names) -> CameraFacts | None:
     settings = next((who for who in ("camera", "camera1") if f"{who}fx" in names), None)
     if settings is not None:
         return _from_settings(names, settings)
-    left, right = (matrix(names, which, 12) for which in (_P, ("p2",)))
-    distortion = _distortion(names)
+    left, right = published(names, _P, 12), matrix(names, ("p2",), 12)
+    distortion = lens_of(names)
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
         return _with_distortion(facts, distortion, _RECTIFY)
@@ -74,7 +74,7 @@ def read_folder(folder: Path) -> CameraFacts:
     """
     first, second = read_two_files(folder)
     if is_ros(first) and is_ros(second) and "p2" not in first | second:
-        return _from_ros_pair(first, second)
+        return facts_from_ros_pair(first, second)
     facts = facts_from_names(first | second)
     if facts is None:
         raise InputError("its two files together describe no camera")
@@ -133,9 +133,9 @@ def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...])
     return _with_distortion(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
 
 
-def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
+def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     """Take the two cameras of a pair; the left one is that without ``Tx``."""
-    P, other = (_need(matrix(names, _P, 12), "projection_matrix") for names in (first, second))
+    P, other = (_need(published(names, _P, 12), "projection_matrix") for names in (first, second))
     left, right = (P, other) if P[0, 3] == 0 else (other, P)
     if left[0, 3] != 0 or right[0, 3] == 0:
         raise InputError(
@@ -146,7 +146,7 @@ def _from_ros_pair(first: Names, second: Names) -> CameraFacts:
     if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
     facts = facts_from_projections("a pair of camera_info", left, right, size_of(first))
-    return _with_distortion(facts, (*_distortion(first), *_distortion(second)), _RECTIFY)
+    return _with_distortion(facts, (*lens_of(first), *lens_of(second)), _RECTIFY)
 
 
 def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
@@ -164,14 +164,31 @@ def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
 
 
 def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
-    K = matrix(names, _K, 9)
+    K = published(names, _K, 9)
     if K is None:
-        return None
+        return _from_lengths(names, distortion)
     kind = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV"
     facts = CameraFacts(
         kind=kind, K=torch.from_numpy(K), size=size_of(names), baseline_m=_level_baseline(names)
     )
     return _with_distortion(facts, distortion, _lens_remedy(names, facts.undistort))
+
+
+def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
+    """RealSense's fx, fy, ppx, ppy; or fx, fy, cx, cy."""
+    is_realsense = "ppx" in names
+    which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
+    found = [scalar(names, name) for name in which]
+    if None in found:
+        return None
+    fx, fy, cx, cy = found
+    return CameraFacts(
+        kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
+        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        size=size_of(names),
+        depth_unit_m=scalar(names, "depthscale") if is_realsense else None,
+        distortion=distortion,
+    )
 
 
 def _level_baseline(names: Names) -> float | None:
@@ -199,7 +216,7 @@ def _lens_remedy(names: Names, of_pinhole: str) -> str:
     return _UNDISTORT_FISHEYE if is_fisheye else of_pinhole
 
 
-def _distortion(names: Names) -> tuple[float, ...]:
+def lens_of(names: Names) -> tuple[float, ...]:
     """Take every coefficient of every lens: whatever is called distortion, and loose k1, p1.
 
     Raises:
@@ -218,8 +235,32 @@ def _distortion(names: Names) -> tuple[float, ...]:
     return tuple(value for value in found if value is not None)
 
 
+def published(names: Names, known: tuple[str, ...], count: int) -> np.ndarray | None:
+    """Take a matrix as it is of the image that ROS publishes: cut to its ROI, then binned."""
+    found = matrix(names, known, count)
+    if found is None:
+        return None
+    (left, top), _, (across, down) = _window(names)
+    found[:2] -= [[left], [top]] * found[2]
+    scale = np.array([[1 / across], [1 / down]])
+    found[:2] = found[:2] * scale + (scale / 2 - 0.5) * found[2]
+    return found
+
+
+def _window(names: Names) -> tuple[Size, Size, Size]:
+    """Corner and size of the ROI [px of the full image], 0 where it is all; binning."""
+    inner = names.get("roi")
+    roi = named(inner) if isinstance(inner, Mapping) else {}
+    read = [scalar(roi, key) for key in ("xoffset", "yoffset", "width", "height")]
+    read += [scalar(names, key) for key in ("binningx", "binningy")]
+    left, top, width, height, across, down = (int(value or 0) for value in read)
+    if min(left, top, width, height, across, down) < 0:
+        raise InputError("its roi or its binning holds a negative number; write what was published")
+    return (left, top), (width, height), (across or 1, down or 1)
+
+
 def size_of(names: Names) -> Size | None:
-    """Take the image's size, where some names say it."""
+    """Take the image's size, where some names say it; of ROS, that of the published image."""
     width, height = (
         next((v for name in which if (v := scalar(names, name)) is not None), None)
         for which in (_WIDTH, _HEIGHT)
@@ -227,7 +268,15 @@ def size_of(names: Names) -> Size | None:
     both = numbers(names.get("imagesize") or names.get("size"))
     if width is None and both is not None and len(both) == 2:
         width, height = both
-    return None if not width or not height else (int(width), int(height))
+    if not width or not height:
+        return None
+    (left, top), (roi_width, roi_height), (across, down) = _window(names)
+    if left + roi_width > width or top + roi_height > height:
+        raise InputError(
+            f"its roi, {roi_width}x{roi_height} at ({left}, {top}), leaves the image of "
+            f"{width:g}x{height:g}; width and height are those of the full image"
+        )
+    return int(roi_width or width) // across, int(roi_height or height) // down
 
 
 def _need(matrix: np.ndarray | None, name: str) -> np.ndarray:

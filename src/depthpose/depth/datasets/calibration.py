@@ -6,7 +6,7 @@ published Eigen evaluation to the bit.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +23,7 @@ from depthpose.core.camera.camera_text import (
     middlebury_facts,
     plain_facts,
 )
-from depthpose.core.camera.facts import CameraFacts, Size, facts_from_projections, make_camera
+from depthpose.core.camera.facts import CameraFacts, Size, camera_from_facts, facts_from_projections
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_key_values, read_text
 from depthpose.core.files.text import MAX_LIST_BYTES
@@ -130,7 +130,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         size = int(numbers[0]), int(numbers[1])
         names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
         values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
-        return _rig(path, plain_facts(path, values), size)
+        return _rig(path, replace(plain_facts(path, values), size=size), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
@@ -148,7 +148,7 @@ def _numbers_of(line: str) -> list[float]:
 
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     try:
-        rig = make_camera(facts, size)
+        rig = camera_from_facts(facts, size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     assert isinstance(rig, StereoRig), "datasets name both cameras"

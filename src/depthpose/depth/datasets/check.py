@@ -13,7 +13,6 @@ from depthpose.depth.datasets.frames import Frame, frame_rig, kitti_calibration,
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.datasets.splits import read_split
 
-_MAX_BASELINE_M = 10
 _MAX_DEPTH_M = 200
 """KITTI's LiDAR sees 120 m."""
 
@@ -140,10 +139,7 @@ def _check_calibration(frame: Frame) -> Iterator[Problem]:
         yield Problem(path=frame.left, kind="note", message=message)
         return
     try:
-        rig = frame_rig(frame)
-        if rig is not None and rig.baseline_m >= _MAX_BASELINE_M:
-            message = f"gives a baseline of {rig.baseline_m:g} m; is it in metres?"
-            yield Problem(path=frame.calibration, kind="mismatch", message=message)
+        frame_rig(frame)
         if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
             message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
             yield Problem(path=frame.calibration, kind="missing", message=message)
