@@ -16,6 +16,7 @@ from depthpose.core.camera.facts import CameraFacts, camera_from_facts
 from depthpose.core.camera.storage import named
 from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair
 from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.files.images import from_16_bit
 from depthpose.core.rigid import Rigid
 
 
@@ -76,7 +77,7 @@ def picture_of(message: Any) -> np.ndarray:  # noqa: ANN401  ROS's classes carry
         values = _rows(message, np.uint8, channels)
         return np.ascontiguousarray(values[..., _PICTURES[message.encoding]])
     grey = _rows(message, _GREYS[message.encoding], 1)[..., 0]
-    return grey if grey.dtype == np.uint8 else (grey / 65535).astype(np.float32)
+    return grey if grey.dtype == np.uint8 else from_16_bit(grey, message.header.frame_id or "image")
 
 
 def depth_of(message: Any) -> np.ndarray:  # noqa: ANN401

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,12 +23,11 @@ from depthpose.core.files import (
     MAP_SUFFIXES,
     cloud_suffixes,
     read_cloud,
-    read_depth_png,
     read_image,
     read_json,
     read_map,
 )
-from depthpose.core.files.images import opened_image
+from depthpose.core.files.images import opened_image, value_range
 from depthpose.core.files.maps import read_numbers
 from depthpose.pose.cloud import frame_advice
 from depthpose.pose.datasets import mask_from_rle
@@ -40,6 +40,9 @@ _NEAR_M, _FAR_M = 0.05, 100.0
 _ONLY_MM, _ONLY_M = 20.0, 2.0
 """A part is no longer than 20 m, a scan no farther; and no part is shorter than 2 mm."""
 _EIGHT_BIT = 255
+_FEW_UNKNOWN, _ROUGH = 0.02, 0.012
+"""Of depth, pixels without a reading (sensors: 6 % and more) and the mean step between neighbours
+as a share of the range (dense depth: 0.004 at most, pictures: 0.024 at least)."""
 _SQUARE = 0.05
 _MOST = 0.5
 
@@ -142,13 +145,20 @@ def _of_camera(path: Path, camera: Camera) -> Seen:
 
 
 def _of_picture(path: Path) -> Seen:
+    what, units = "", None
     with opened_image(path) as image:
-        is_depth = image.mode == "I;16"
-    if is_depth:
-        return _of_depth(path, read_depth_png(path, 1.0))
+        if image.mode == "I;16":
+            units = torch.from_numpy(np.asarray(image).astype(np.float32))
+    if units is not None:
+        known, (low, high) = units > 0, value_range(units.numpy())
+        unknown, span = 1 - float(known.float().mean()), max(high - low, 1)
+        rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
+        if unknown > _FEW_UNKNOWN or rough < _ROUGH:
+            return _of_depth(path, torch.where(known, units, torch.nan))
+        what = f", 16 bits a value, from {low} to {high}"
     picture = read_image(path)
     size = (picture.shape[2], picture.shape[1])
-    what = f"picture of {size[0]}x{size[1]}"
+    what = f"picture of {size[0]}x{size[1]}{what}"
     low, high = picture.aminmax()
     if all(bool(((row == low) | (row == high)).all()) for row in picture):
         return _of_mask(path, picture[0] > 0)
@@ -180,6 +190,8 @@ def _of_depth(path: Path, units: Tensor) -> Seen:
     seen.what = (
         f"16-bit depth of {width}x{height}, {share:.0%} known, median {median:g} units: {maybe}"
     )
+    if share == 1:
+        seen.what += "; or, as no pixel is 0, a picture of 16 bits"
     if float(known.max()) <= _EIGHT_BIT:
         seen.odd.append("no value is above 255: a picture of depth, not the data?")
     return seen

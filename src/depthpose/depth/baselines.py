@@ -102,7 +102,11 @@ class NearestImageBaseline:
             InputError: none has.
         """
         frames = dataset.frames
-        indices = [i for i, frame in enumerate(frames) if frame.calibration and known_truths(frame)]
+        indices = [
+            i
+            for i, frame in enumerate(frames)
+            if frame.calibration and known_truths(frame) and dataset.read_rig(i) is not None
+        ]
         if not indices:
             raise _nothing_to_learn(dataset)
         thumbnails = [

@@ -14,6 +14,8 @@ from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     Cloud,
+    read_depth_png,
+    read_disparity_png,
     read_image,
     read_map,
     write_cloud,
@@ -39,7 +41,14 @@ class Estimator(Protocol):
         ...
 
 
-_READABLE = ("disparity_px.npy", "disparity_px.pfm", "depth_m.npy")
+_DISPARITY = ("disparity_px.npy", "disparity_px.pfm")
+_DEPTH = ("depth_m.npy", "depth_m.pfm", "depth.png")
+_KITTI = "png"
+"""NAME.png as KITTI's benchmarks take it: metres x 256, or pixels of disparity x 256."""
+EXPECTED = (
+    "NAME.disparity_px.npy or .pfm (pixels at the map's own width), NAME.depth_m.npy or .pfm, "
+    "NAME.depth.png (metres x 256), or NAME.png as KITTI's benchmarks take it"
+)
 
 CLOUD = "cloud.ply"
 ENDINGS = (
@@ -115,35 +124,62 @@ def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
 
 def has_prediction(folder: Path, name: str) -> bool:
     """Whether the folder holds a prediction of this frame, ours or anybody's."""
-    return any(_file(folder / name, ending).is_file() for ending in _READABLE)
+    return _first(folder / name, (*_DISPARITY, *_DEPTH, _KITTI)) is not None
 
 
-def read_disparity(folder: Path, name: str, camera: Camera | None) -> Float[Tensor, "h w"]:
+def read_disparity(
+    folder: Path, name: str, camera: Camera | None, *, with_disparity_png: bool = False
+) -> Float[Tensor, "h w"]:
     """Read one predicted disparity [px at its own width], ours or anybody's.
 
-    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; a ``NAME.depth_m.npy`` alone is turned
+    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; what :func:`read_depth` finds is turned
     into disparity by the rig. NaN alone says that there is no answer: depth of zero or below is
     the smallest of the protocol, as the published script takes it.
 
+    Args:
+        folder: of the predictions.
+        name: of the frame.
+        camera: of the frame.
+        with_disparity_png: ``NAME.png`` is disparity x 256, else metres x 256.
+
     Raises:
-        InputError: neither file is there, or depth without a rig.
+        InputError: no file is there, or depth without a rig.
     """
     base = folder / name
-    for ending in _READABLE[:2]:
-        if (path := _file(base, ending)).is_file():
-            return read_map(path)
-    path = _file(base, "depth_m.npy")
-    if not path.is_file():
-        raise InputError(
-            f"{folder}: no prediction for frame {name!r}. Expected {name}.disparity_px.npy (pixels "
-            f"at the map's own width) or {name}.depth_m.npy."
-        )
-    depth_m = read_map(path)
+    if (path := _first(base, _DISPARITY)) is not None:
+        return read_map(path)
+    path = _first(base, (*_DEPTH, _KITTI))
+    if path is None:
+        raise InputError(f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED}")
+    if with_disparity_png and path == _file(base, _KITTI):
+        return read_disparity_png(path)
+    depth_m = read_depth(folder, name)
+    assert depth_m is not None
     if not isinstance(camera, StereoRig):
         raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
     # The map may have a size of its own: its disparity is counted in its own pixels.
     least_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
     return disparity_from_depth(least_m, camera) * (depth_m.shape[1] / camera.width)
+
+
+def read_depth(folder: Path, name: str) -> Float[Tensor, "h w"] | None:
+    """Read one predicted depth [m at its own size]; None where there is no file of depth.
+
+    ``NAME.depth_m.npy`` or ``.pfm`` comes before ``NAME.depth.png`` and ``NAME.png``.
+    """
+    path = _first(folder / name, (*_DEPTH, _KITTI))
+    if path is None:
+        return None
+    return read_depth_png(path) if path.suffix == ".png" else read_map(path)
+
+
+def has_disparity(folder: Path, name: str) -> bool:
+    """Whether a prediction is one of disparity."""
+    return _first(folder / name, _DISPARITY) is not None
+
+
+def _first(base: Path, endings: tuple[str, ...]) -> Path | None:
+    return next((path for end in endings if (path := _file(base, end)).is_file()), None)
 
 
 def read_confidence(folder: Path, name: str) -> Float[Tensor, "h w"] | None:

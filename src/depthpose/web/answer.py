@@ -12,6 +12,7 @@ from depthpose.core.draw import Scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, write_json
 from depthpose.core.files.disk import write_bytes
+from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.mesh import mesh_suffixes
 from depthpose.report.scene import Scene
 
@@ -65,14 +66,13 @@ def read_files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 MOST_PIXELS = 12_500_000
 """Of a picture: those of a phone."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "image": ("a picture", IMAGES),
-    "right": ("a picture", IMAGES),
+    "image": ("a picture", LISTED_SUFFIXES),
+    "right": ("a picture", LISTED_SUFFIXES),
     "depth": ("a depth image", DEPTH_SUFFIXES),
-    "mask": ("a mask", IMAGES),
+    "mask": ("a mask", LISTED_SUFFIXES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", cloud_suffixes()),
     "cad": ("a model file", mesh_suffixes()),

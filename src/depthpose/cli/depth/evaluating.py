@@ -145,8 +145,18 @@ def measure(
     write_table(out, rows)
     write_details(measured, out)
     page = out / "report.html"
+    about = describe_protocol(protocol)
+    unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
+    if unknown:
+        said = (
+            f"{unknown} of {len(dataset)} pairs have no calibration, so a network matches them at "
+            "their own focal length, not at the one it knows: compare no numbers with those of "
+            "frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its own)"
+        )
+        print(f"depthpose: {said}", file=sys.stderr)
+        about += f" {said}."
     sections = [
-        Section(title="Mean over frames", text=describe_protocol(protocol), rows=rows),
+        Section(title="Mean over frames", text=about, rows=rows),
         *frame_sections(dataset, folders, [one.per_frame for one in each], protocol),
         *detail_sections(measured),
     ]

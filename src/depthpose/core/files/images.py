@@ -1,5 +1,8 @@
 """Pictures: 8-bit files to RGB tensors and back, and the listing of them."""
 
+import re
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -11,7 +14,7 @@ from jaxtyping import Float32
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import (
     AnyPath,
     refused_as,
@@ -21,7 +24,9 @@ from depthpose.core.files.disk import (
 from depthpose.core.files.names import natural_order
 from depthpose.core.files.shards import read_bytes
 
-LISTED_SUFFIXES = (".png", ".jpg", ".jpeg")
+WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Of pictures that are written."""
+LISTED_SUFFIXES = (*WRITTEN_SUFFIXES, ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".webp")
 """Of files that count as pictures where a folder is listed; of a file that is named, any."""
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
@@ -48,30 +53,124 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Read a picture as RGB in [0, 1].
 
     Greyscale becomes three equal channels, a palette its colours; alpha is dropped, the EXIF
-    orientation applied, and 16-bit greyscale scaled by 65535.
+    orientation applied, and 16 bits a channel scaled by :func:`from_16_bit`.
 
     Raises:
         InputError: the file is missing, damaged, too large or not a picture.
     """
     with opened_image(path) as image:
-        return picture_tensor(image, path)
+        pixels = _decoded(path, image)
+    return _tensor_of(pixels, path)
 
 
 def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Bring a picture of Pillow's to RGB in [0, 1], as :func:`read_image` does a file.
 
     Raises:
-        InputError: it has 32 bits a pixel; Pillow's own errors where its file is damaged.
+        InputError: it has 32 bits a pixel, or its file is damaged.
     """
+    with refused_as(name, "picture", "give an intact one"):
+        pixels = _decoded(name, image)
+    return _tensor_of(pixels, name)
+
+
+def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
+    """Give RGB or grey, upright, of 8 or 16 bits."""
     turn = _UPRIGHT.get(_orientation(image))
-    pixels = _rgb_or_grey(name, image if turn is None else image.transpose(turn))
-    if pixels.ndim == 2:
-        scale = 65535 if pixels.dtype.itemsize == 2 else 255
-        grey = torch.from_numpy(pixels.astype(np.float32)).div_(scale)
-        return grey.expand(3, -1, -1).contiguous()
-    # Channels are parted while a pixel is a byte: the floats are there once.
-    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1))
-    return torch.from_numpy(planes.astype(np.float32)).div_(255)
+    deep, low_bytes = _deep_ppm(image), _low_bytes(image)
+    if deep is not None:
+        return deep
+    parts = [image] if low_bytes is None else [image, low_bytes]
+    pixels, *low = (
+        _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
+    )
+    return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
+
+
+def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    # Channels are parted while a pixel is an integer: the floats are there once.
+    planes = pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
+    planes = np.ascontiguousarray(planes)
+    if planes.dtype.itemsize == 2:
+        found = torch.from_numpy(from_16_bit(planes, name))
+    else:
+        found = torch.from_numpy(planes.astype(np.float32)).div_(255)
+    return found.expand(3, -1, -1).contiguous()
+
+
+def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
+    """Bring 16-bit numbers to floats in [0, 1], and say so where not by 65535.
+
+    Cameras of 10, 12 or 14 bits, and thermal ones, use a part of the range: black and white are
+    then what 0.1 % of the values lie below and above; black is 0 unless all lie far from it.
+    """
+    low, high = value_range(values)
+    if not _LEAST_SPAN <= high - low < _FULL_SPAN:
+        return values.astype(np.float32) / 65535
+    black = low if low > high - low else 0
+    if (folder := Path(name).parent) not in _SAID:
+        _SAID.add(folder)
+        said = (
+            f"{name}: of 16 bits, and its values are {low} to {high}: {black} is taken as black "
+            f"and {high} as white; so are those of other pictures there"
+        )
+        warnings.warn(said, Notice, stacklevel=2)
+    return ((values.astype(np.float32) - black) / (high - black)).clip(0, 1)
+
+
+def value_range(values: np.ndarray) -> tuple[int, int]:
+    """Give the values that all but 0.1 % lie above, and below; defective pixels do not count."""
+    low, high = np.quantile(values, (0.001, 0.999), method="nearest")
+    return int(low), int(high)
+
+
+_LEAST_SPAN, _FULL_SPAN = 64, 2**14
+"""Masks and labels have fewer values than a picture; more than 14 bits are taken for all 16."""
+
+
+_SAID: set[Path] = set()
+"""Folders of which it was said."""
+
+
+def _deep_ppm(image: Image.Image) -> np.ndarray | None:
+    """Take a binary PPM of 16 bits a colour, of which Pillow keeps 8."""
+    tiles, file = getattr(image, "tile", None), getattr(image, "fp", None)
+    if image.format != "PPM" or image.mode != "RGB" or not tiles or file is None:
+        return None
+    most = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
+    if tiles[0].codec_name != "ppm" or most <= 255:
+        return None
+    file.seek(tiles[0].offset)
+    values = np.frombuffer(file.read(6 * image.width * image.height), ">u2")
+    whole = values.reshape(image.height, image.width, 3).astype(np.float64)
+    return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
+
+
+def _low_bytes(image: Image.Image) -> Image.Image | None:
+    """Open a picture of 16 bits a colour again, so that it gives the lower bytes.
+
+    Pillow keeps the upper one of each colour: what it unpacks in the other byte order is the lower.
+    """
+    tiles, file = getattr(image, "tile", None), getattr(image, "fp", None)
+    if not tiles or file is None:
+        return None
+    raws = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
+    if not all(re.fullmatch("RGBA?;16[BLN]", str(raw)) for raw in raws):
+        return None
+    at = file.tell()
+    file.seek(0)
+    other = Image.open(BytesIO(file.read()), formats=_FORMATS)
+    file.seek(at)
+    is_little = sys.byteorder == "little"
+    swapped = [
+        raw[:-1] + ("B" if raw[-1] == "L" or (raw[-1] == "N" and is_little) else "L")
+        for raw in raws
+    ]
+    other.tile = [
+        tile._replace(args=raw if isinstance(tile.args, str) else (raw, *tile.args[1:]))
+        for tile, raw in zip(tiles, swapped, strict=True)
+    ]
+    return other
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:
@@ -108,8 +207,8 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
         InputError: the shape, the values or the suffix are wrong.
     """
     suffix = Path(name).suffix.lower()
-    if suffix not in LISTED_SUFFIXES:
-        raise refused_suffix(name, "picture", LISTED_SUFFIXES)
+    if suffix not in WRITTEN_SUFFIXES:
+        raise refused_suffix(name, "picture", WRITTEN_SUFFIXES)
     _check_image(name, image)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
     form, options = (
@@ -122,7 +221,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
 
 
 def list_images(path: AnyPath) -> list[Path]:
-    """List pictures: a file itself, the PNG and JPEG files of a folder, or those of a pattern.
+    """List pictures: a file itself, those of a folder by their suffixes, or those of a pattern.
 
     Args:
         path: a file, a folder or a pattern with ``*``, ``?``, ``[...]`` or ``**``.
@@ -202,8 +301,10 @@ def _check_image(path: AnyPath, image: Tensor) -> None:
 
 
 def _glob(pattern: Path) -> list[Path]:
-    relative = pattern.relative_to(pattern.anchor)
-    return [p for p in Path(pattern.anchor).glob(str(relative)) if p.is_file()]
+    home, parts = Path(pattern.anchor), list(pattern.relative_to(pattern.anchor).parts)
+    while len(parts) > 1 and (home / parts[0]).is_dir():  # brackets in its name are no pattern
+        home /= parts.pop(0)
+    return [p for p in home.glob("/".join(parts)) if p.is_file()]
 
 
 def _is_listed(path: Path) -> bool:

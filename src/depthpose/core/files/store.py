@@ -199,10 +199,12 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
     with _refused(path, "listed"):
         fs, inner = url_to_fs(path)
         fs.invalidate_cache()
-        if any(mark in inner for mark in "*?["):
-            found = fs.glob(inner)
+        if fs.isfile(inner):
+            found = [inner]
+        elif fs.isdir(inner) or not any(mark in inner for mark in "*?["):
+            found = _entries(fs, inner)
         else:
-            found = [inner] if fs.isfile(inner) else _entries(fs, inner)
+            found = fs.glob(_with_plain_folders(fs, inner))
     kept = [p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
     kept.sort(key=lambda p: natural_order(Path(p)))
     if not kept:
@@ -248,6 +250,15 @@ def list_tree(url: str) -> dict[str, str]:
         root = inner.rstrip("/")
         names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]
     return {name: join(url, name) for name in sorted(names)}
+
+
+def _with_plain_folders(fs: Any, pattern: str) -> str:  # noqa: ANN401  fsspec carries no types
+    """Take brackets in the name of a folder that is there as themselves."""
+    home, _, rest = pattern.rpartition("/")
+    while "[" in home and not fs.isdir(home):
+        home, _, last = home.rpartition("/")
+        rest = f"{last}/{rest}"
+    return f"{home.replace('[', '[[]')}/{rest}" if "[" in home else pattern
 
 
 def _entries(fs: Any, folder: str) -> list[str]:  # noqa: ANN401  fsspec carries no types

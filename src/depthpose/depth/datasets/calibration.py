@@ -67,23 +67,31 @@ def read_raw_calibration(folder: Path, width: int, height: int) -> KittiCalibrat
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 
 
-def read_object_calibration(path: Path, width: int, height: int) -> KittiCalibration:
+def read_object_calibration(
+    path: Path, width: int, height: int, *, is_grey: bool = False
+) -> KittiCalibration:
     """Read a text of the object layout: P2, P3 and, for the LiDAR, R0_rect and Tr_velo_to_cam.
 
-    Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too.
+    Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
+    odometry, whose ``Tr`` goes to the rectified camera 0; of the grey pair, P0 and P1.
 
     Raises:
         InputError: missing, or a matrix missing or of the wrong size.
     """
     keys = read_key_values(path)
     names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
+    names = ("P0", "P1") if is_grey else names
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
     _check_size(path, keys, width, height)
     rig = _projected_rig(path, left, right, (width, height))
-    if "Tr_velo_to_cam" not in keys:
+    moved = next((name for name in ("Tr_velo_to_cam", "Tr") if name in keys), None)
+    if moved is None:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = _square(kitti_matrix(path, keys, "R0_rect", (3, 3)))
-    camera_from_velodyne = _square(kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4)))
+    turned = np.eye(3) if moved == "Tr" else kitti_matrix(path, keys, "R0_rect", (3, 3))
+    rectify, camera_from_velodyne = (
+        _square(turned),
+        _square(kitti_matrix(path, keys, moved, (3, 4))),
+    )
     composed = _compose(path, left, rectify, camera_from_velodyne)
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
 

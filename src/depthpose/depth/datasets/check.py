@@ -6,10 +6,16 @@ from pathlib import Path
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import image_size, read_depth_png, read_image, read_points_bin
+from depthpose.core.files import image_size, read_image, read_points_bin
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
-from depthpose.depth.datasets.frames import Frame, frame_rig, kitti_calibration, read_disparity
+from depthpose.depth.datasets.frames import (
+    Frame,
+    frame_camera,
+    kitti_calibration,
+    read_depth,
+    read_disparity,
+)
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.datasets.splits import read_split
 
@@ -139,7 +145,7 @@ def _check_calibration(frame: Frame) -> Iterator[Problem]:
         yield Problem(path=frame.left, kind="note", message=message)
         return
     try:
-        frame_rig(frame)
+        frame_camera(frame)
         if frame.velodyne is not None and kitti_calibration(frame).pixels_from_velodyne is None:
             message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
             yield Problem(path=frame.calibration, kind="missing", message=message)
@@ -159,7 +165,7 @@ def _check_scan(path: Path) -> Iterator[Problem]:
 
 def _check_truth(path: Path, size: tuple[int, int], *, is_depth: bool) -> Iterator[Problem]:
     try:
-        truth = read_depth_png(path) if is_depth else read_disparity(path)
+        truth = read_depth(path) if is_depth else read_disparity(path)
     except InputError as error:
         yield unreadable(path, error)
         return

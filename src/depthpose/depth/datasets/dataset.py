@@ -12,8 +12,8 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.depth.datasets.frames import (
     Frame,
+    frame_camera,
     frame_input,
-    frame_rig,
     frame_truth,
     has_lidar,
     lidar_truth,
@@ -55,8 +55,9 @@ class Dataset:
         return frame_truth(self.frames[index])
 
     def read_rig(self, index: int) -> StereoRig | None:
-        """Read the calibration alone; None where the frame has none."""
-        return frame_rig(self.frames[index])
+        """Read the calibration alone; None where the frame has none of a pair."""
+        camera = frame_camera(self.frames[index])
+        return camera if isinstance(camera, StereoRig) else None
 
 
 def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset:

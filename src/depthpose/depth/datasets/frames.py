@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from depthpose.core.camera import StereoRig, check_image_matches_camera, read_rig
+from depthpose.core.camera import Camera, check_image_matches_camera, read_camera, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
+    MAP_SUFFIXES,
     image_size,
     read_depth_png,
     read_disparity_png,
@@ -29,7 +31,7 @@ from depthpose.depth.datasets.calibration import (
 )
 from depthpose.depth.types import StereoInput, StereoTruth
 
-CalibrationStyle = Literal["raw", "object", "middlebury", "plain", "camera"]
+CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +47,8 @@ class Frame:
         velodyne: one LiDAR scan, float32 x, y, z, reflectance.
         scan: a LiDAR scan that was drawn into the left image already, 16-bit camera z, metres x
             256 (``velodyne_raw`` of KITTI's depth-prediction set).
-        depth: 16-bit depth of the left image, metres x 256.
-        disparity: disparity of the left image, 16-bit PNG (x 256) or PFM, hidden pixels too.
+        depth: depth of the left image, 16-bit PNG (metres x 256), or PFM or NPY in metres.
+        disparity: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, hidden pixels too.
         disparity_noc: that of the pixels alone that both views see.
         sky: 8-bit PNG of the left image, not 0 where it shows the sky.
     """
@@ -85,7 +87,7 @@ def frame_input(frame: Frame) -> StereoInput:
     right = None if frame.right is None else read_image(frame.right)
     if frame.right is not None and right is not None:
         _check_size(frame.right, right, (left.shape[2], left.shape[1]))
-    return StereoInput(name=frame.name, left=left, right=right, camera=frame_rig(frame))
+    return StereoInput(name=frame.name, left=left, right=right, camera=frame_camera(frame))
 
 
 def frame_truth(frame: Frame) -> StereoTruth:
@@ -94,7 +96,7 @@ def frame_truth(frame: Frame) -> StereoTruth:
     Raises:
         InputError: a map is damaged, or of another size than the left image.
     """
-    depth_m = None if frame.depth is None else read_depth_png(frame.depth)
+    depth_m = None if frame.depth is None else read_depth(frame.depth)
     disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
     is_sky = None if frame.sky is None else read_image(frame.sky)[0] > 0
     parts = ((frame.depth, depth_m), (frame.disparity, disparity_px), (frame.sky, is_sky))
@@ -104,28 +106,26 @@ def frame_truth(frame: Frame) -> StereoTruth:
     return StereoTruth(disparity_px=disparity_px, depth_m=depth_m, is_sky=is_sky)
 
 
-def frame_rig(frame: Frame) -> StereoRig | None:
-    """Read the rig of a frame, or None where it has no calibration.
+def frame_camera(frame: Frame) -> Camera | None:
+    """Read the camera of a frame, or None where it has no calibration; of a pair, the rig.
 
     Raises:
         InputError: the calibration is damaged, or that of images of another size.
     """
     if frame.calibration is None:
         return None
-    rig = _read_rig(frame, frame.calibration)
-    check_image_matches_camera(rig, *image_size(frame.left), str(frame.left))
-    return rig
-
-
-def _read_rig(frame: Frame, path: Path) -> StereoRig:
-    if frame.style in ("raw", "object"):
-        return kitti_calibration(frame).rig
-    if frame.style == "middlebury":
-        return read_middlebury_calibration(path)
-    width, height = image_size(frame.left)
-    if frame.style == "camera":
-        return read_rig(path, (width, height))
-    return read_plain_calibration(path, frame.name, width, height)
+    path, size = frame.calibration, image_size(frame.left)
+    match frame.style:
+        case "raw" | "object" | "grey":
+            camera = kitti_calibration(frame).rig
+        case "middlebury":
+            camera = read_middlebury_calibration(path)
+        case "camera":
+            camera = read_camera(path, size) if frame.right is None else read_rig(path, size)
+        case "plain":
+            camera = read_plain_calibration(path, frame.name, *size)
+    check_image_matches_camera(camera, *size, str(frame.left))
+    return camera
 
 
 def kitti_calibration(frame: Frame) -> KittiCalibration:
@@ -134,14 +134,15 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     Raises:
         InputError: the frame has no such calibration.
     """
-    if frame.calibration is None or frame.style not in ("raw", "object"):
+    if frame.calibration is None or frame.style not in ("raw", "object", "grey"):
         raise InputError(
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
     width, height = image_size(frame.left)
-    read = read_raw_calibration if frame.style == "raw" else read_object_calibration
-    return read(frame.calibration, width, height)
+    if frame.style == "raw":
+        return read_raw_calibration(frame.calibration, width, height)
+    return read_object_calibration(frame.calibration, width, height, is_grey=frame.style == "grey")
 
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
@@ -171,7 +172,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
     """
     drawn = _drawn_scan(frame)
     if frame.velodyne is None and drawn is not None and depth == "camera_z":
-        depth_m = read_depth_png(drawn)
+        depth_m = read_depth(drawn)
         _check_size(drawn, depth_m, image_size(frame.left))
         return depth_m
     if frame.velodyne is None:
@@ -188,12 +189,12 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Float[Tensor, "h w"]:
 
 
 def _drawn_scan(frame: Frame) -> Path | None:
-    return frame.depth if frame.scan is None and _is_plain(frame) else frame.scan
+    return frame.depth if _is_plain(frame) else frame.scan
 
 
 def _is_plain(frame: Frame) -> bool:
     """Whether the depth of a frame is a LiDAR scan, as that of plain folders of pairs is."""
-    return frame.style in ("plain", "camera")
+    return frame.style in ("plain", "camera") and frame.scan is None
 
 
 def _check_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
@@ -206,5 +207,15 @@ def _check_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int,
 
 
 def read_disparity(path: Path) -> Float[Tensor, "h w"]:
-    """Read disparity from a 16-bit PNG or a PFM; NaN where there is none."""
-    return read_map(path) if path.suffix.lower() == ".pfm" else read_disparity_png(path)
+    """Read true disparity from a 16-bit PNG, PFM or NPY; NaN where it is unknown, 0 or below."""
+    return _known(path) if path.suffix.lower() in MAP_SUFFIXES else read_disparity_png(path)
+
+
+def read_depth(path: Path) -> Float[Tensor, "h w"]:
+    """Read true depth [m] from a 16-bit PNG (x 256), PFM or NPY; NaN where it is unknown."""
+    return _known(path) if path.suffix.lower() in MAP_SUFFIXES else read_depth_png(path)
+
+
+def _known(path: Path) -> Float[Tensor, "h w"]:
+    values = read_map(path)
+    return torch.where(values > 0, values, torch.nan)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.errors import InputError
+from depthpose.core.files import MAP_SUFFIXES
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.packed import packed_frames
@@ -40,6 +41,13 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
     found = ", ".join(path.name for path in children[:8]) or "nothing"
     inside = [path.name for path in children[:50] if path.is_dir() and _recognise(path)]
     hint = f" Open one of its folders instead: {', '.join(inside)}." if inside else ""
+    if any(
+        path.name.endswith("_extract") for path in (folder, *children, *folder.glob("*/*_extract"))
+    ):
+        hint += (
+            " Drives called _extract hold KITTI's raw images, which are neither rectified nor "
+            "synchronised: take those called _sync."
+        )
     known_layouts = ", ".join(f"{name} ({one.parts})" for name, one in LAYOUTS.items())
     raise InputError(
         f"{folder}: no layout that is known here. It holds {found}. Known: {known_layouts}.{hint}"
@@ -59,21 +67,25 @@ def _raw(folder: Path) -> Iterable[Frame]:
     itself = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*itself, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date = drive.parent
-        annotated = _depth_folder(drive, "groundtruth", "data_depth_annotated")
-        scans = _depth_folder(drive, "velodyne_raw", "data_depth_velodyne")
+        right, disparity, disparity_noc, sky = (
+            _by_stem(drive / part) for part in ("image_03/data", "disp_occ", "disp_noc", "sky")
+        )
+        annotated = _by_stem(_depth_folder(drive, "groundtruth", "data_depth_annotated"))
+        scans = _by_stem(_depth_folder(drive, "velodyne_raw", "data_depth_velodyne"))
+        points = _by_stem(drive / "velodyne_points/data", (".bin",))
         for left in _images(drive / "image_02/data"):
             yield Frame(
                 name=f"{drive.name}_{left.stem}",
                 left=left,
-                right=_partner(drive / "image_03/data", left.stem),
+                right=right.get(left.stem),
                 calibration=date if (date / "calib_cam_to_cam.txt").exists() else None,
                 style="raw",
-                velodyne=_existing(drive / "velodyne_points/data" / f"{left.stem}.bin"),
-                scan=_existing(scans / f"{left.stem}.png"),
-                depth=_existing(annotated / f"{left.stem}.png"),
-                disparity=_existing(drive / "disp_occ" / f"{left.stem}.png"),
-                disparity_noc=_existing(drive / "disp_noc" / f"{left.stem}.png"),
-                sky=_existing(drive / "sky" / f"{left.stem}.png"),
+                velodyne=points.get(left.stem),
+                scan=scans.get(left.stem),
+                depth=annotated.get(left.stem),
+                disparity=disparity.get(left.stem),
+                disparity_noc=disparity_noc.get(left.stem),
+                sky=sky.get(left.stem),
             )
 
 
@@ -90,75 +102,132 @@ def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
     return next((home / inside for home in homes if (home / inside).is_dir()), drive / inside)
 
 
+def _depth_selection(folder: Path) -> Iterable[Frame]:
+    """KITTI's frames for completion and prediction of depth: cropped, each with its camera."""
+    inner = folder / "val_selection_cropped"
+    home = inner if inner.is_dir() else folder
+    if not (home / "intrinsics").is_dir():
+        return
+    lenses = _by_stem(home / "intrinsics", (".txt",))
+    scans, depth = _by_stem(home / "velodyne_raw"), _by_stem(home / "groundtruth_depth")
+    for left in _images(home / "image"):
+        yield Frame(
+            name=left.stem,
+            left=left,
+            calibration=lenses.get(left.stem),
+            style="camera",
+            scan=scans.get(left.stem.replace("_image_", "_velodyne_raw_", 1)),
+            depth=depth.get(left.stem.replace("_image_", "_groundtruth_depth_", 1)),
+        )
+
+
+def _odometry(folder: Path) -> Iterable[Frame]:
+    """A sequence of KITTI odometry, or the folder of all: in colour, else in grey."""
+    homes = [folder, *sorted(folder.glob("*")), *sorted(folder.glob("*sequences/*"))]
+    for home in (*homes, *sorted(folder.glob("dataset/sequences/*"))):
+        one, other = (
+            ("image_2", "image_3") if (home / "image_2").is_dir() else ("image_0", "image_1")
+        )
+        if not (home / "calib.txt").is_file():
+            continue
+        right, points = _by_stem(home / other), _by_stem(home / "velodyne", (".bin",))
+        for left in _images(home / one):
+            yield Frame(
+                name=left.stem if home == folder else f"{home.name}_{left.stem}",
+                left=left,
+                right=right.get(left.stem),
+                calibration=home / "calib.txt",
+                style="object" if one == "image_2" else "grey",
+                velodyne=points.get(left.stem),
+            )
+
+
 def _object_or_2015(folder: Path) -> Iterable[Frame]:
     home = folder / "training" if (folder / "training/image_2").is_dir() else folder
     lefts = _images(home / "image_2")
     is_stereo = any(left.stem.endswith("_10") for left in lefts)  # its testing folder too
+    right, depth, disparity, disparity_noc = (
+        _by_stem(home / part) for part in ("image_3", "gt_depth_map", "disp_occ_0", "disp_noc_0")
+    )
+    texts = _by_stem(home / "calib", (".txt",))
+    texts_2015 = _by_stem(home / "calib_cam_to_cam", (".txt",))
+    points = _by_stem(home / "velodyne", (".bin",))
     for left in lefts:
         if is_stereo and not left.stem.endswith("_10"):
             continue
-        number = left.stem.removesuffix("_10")
         yield Frame(
             name=left.stem,
             left=left,
-            right=_partner(home / "image_3", left.stem),
-            calibration=_existing(home / "calib" / f"{left.stem}.txt")
-            or _existing(home / "calib_cam_to_cam" / f"{number}.txt"),
+            right=right.get(left.stem),
+            calibration=texts.get(left.stem) or texts_2015.get(left.stem.removesuffix("_10")),
             style="object",
-            velodyne=_existing(home / "velodyne" / f"{left.stem}.bin"),
-            depth=_existing(home / "gt_depth_map" / f"{left.stem}.png"),
-            disparity=_existing(home / "disp_occ_0" / f"{left.stem}.png"),
-            disparity_noc=_existing(home / "disp_noc_0" / f"{left.stem}.png"),
+            velodyne=points.get(left.stem),
+            depth=depth.get(left.stem),
+            disparity=disparity.get(left.stem),
+            disparity_noc=disparity_noc.get(left.stem),
         )
 
 
 def _kitti_2012(folder: Path) -> Iterable[Frame]:
     home = folder / "training" if (folder / "training/colored_0").is_dir() else folder
+    right, disparity, disparity_noc = (
+        _by_stem(home / part) for part in ("colored_1", "disp_occ", "disp_noc")
+    )
+    texts = _by_stem(home / "calib", (".txt",))
     for left in _images(home / "colored_0"):
         if left.stem.endswith("_10"):
             yield Frame(
                 name=left.stem,
                 left=left,
-                right=_partner(home / "colored_1", left.stem),
-                calibration=_existing(home / "calib" / f"{left.stem.removesuffix('_10')}.txt"),
+                right=right.get(left.stem),
+                calibration=texts.get(left.stem.removesuffix("_10")),
                 style="object",
-                disparity=_existing(home / "disp_occ" / f"{left.stem}.png"),
-                disparity_noc=_existing(home / "disp_noc" / f"{left.stem}.png"),
+                disparity=disparity.get(left.stem),
+                disparity_noc=disparity_noc.get(left.stem),
             )
 
 
 def _middlebury(folder: Path) -> Iterable[Frame]:
     for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
-        if (scene / "calib.txt").is_file() and (scene / "im0.png").is_file():
+        if not (scene / "calib.txt").is_file():
+            continue
+        views, truth = _by_stem(scene, LISTED_SUFFIXES), _by_stem(scene, (".pfm",))
+        if "im0" in views:
             yield Frame(
                 name="_".join(scene.relative_to(folder).parts) or scene.name,
-                left=scene / "im0.png",
-                right=_existing(scene / "im1.png"),
+                left=views["im0"],
+                right=views.get("im1"),
                 calibration=scene / "calib.txt",
                 style="middlebury",
-                disparity=_existing(scene / "disp0GT.pfm") or _existing(scene / "disp0.pfm"),
+                disparity=truth.get("disp0GT") or truth.get("disp0"),
             )
 
 
 def _pairs(folder: Path) -> Iterable[Frame]:
-    cameras = (_existing(folder / f"camera{suffix}") for suffix in (".json", ".yaml", ".yml"))
-    camera = next((path for path in cameras if path is not None), None)
-    text = _existing(folder / "calib.txt")
+    cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
+    camera, text = cameras.get("camera"), folder / "calib.txt"
+    right, depth, disparity = (
+        _by_stem(folder / part) for part in ("right", "lidar_depth", "disp_occ")
+    )
     for left in _images(folder / "left"):
         yield Frame(
             name=left.stem,
             left=left,
-            right=_partner(folder / "right", left.stem),
-            calibration=camera or text,
+            right=right.get(left.stem),
+            calibration=camera or (text if text.is_file() else None),
             style="camera" if camera else "plain",
-            depth=_existing(folder / "lidar_depth" / f"{left.stem}.png"),
-            disparity=_existing(folder / "disp_occ" / f"{left.stem}.png"),
+            depth=depth.get(left.stem),
+            disparity=disparity.get(left.stem),
         )
 
 
 LAYOUTS = {
     "packed shards": Layout(find=packed_frames, parts="index.json of 'depthpose data pack'"),
     "KITTI raw": Layout(find=_raw, parts="DATE/DATE_drive_NNNN_sync/image_02/data"),
+    "KITTI depth selection": Layout(
+        find=_depth_selection, parts="val_selection_cropped: image, groundtruth_depth, intrinsics"
+    ),
+    "KITTI odometry": Layout(find=_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
     "KITTI object or 2015": Layout(
         find=_object_or_2015, parts="image_2, image_3, calib or disp_occ_0"
     ),
@@ -170,16 +239,19 @@ LAYOUTS = {
 
 
 def _images(folder: Path) -> list[Path]:
+    return _listed(folder, LISTED_SUFFIXES)
+
+
+def _by_stem(
+    folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *MAP_SUFFIXES)
+) -> dict[str, Path]:
+    """List files by their names; of two suffixes the first one counts, in capitals or not."""
+    files = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
+    return {path.stem: path for path in reversed(files)}
+
+
+def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     if not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in found if path.suffix.lower() in LISTED_SUFFIXES)
-
-
-def _partner(folder: Path, stem: str) -> Path | None:
-    candidates = (folder / f"{stem}{ending}" for ending in LISTED_SUFFIXES)
-    return next((path for path in candidates if path.is_file()), None)
-
-
-def _existing(path: Path) -> Path | None:
-    return path if path.is_file() else None
+    return sorted(path for path in found if path.suffix.lower() in suffixes and path.is_file())

@@ -18,7 +18,7 @@ from depthpose.core.camera import (
     check_rectified,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.files import picture_tensor, read_image, refused_as
+from depthpose.core.files import picture_tensor, read_image
 from depthpose.depth.estimator.far import infinity_shift_px, moved_apart
 from depthpose.depth.types import StereoInput
 
@@ -44,8 +44,7 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
         case str() | Path():
             return read_image(Path(image))
         case Image():
-            with refused_as(name, "picture", "give an intact one"):
-                return picture_tensor(image, name)
+            return picture_tensor(image, name)
         case np.ndarray() if image.dtype != np.uint8 and image.dtype.kind != "f":
             raise InputError(f"{name} is an array of {image.dtype}; {_VALUES}")
         case np.ndarray():

@@ -13,6 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.datasets import read_disparity as read_truth_disparity
 from depthpose.depth.evaluate.frames import (
+    NO_PREDICTION,
     Compared,
     Prepared,
     Protocol,
@@ -30,6 +31,7 @@ from depthpose.depth.metrics import (
     measure,
     score_confidence,
 )
+from depthpose.depth.predictions import EXPECTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +144,12 @@ def summarise(
     each = {frame.name: found[frame.name] for frame in dataset.frames}
     skipped = {name: why for name, why in each.items() if isinstance(why, str)}
     measured = [one for some in each.values() if not isinstance(some, str) for one in some]
+    if not measured and NO_PREDICTION in skipped.values():
+        name = next(name for name, why in skipped.items() if why == NO_PREDICTION)
+        raise InputError(
+            f"{dataset.name}: no frame has both truth and a prediction; {name!r} has the truth and "
+            f"{NO_PREDICTION}. Predictions are called {EXPECTED}"
+        )
     if not measured:
         raise InputError(
             f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "

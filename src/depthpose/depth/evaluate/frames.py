@@ -20,13 +20,17 @@ from depthpose.depth.disparity import (
 )
 from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, view_errors
 from depthpose.depth.predictions import (
+    has_disparity,
     has_prediction,
     read_confidence,
+    read_depth,
     read_disparity,
     read_drawn_view,
     read_sky,
 )
 from depthpose.depth.types import DepthEstimate
+
+NO_PREDICTION = "no right view to match, and no prediction"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,11 +103,15 @@ def has_truth(frame: Frame, rule: Protocol) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prepared:
-    """A frame's truth and prediction, brought to the size of the image."""
+    """A frame's truth and prediction, brought to the size of the image.
+
+    What was predicted as depth alone is compared as it is, by ``depth_m``.
+    """
 
     frame: Frame
     truth: Float[Tensor, "h w"]
     disparity_px: Float[Tensor, "h w"]
+    depth_m: Float[Tensor, "h w"] | None
     confidence: Float[Tensor, "h w"] | None
     camera: Camera | None
     view: dict[str, float]
@@ -189,8 +197,11 @@ def compare_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Compared:
     counts = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
     if rule.with_crop:
         counts &= garg_crop(*truth.shape)
+    predicted_m = prepared.depth_m
+    if predicted_m is None:
+        predicted_m = clamped_depth(prepared.disparity_px, prepared.camera, cap_m)
     return Compared(
-        predicted=clamped_depth(prepared.disparity_px, prepared.camera, cap_m),
+        predicted=predicted_m.clamp(SMALLEST_DEPTH_M, cap_m),
         truth=torch.where(counts, truth, torch.nan),
     )
 
@@ -218,13 +229,23 @@ def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> 
     if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not has_prediction(predictions, frame.name):
-        return "no right view to match, and no prediction"
+        return NO_PREDICTION
     truth = _truth(dataset, index, rule)
-    camera = dataset.read_rig(index)
-    if rule.truth != "disparity" and not isinstance(camera, StereoRig):
-        raise InputError(f"{frame.name}: no calibration, so its disparity cannot become metres.")
     height, width = truth.shape
-    predicted_px = resize_disparity(read_disparity(predictions, frame.name, camera), height, width)
+    camera, depth_m = dataset.read_rig(index), None
+    if rule.truth != "disparity" and (camera is None or not has_disparity(predictions, frame.name)):
+        depth_m = read_depth(predictions, frame.name)
+    if rule.truth != "disparity" and camera is None:
+        if depth_m is None:
+            raise InputError(
+                f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
+                f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
+            )
+        K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
+        camera = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # any serves for depth
+    is_stereo = rule.truth == "disparity"
+    found_px = read_disparity(predictions, frame.name, camera, with_disparity_png=is_stereo)
+    predicted_px = resize_disparity(found_px, height, width)
     true_px = truth
     if rule.truth != "disparity" and isinstance(camera, StereoRig):
         true_px = disparity_from_depth(truth, camera)
@@ -239,6 +260,7 @@ def prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> 
         frame=frame,
         truth=truth,
         disparity_px=predicted_px,
+        depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
         confidence=confidence,
         camera=camera,
         view=_measure_view(frame, predictions),

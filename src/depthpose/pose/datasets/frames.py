@@ -25,7 +25,6 @@ from depthpose.pose.datasets.parse import (
 )
 
 _IMAGE_FOLDERS = ("rgb", "gray")
-_IMAGE_SUFFIXES = (*LISTED_SUFFIXES, ".tif")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,7 +144,7 @@ def _depth(scene: Path, image: int) -> Path:
 
 def _picture(scene: Path, image: int) -> Path | None:
     named = (scene / folder / f"{image:06d}{suffix}"
-             for folder in _IMAGE_FOLDERS for suffix in _IMAGE_SUFFIXES)  # fmt: skip
+             for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
     return next((path for path in named if path.is_file()), None)
 
 
