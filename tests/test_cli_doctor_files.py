@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -10,6 +11,7 @@ from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
 from depthpose.cli import main
 from depthpose.core.camera import Camera, StereoRig, write_camera
+from depthpose.core.errors import Notice
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image, write_map
 from depthpose.pose.types import ObjectModel
 
@@ -113,3 +115,18 @@ def test_a_camera_of_another_size_and_unit_is_odd(
     assert code == 1
     assert "odd: beside unit.json: it is 480x240 but its camera is 320x240;" in out
     assert "m by the camera's depth_unit_m 1; 0.001 means millimetres" in out
+
+
+def test_a_picture_of_ten_bits_is_no_depth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grey = np.random.default_rng(0).integers(1, 1024, (12, 16)).repeat(4, 0).repeat(4, 1)
+    Image.fromarray(grey.astype(np.uint16)).save(tmp_path / "mono10.png")
+    with pytest.warns(Notice, match="is taken as black"):
+        code, text = said(capsys, tmp_path / "mono10.png")
+    assert code == 0
+    assert "picture of 64x48, 16 bits a value, from" in text
+    ramp = np.linspace(800, 900, 48 * 64).reshape(48, 64)
+    ramp[:4] = 0
+    Image.fromarray(ramp.astype(np.uint16)).save(tmp_path / "depth.png")
+    assert "16-bit depth of 64x48" in said(capsys, tmp_path / "depth.png")[1]

@@ -118,6 +118,13 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"baseline_m": 0}, r"baseline_m is 0\.0, but the right camera stands"),
     ({"baseline_m": 532.7}, r"baseline_m is 532\.7, which looks like millimetres; divide by 1000"),
     ({"baseline_m": 54}, "baseline_m is 54, which looks like millimetres; divide by 1000"),
+    ({"baseline_m": 12}, "looks like centimetres; .* in millimetres, divide by 1000"),
+    ({"baseline_m": 1e-9}, "baseline_m is 1e-09, less than two lenses can stand apart"),
+    ({"depth_unit_m": 1e-9}, "depth_unit_m is 1e-09, finer than any sensor's"),
+    (
+        {"baseline_m": 0.1, "cx_right_minus_left_px": 2000},
+        "principal points differ by 2000 px, more than the image",
+    ),
     ({"depth_unit_m": -1}, r"depth_unit_m is -1\.0, but a unit is a positive number of metres"),
 ]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from depthpose.core.camera import Camera, StereoRig, read_camera, read_rig
+from depthpose.core.camera import Camera, StereoRig, read_camera, read_rig, resize_camera
 from depthpose.core.errors import InputError
 
 SIZE = (640, 480)
@@ -57,6 +57,13 @@ BOP = {"cx": 320.5, "cy": 240.5, "depth_scale": 0.1, "fx": 500, "fy": 501, "widt
 SCENE = {str(n): {"cam_K": [500, 0, 320, 0, 501, 240, 0, 0, 1], "depth_scale": 1} for n in (0, 7)}
 
 
+FLAT = [500, 0, 320, 0, 501, 240, 0, 0, 1]
+OPEN3D = {"width": 640, "height": 480, "intrinsic_matrix": [500, 0, 0, 0, 501, 0, 320, 240, 1]}
+REALSENSE = {"width": 640, "height": 480, "fx": 500, "fy": 501, "ppx": 320, "ppy": 240}
+ROSBRIDGE = {"width": 640, "height": 480, "distortion_model": "plumb_bob",
+             "P": [500, 0, 320, -30, 0, 501, 240, 0, 0, 0, 1, 0]}  # fmt: skip
+
+
 def ros(distortion: object = (0, 0, 0, 0, 0), Tx: float = 0, cx: float = 321) -> str:
     return ROS.format(distortion=list(distortion), Tx=Tx, cx=cx)  # pyright: ignore[reportArgumentType]
 
@@ -88,6 +95,25 @@ READ: dict[str, tuple[str, tuple[float, ...], tuple[float | None, ...]]] = {
                             (0.12, 0, None)),
     "BOP": (json.dumps({**BOP, "height": 480}), (500, 501, 320.5, 240.5), (None, None, 0.0001)),
     "BOP scene": (json.dumps(SCENE), (500, 501, 320, 240), (None, None, 0.001)),
+    "Middlebury, commas": (
+        MIDDLEBURY.replace(" 0", ", 0").replace("cam0=", "cam0 = ").replace("640", "640.0"),
+        (700, 700, 310, 240), (0.193, 10, None)),
+    "flat K": (json.dumps({"width": 640.0, "height": 480, "K": FLAT}), (500, 501, 320, 240),
+               (None, None, None)),
+    "K alone in JSON": (json.dumps([FLAT[:3], FLAT[3:6], FLAT[6:]]), (500, 501, 320, 240),
+                        (None, None, None)),
+    "Open3D": (json.dumps(OPEN3D), (500, 501, 320, 240), (None, None, None)),
+    "Open3D, parameters": (
+        json.dumps({"class_name": "PinholeCameraParameters", "intrinsic": OPEN3D}),
+        (500, 501, 320, 240), (None, None, None)),
+    "RealSense": (json.dumps({**REALSENSE, "coeffs": [0] * 5, "depth_scale": 0.001}),
+                  (500, 501, 320, 240), (None, None, 0.001)),
+    "COLMAP": ("# Camera list\n1 PINHOLE 640 480 500 501 320.5 240.5\n", (500, 501, 320, 240),
+               (None, None, None)),
+    "COLMAP, one focal length": ("3 SIMPLE_RADIAL 640 480 500 320.5 240.5 0\n",
+                                 (500, 500, 320, 240), (None, None, None)),
+    "ROS in JSON": (json.dumps({**ROSBRIDGE, "K": FLAT, "D": [0] * 5}), (500, 501, 320, 240),
+                    (0.06, 0, None)),
     "ROS": (ros(), (490, 491, 321, 241), (None, None, None)),
     "ROS right": (ros(Tx=-49), (490, 491, 321, 241), (0.1, 0, None)),
     "ROS echo": (ECHO, (500, 501, 320, 240), (0.06, 0, None)),
@@ -154,6 +180,9 @@ BENT: dict[str, tuple[str, str]] = {
     "ROS pair": (ros((-0.3, 0.1, 0, 0, 0), Tx=-49), r"cv2\.initUndistortRectifyMap"),
     "TUM": ("517.3 516.5 318.6 255.3 0.2624 -0.9531 -0.0054 0.0026 1.1633", r"cv2\.undistort\("),
     "ORB-SLAM": (orb(k1=0.26), r"cv2\.undistort\(image, K, distortion\)"),
+    "RealSense": (json.dumps({**REALSENSE, "coeffs": [0.1, 0, 0, 0, 0]}), r"cv2\.undistort\("),
+    "BOP": (json.dumps({**BOP, "height": 480, "k1": 0.1}), r"cv2\.undistort\("),
+    "COLMAP": ("1 RADIAL 640 480 500 320 240 0.1 0.2\n", "colmap image_undistorter"),
     "loose": ("camera_matrix: [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\nk1: -0.2", "-0.2"),
     "named": (
         "camera_matrix: [500, 0, 320, 0, 500, 240, 0, 0, 1]\ndistortion_parameters: {k1: 0.1}",
@@ -189,6 +218,30 @@ WRONG: dict[str, tuple[str, str]] = {
     "several cameras": (
         json.dumps({**SCENE, "9": {"cam_K": [1] * 9}}),
         "whose 3 images have several cameras",
+    ),
+    "another fx": (P2 + P3.replace("700", "800"), "fx of the left camera is 700 and of the right"),
+    "another cy": (P2 + P3.replace("240", "243"), "cy of the left camera is 240 .* right one 243"),
+    "centimetres": (
+        P2.replace("35", "0") + P3.replace("-315", "-4200"),
+        r"baseline_m is 6, .* centimetres; divide by 100 \(0\.06\)",
+    ),
+    "squares": (
+        P2.replace("35", "0") + P3.replace("-315", "-3360"),
+        r"baseline_m is 4\.8, .* squares of the calibration board",
+    ),
+    "doffs": (MIDDLEBURY.replace("doffs=10", "doffs=0"), "doffs is 0, but cx of cam1 .* is 10"),
+    "Middlebury in metres": (MIDDLEBURY.replace("=193", "=0.193"), "in metres, write 193"),
+    "squeezed": ("500 0 320 0 1000 240 0 0 1", "fx 500 and fy 1000, as if pixels were 2 times"),
+    "far too long": ("500000 0 320 0 500000 240 0 0 1", "sees less than 0.3 degrees"),
+    "ZED": ("[LEFT_CAM_HD]\nfx=699\nfy=699\n", "factory calibration of a ZED, .* SDK"),
+    "several of COLMAP": ("1 PINHOLE 9 9 5 5 4 4\n2 PINHOLE 9 9 6 6 4 4\n", "2 different cameras"),
+    "NeRF": (
+        json.dumps({"fl_x": 500, "frames": []}),
+        "no camera that is known; its keys are 'fl_x'",
+    ),
+    "window": (
+        ECHO.replace("---", "roi: {x_offset: 400, y_offset: 0, width: 320, height: 9}"),
+        r"its roi, 320x9 at \(400, 0\), leaves the image of 640x480",
     ),
     "one above the other": (
         P2 + "P3: 700 0 310 35 0 700 240 -300 0 0 1 0\n",
@@ -305,3 +358,23 @@ def test_yaml_takes_the_keys_of_our_json_too(tmp_path: Path, key: str) -> None:
     path.write_text(f"{text}baseline_m: 0.2\n")
     with pytest.raises(InputError, match="key 'baseline_m' is given twice"):
         read_rig(path)
+
+
+def test_a_camera_of_ros_is_that_of_the_window_and_binning(tmp_path: Path) -> None:
+    window = "roi: {x_offset: 100, y_offset: 40, width: 320, height: 240, do_rectify: false}"
+    cut = read_rig(saved(tmp_path, ECHO.replace("---", window)))
+    assert (cut.width, cut.height) == (320, 240)
+    assert pinhole(cut) == (500, 501, 220, 200)
+    assert cut.baseline_m == pytest.approx(0.06)
+    binned = read_rig(saved(tmp_path, ECHO.replace("---", "binning_x: 2\nbinning_y: 2")))
+    halved = resize_camera(read_rig(saved(tmp_path, ECHO)), 320, 240)
+    assert (binned.width, binned.height) == (320, 240)
+    assert torch.allclose(binned.K, halved.K)
+    assert binned.baseline_m == pytest.approx(0.06)
+
+
+def test_a_wide_rig_is_believed_where_its_unit_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="truly this wide is written as ours"):
+        read_rig(saved(tmp_path, P2.replace("35", "0") + P3.replace("-315", "-2100")), SIZE)
+    ours = {"width": 640, "height": 480, "K": FLAT, "baseline_m": 3}
+    assert read_rig(saved(tmp_path, json.dumps(ours))).baseline_m == 3

@@ -105,6 +105,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {**GOOD, "T": [-100, 0, 0]},
         "looks like millimetres; divide by 1000 .--unit cm or mm",
     ),
+    "centimetres": ({**GOOD, "T": [-6, 0, 0]}, "looks like centimetres; .*--unit cm or mm"),
+    "scaled twice": ({**GOOD, "T": [-1e-4, 0, 0]}, "less than two lenses can stand apart"),
     "another model": ({**GOOD, "distortion_model": "fov"}, "model is 'fov'; known are radtan"),
     "transposed": (
         {**GOOD, "K1": [500, 0, 0, 0, 500, 0, 320, 240, 1]},

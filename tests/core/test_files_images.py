@@ -1,4 +1,7 @@
+import struct
+from contextlib import nullcontext
 from pathlib import Path
+from zlib import compress, crc32
 
 import numpy as np
 import pytest
@@ -7,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import (
     image_size,
     list_images,
@@ -19,6 +22,7 @@ from depthpose.core.files import (
     write_image,
 )
 from depthpose.core.files.names import refuse_unpaired
+from depthpose.core.files.store import list_files
 
 
 def bytes_image(height: int = 5, width: int = 7) -> np.ndarray:
@@ -150,6 +154,18 @@ def test_numbers_in_names_are_in_the_order_of_their_values(tmp_path: Path) -> No
     assert [p.name for p in list_images(tmp_path / "sub*" / "*.png")] == ["1.png", "0.png"]
 
 
+def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path: Path) -> None:
+    home = tmp_path / "run[1]" / "left"
+    home.mkdir(parents=True)
+    for name in ("a.PNG", "b.tif", "c.webp", "d.bmp", "e.ppm", "f.txt"):
+        (home / name).touch()
+    pictures = ["a.PNG", "b.tif", "c.webp", "d.bmp", "e.ppm"]
+    for wanted in (home, home / "*", home / "[a-e].*"):
+        assert [path.name for path in list_images(wanted)] == pictures
+    found = list_files(str(home / "*"), (".png", ".tif"))
+    assert [Path(path).name for path in found] == ["a.PNG", "b.tif"]
+
+
 @pytest.mark.parametrize("wanted", ["", "nothing", "*.bmp", "empty"])
 def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> None:
     (tmp_path / "empty").mkdir()
@@ -162,3 +178,58 @@ def test_names_on_one_side_alone_are_refused_where_others_have_partners() -> Non
     refuse_unpaired(["a", "b"], ["b", "a"], "equal names")
     with pytest.raises(InputError, match=r"l and r: 'a' is on one side alone"):
         refuse_unpaired(["a", "b", "c"], ["b", "c", "d"], "l and r")
+
+
+def levels() -> np.ndarray:
+    """Each of 256 levels on 100 pixels, so that 0.1 % is less than a level."""
+    return np.arange(256, dtype=np.uint16).repeat(100).reshape(160, 160)
+
+
+@pytest.mark.parametrize(
+    ("times", "offset", "said"),
+    [(4, 0, "0 to 1020: 0 is"), (16, 0, "0 to 4080: 0 is"), (64, 0, "0 to 16320: 0 is"),
+     (4, 7600, "7600 to 8620: 7600 is"), (4, 30000, "30000 to 31020: 30000 is"), (257, 0, None)],
+)  # fmt: skip
+def test_fewer_than_16_bits_in_16_are_scaled_by_the_values_and_said(
+    tmp_path: Path, times: int, offset: int, said: str | None
+) -> None:
+    path = tmp_path / "grey.png"
+    Image.fromarray(levels() * times + offset).save(path)
+    expected = pytest.warns(Notice, match=said) if said else nullcontext()
+    with expected:
+        grey = read_image(path)
+    assert torch.allclose(grey[1], torch.from_numpy(levels() / 255).float(), atol=1e-6)
+
+
+def test_few_values_are_a_mask_and_stay(tmp_path: Path) -> None:
+    labels = np.ones((40, 40), np.uint16)
+    labels[0, 0] = 0
+    Image.fromarray(labels).save(tmp_path / "mask.png")
+    assert int((read_image(tmp_path / "mask.png")[0] > 0).sum()) == 1599
+
+
+def png_of_48_bits(pixels: np.ndarray) -> bytes:
+    """Write a PNG by its specification: colour type 2, 16 bits, rows without filter."""
+
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", crc32(name + body))
+
+    height, width, _ = pixels.shape
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", compress(rows)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+@pytest.mark.parametrize("suffix", ["png", "ppm"])
+@pytest.mark.parametrize("times", [4, 257])
+def test_colours_of_16_bits_keep_their_lower_bytes(tmp_path: Path, suffix: str, times: int) -> None:
+    grey = levels()
+    pixels = np.stack([grey, grey[::-1], grey.T], -1) * times
+    path = tmp_path / f"colour.{suffix}"
+    ppm = b"P6 160 160 65535\n" + pixels.astype(">u2").tobytes()
+    path.write_bytes(png_of_48_bits(pixels) if suffix == "png" else ppm)
+    with pytest.warns(Notice, match="0 to 1020") if times == 4 else nullcontext():
+        found = read_image(path)
+    wanted = torch.from_numpy(pixels / (255 * times)).permute(2, 0, 1).float()
+    assert torch.allclose(found, wanted, atol=1e-6)

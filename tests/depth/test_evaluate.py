@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from depthpose.core.camera import StereoRig, write_camera
+from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
 from depthpose.depth.datasets import Dataset, open_dataset
@@ -93,6 +93,44 @@ def test_perfect_disparity_has_perfect_depth(pairs: Dataset, tmp_path: Path) -> 
         assert row.metrics["abs_rel"] < 1e-3  # the truth is stored in steps of 1/256 m
         assert row.metrics["d1"] == 1.0
         assert row.coverage == 1.0
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Dataset:
+    """One image of a camera without baseline, and its LiDAR."""
+    home = tmp_path / "alone"
+    write_image(home / "left/a.png", torch.rand(3, H, W))
+    write_depth_png(home / "lidar_depth/a.png", torch.full((H, W), 10.0))
+    camera = Camera(width=W, height=H, K=rig().K)
+    write_camera(home / "camera.json", camera)
+    return open_dataset(home)
+
+
+@pytest.mark.parametrize("ending", ["depth_m.npy", "depth_m.pfm", "depth.png", "png"])
+def test_depth_of_one_camera_needs_no_baseline(alone: Dataset, tmp_path: Path, ending: str) -> None:
+    write = write_depth_png if ending.endswith("png") else write_map
+    write(tmp_path / "p" / f"a.{ending}", torch.full((H, W), 10.0))
+    for row in evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows:
+        assert row.metrics["abs_rel"] == 0
+        assert row.coverage == 1
+    shown = frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
+    assert float(shown.error.nanmean()) == 0
+
+
+def test_a_prediction_that_is_missing_is_not_called_a_truth(alone: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'a' has the truth and no right .* NAME\.depth\.png"):
+        evaluate(alone, tmp_path, "eigen-raw-camera")
+    write_map(tmp_path / "a.disparity_px.npy", torch.full((H, W), 4.0))
+    with pytest.raises(InputError, match=r"a: no calibration of a pair, .*a\.depth_m\.npy"):
+        evaluate(alone, tmp_path, "eigen-raw-camera")
+
+
+def test_a_png_of_kitti_is_disparity_where_disparity_is_measured(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    for k, name in enumerate("abc"):
+        write_disparity_png(tmp_path / "p" / f"{name}.png", truth_px(k))
+    assert evaluate(pairs, tmp_path / "p", "kitti-2015").rows[0].metrics["epe_px"] == 0
 
 
 def test_a_prediction_of_half_the_size_is_scaled(pairs: Dataset, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resized_match
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.far import is_cut_off, join_far
-from depthpose.depth.estimator.rig import join_matches
+from depthpose.depth.estimator.rig import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
@@ -28,7 +28,7 @@ from depthpose.depth.train.adapt import AdaptationCheck
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.train.stages import validate_pairs
-from depthpose.depth.types import DepthEstimate, Match
+from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 
 PLAIN = replace(SMALL, with_sky=False)
@@ -174,6 +174,21 @@ def test_an_estimate_has_no_depth_in_the_sky(apart_px: float) -> None:
     torch.testing.assert_close(found.disparity_px, expected_px)
     assert "sky 50%" in repr(found)
     assert len(found.cloud().points) == 300
+
+
+def test_a_few_pixels_of_sky_are_none() -> None:
+    """They keep what was matched; in a garage they were infinitely far."""
+    pair = StereoInput(name="a", left=torch.rand(3, 100, 100), right=None, camera=rig(100, 100))
+    is_sky = torch.zeros(100, 100, dtype=torch.bool)
+    is_sky[0, :15] = True
+    match = Match(disparity_px=torch.full((100, 100), 4.0), is_sky=is_sky)
+    found = from_pair(pair, match)
+    assert found.depth_m is not None
+    assert bool(found.depth_m.isfinite().all())
+    assert bool((found.disparity_px == 4).all())
+    is_sky[:2] = True
+    assert from_pair(pair, match).is_sky is not None
+    assert torch.equal(from_pair(pair, match).is_sky, is_sky)  # pyright: ignore[reportArgumentType]
 
 
 def test_without_a_rig_the_disparity_of_the_sky_is_next_to_nothing() -> None:

@@ -114,6 +114,22 @@ def test_images_that_cannot_be_read_are_refused(read: Any, message: Image, said:
         read(message)
 
 
+def test_the_camera_is_that_of_the_window_and_binning() -> None:
+    roi = SimpleNamespace(x_offset=100, y_offset=40, width=320, height=240)
+    p = [500.0, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]
+    whole = {"width": 640, "height": 480, "p": p}
+    cut = camera_of(info(**whole, roi=roi, binning_x=0, binning_y=0))
+    assert (cut.width, cut.height) == (320, 240)
+    assert (float(cut.K[0, 2]), float(cut.K[1, 2])) == (220, 200)
+    right = {**whole, "p": [*p[:3], -50.0, *p[4:]]}
+    sides = (info(**one, binning_x=2, binning_y=2) for one in (whole, right))
+    rig = rig_of(*sides)
+    assert (rig.width, rig.height, rig.baseline_m) == (320, 240, pytest.approx(0.1))
+    assert float(rig.K[0, 0]) == 250
+    with pytest.raises(InputError, match="fx of the left camera is 500 and of the right one 600"):
+        rig_of(info(**whole), info(**{**right, "p": [600.0, 0, 320, -50, 0, 600, *p[6:]]}))
+
+
 def test_the_camera_is_that_of_the_rectified_image() -> None:
     raw = info(d=[0.1, 0, 0, 0, 0], k=[50.0, 0, 1, 0, 50, 1, 0, 0, 1])
     assert camera_of(raw).K[0].tolist() == [100, 0, 2]

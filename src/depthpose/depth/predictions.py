@@ -150,7 +150,9 @@ def read_disparity(
         return read_map(path)
     path = _first(base, (*_DEPTH, _KITTI))
     if path is None:
-        raise InputError(f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED}")
+        raise InputError(
+            f"{folder}: no prediction for frame {name!r}. Expected {EXPECTED.replace('NAME', name)}"
+        )
     if with_disparity_png and path == _file(base, _KITTI):
         return read_disparity_png(path)
     depth_m = read_depth(folder, name)

@@ -147,10 +147,7 @@ def _deep_ppm(image: Image.Image) -> np.ndarray | None:
 
 
 def _low_bytes(image: Image.Image) -> Image.Image | None:
-    """Open a picture of 16 bits a colour again, so that it gives the lower bytes.
-
-    Pillow keeps the upper one of each colour: what it unpacks in the other byte order is the lower.
-    """
+    """Open a picture of 16 bits a colour again, so that it gives the lower bytes."""
     tiles, file = getattr(image, "tile", None), getattr(image, "fp", None)
     if not tiles or file is None:
         return None

@@ -1,6 +1,6 @@
 """Calibration files to a rig and a LiDAR projection, and one scan as a sparse depth map.
 
-Files are those of KITTI, Middlebury and plain folders; the depth map of a scan equals that of the
+Files are those of KITTI and plain folders; the depth map of a scan equals that of the
 published Eigen evaluation to the bit.
 """
 
@@ -20,13 +20,11 @@ from depthpose.core.camera.camera_text import (
     Matrix,
     kitti_matrix,
     kitti_size,
-    middlebury_facts,
     plain_facts,
 )
 from depthpose.core.camera.facts import CameraFacts, Size, camera_from_facts, facts_from_projections
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_key_values, read_text
-from depthpose.core.files.text import MAX_LIST_BYTES
 
 _MAX_PAIRS_BYTES = 2**24
 """Of a text with a line for each pair of a folder."""
@@ -94,15 +92,6 @@ def read_object_calibration(
     )
     composed = _compose(path, left, rectify, camera_from_velodyne)
     return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
-
-
-def read_middlebury_calibration(path: Path) -> StereoRig:
-    """Read Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size.
-
-    Raises:
-        InputError: missing, or a value missing or not a number.
-    """
-    return _rig(path, middlebury_facts(path, read_text(path, MAX_LIST_BYTES)), None)
 
 
 def read_plain_calibration(path: Path, name: str, width: int, height: int) -> StereoRig:

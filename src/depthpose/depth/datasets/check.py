@@ -54,6 +54,7 @@ def check_dataset(
         ]
         frames = [here[name] for name in chosen.names if name in here]
     found += [*_same_names(frames), *_mixed_formats(folder, frames), *_lone_right_views(frames)]
+    found += _unused_maps(folder, frames)
     for done, frame in enumerate(frames, 1):
         found += _check_frame(frame, with_decoding=with_decoding)
         if progress is not None:
@@ -100,6 +101,14 @@ def _lone_right_views(frames: list[Frame]) -> Iterator[Problem]:
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and path.stem not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
+
+
+def _unused_maps(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
+    for name, part in (("lidar_depth", "depth"), ("disp_occ", "disparity")):
+        is_there = (folder / name).is_dir() and any((folder / name).iterdir())
+        if is_there and not any(getattr(frame, part) for frame in frames):
+            message = "holds no map of a frame's name in a format that is read: .png, .npy or .pfm"
+            yield Problem(path=folder / name, kind="missing", message=message)
 
 
 def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:

@@ -109,11 +109,7 @@ def _best_shift(
 
 
 def _fine_structure(dataset: Dataset, index: int) -> Float[Tensor, "zooms rows columns"]:
-    """Make grey thumbnails of the image and of its middle, one a zoom, contrast evened out.
-
-    What a pixel shares with its surroundings is taken away, and shadows, which hold as much
-    structure as light at less contrast, are raised to it.
-    """
+    """Make grey thumbnails of the image and of its middle, one a zoom, contrast evened out."""
     image = read_image(dataset.frames[index].left).mean(0, keepdim=True)
     grey = torch.stack([shrink(_middle(image, zoom), _ROWS, _COLUMNS) for zoom in _ZOOMS])
     detail = grey - _blur(grey)

@@ -24,7 +24,6 @@ from depthpose.depth.datasets.calibration import (
     KittiCalibration,
     LidarDepth,
     project_lidar,
-    read_middlebury_calibration,
     read_object_calibration,
     read_plain_calibration,
     read_raw_calibration,
@@ -119,7 +118,7 @@ def frame_camera(frame: Frame) -> Camera | None:
         case "raw" | "object" | "grey":
             camera = kitti_calibration(frame).rig
         case "middlebury":
-            camera = read_middlebury_calibration(path)
+            camera = read_rig(path)
         case "camera":
             camera = read_camera(path, size) if frame.right is None else read_rig(path, size)
         case "plain":

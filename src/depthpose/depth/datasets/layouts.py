@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from depthpose.core.errors import InputError
@@ -90,11 +91,7 @@ def _raw(folder: Path) -> Iterable[Frame]:
 
 
 def _depth_folder(drive: Path, kind: str, archive: str) -> Path:
-    """Find maps of a drive's left camera, wherever in the tree the dataset was opened.
-
-    KITTI's depth-prediction set holds them as ``train|val/DRIVE/proj_depth/KIND/image_02``, its
-    downloads each in a folder of the archive's name.
-    """
+    """Find maps of a drive's left camera, wherever in the tree the dataset was opened."""
     inside = f"proj_depth/{kind}/image_02"
     homes = (drive.parent, drive.parent.parent)
     roots = [root for home in homes for root in (home, home / archive)]
@@ -142,15 +139,16 @@ def _odometry(folder: Path) -> Iterable[Frame]:
             )
 
 
-def _object_or_2015(folder: Path) -> Iterable[Frame]:
-    home = folder / "training" if (folder / "training/image_2").is_dir() else folder
-    lefts = _images(home / "image_2")
+def _benchmark(folder: Path, one: str, other: str, ending: str) -> Iterable[Frame]:
+    """KITTI object, 2012 or 2015: of the stereo sets the frames that have truth, NNNNNN_10."""
+    home = folder / "training" if (folder / "training" / one).is_dir() else folder
+    lefts = _images(home / one)
     is_stereo = any(left.stem.endswith("_10") for left in lefts)  # its testing folder too
     right, depth, disparity, disparity_noc = (
-        _by_stem(home / part) for part in ("image_3", "gt_depth_map", "disp_occ_0", "disp_noc_0")
+        _by_stem(home / part)
+        for part in (other, "gt_depth_map", f"disp_occ{ending}", f"disp_noc{ending}")
     )
-    texts = _by_stem(home / "calib", (".txt",))
-    texts_2015 = _by_stem(home / "calib_cam_to_cam", (".txt",))
+    texts = _by_stem(home / "calib_cam_to_cam", (".txt",)) | _by_stem(home / "calib", (".txt",))
     points = _by_stem(home / "velodyne", (".bin",))
     for left in lefts:
         if is_stereo and not left.stem.endswith("_10"):
@@ -159,32 +157,13 @@ def _object_or_2015(folder: Path) -> Iterable[Frame]:
             name=left.stem,
             left=left,
             right=right.get(left.stem),
-            calibration=texts.get(left.stem) or texts_2015.get(left.stem.removesuffix("_10")),
+            calibration=texts.get(left.stem) or texts.get(left.stem.removesuffix("_10")),
             style="object",
             velodyne=points.get(left.stem),
             depth=depth.get(left.stem),
             disparity=disparity.get(left.stem),
             disparity_noc=disparity_noc.get(left.stem),
         )
-
-
-def _kitti_2012(folder: Path) -> Iterable[Frame]:
-    home = folder / "training" if (folder / "training/colored_0").is_dir() else folder
-    right, disparity, disparity_noc = (
-        _by_stem(home / part) for part in ("colored_1", "disp_occ", "disp_noc")
-    )
-    texts = _by_stem(home / "calib", (".txt",))
-    for left in _images(home / "colored_0"):
-        if left.stem.endswith("_10"):
-            yield Frame(
-                name=left.stem,
-                left=left,
-                right=right.get(left.stem),
-                calibration=texts.get(left.stem.removesuffix("_10")),
-                style="object",
-                disparity=disparity.get(left.stem),
-                disparity_noc=disparity_noc.get(left.stem),
-            )
 
 
 def _middlebury(folder: Path) -> Iterable[Frame]:
@@ -229,9 +208,13 @@ LAYOUTS = {
     ),
     "KITTI odometry": Layout(find=_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
     "KITTI object or 2015": Layout(
-        find=_object_or_2015, parts="image_2, image_3, calib or disp_occ_0"
+        find=partial(_benchmark, one="image_2", other="image_3", ending="_0"),
+        parts="image_2, image_3, calib or disp_occ_0",
     ),
-    "KITTI 2012": Layout(find=_kitti_2012, parts="colored_0, colored_1"),
+    "KITTI 2012": Layout(
+        find=partial(_benchmark, one="colored_0", other="colored_1", ending=""),
+        parts="colored_0, colored_1",
+    ),
     "Middlebury": Layout(find=_middlebury, parts="SCENE/im0.png, calib.txt"),
     "pairs": Layout(find=_pairs, parts="left, right, calib.txt or camera.json, .yaml"),
 }

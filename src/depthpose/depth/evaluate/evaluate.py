@@ -202,10 +202,7 @@ def _measure_disparity(prepared: Prepared) -> Measured | None:
 def _count(
     prepared: Prepared, compared: Compared, cap_m: float | None
 ) -> tuple[Bool[Tensor, "h w"], Measured | None]:
-    """Find the pixels that are measured, how many they are, and their share of the truth.
-
-    None where there is no truth.
-    """
+    """Find the pixels that are measured, how many they are, and their share of the truth."""
     counts = torch.isfinite(compared.truth)
     mask = counts & torch.isfinite(compared.predicted)
     if not bool(counts.any()):
@@ -248,13 +245,7 @@ def _frame_row(dataset: str, protocol: str, one: Measured) -> FrameRow:
 
 
 def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[MeanRow]:
-    """One row for each cap; each frame counts the same.
-
-    A frame without a predicted pixel has no metrics, and lowers the coverage.
-
-    Raises:
-        InputError: no frame has a predicted pixel.
-    """
+    """One row for each cap; each frame counts the same."""
     rows: list[MeanRow] = []
     for cap_m, of_cap in _by_cap(measured).items():
         answered = [one for one in of_cap if one.pixels]
