@@ -148,12 +148,33 @@ def ros(Tx: float, distortion: float = 0.0) -> str:
     )
 
 
+KITTI_P2 = "P2: 700 0 320 0 0 700 240 0 0 0 1 0\n"
 Work = Callable[[Path], object]
 MISTAKES: dict[str, tuple[Work, Work, str]] = {
     "baseline in millimetres": (
         lambda folder: camera(folder, baseline_m=120),
         camera,
         "baseline_m is 120, which looks like millimetres; divide by 1000",
+    ),
+    "baseline in centimetres": (
+        lambda folder: camera(folder, ros(Tx=-6000.0)),
+        lambda folder: camera(folder, ros(Tx=-60.0)),
+        "baseline_m is 12, which looks like centimetres; divide by 100 (0.12). If it is in mill",
+    ),
+    "baseline divided once too often": (
+        lambda folder: camera(folder, baseline_m=0.12 / 1000),
+        camera,
+        "baseline_m is 0.00012, less than two lenses can stand apart; write metres, once",
+    ),
+    "two calibrations": (
+        lambda folder: camera(folder, KITTI_P2 + KITTI_P2.replace("P2: 700", "P3: 600")),
+        lambda folder: camera(folder, KITTI_P2),
+        "fx of the left camera is 700 and of the right one 600, but a rectified pair shares fx",
+    ),
+    "K scaled in one direction alone": (
+        lambda folder: camera(folder, K=[[500, 0, 320], [0, 1000, 240], [0, 0, 1]]),
+        camera,
+        "K has fx 500 and fy 1000, as if pixels were 2 times longer than wide",
     ),
     "baseline of the wrong sign": (
         lambda folder: camera(folder, ros(Tx=60.0)),

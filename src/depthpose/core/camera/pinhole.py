@@ -18,6 +18,8 @@ MAX_SIDE_PX = 2**20
 """Largest image side: a larger number in a file is a mistake, and is refused."""
 MAX_BASELINE_M = 100
 """No rig on the ground is this wide: such a number was in millimetres."""
+MIN_BASELINE_M = 1e-4
+"""No two lenses stand so near: such a number was divided once too often."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +82,11 @@ class StereoRig(Camera):
         if self.baseline_m >= MAX_BASELINE_M:
             raise InputError(
                 f"baseline_m is {self.baseline_m:g}, which looks like millimetres; divide by 1000"
+            )
+        if self.baseline_m < MIN_BASELINE_M:
+            raise InputError(
+                f"baseline_m is {self.baseline_m:g}, less than two lenses can stand apart; give "
+                "their distance in metres"
             )
         if not math.isfinite(self.cx_right_minus_left_px):
             raise InputError(
