@@ -53,7 +53,7 @@ def test_a_camera_without_baseline_is_no_rig(tmp_path: Path) -> None:
 
 @given(
     lengths=st.tuples(LENGTHS, st.floats(0.6, 1.7), st.floats(0, 1241)),
-    baseline_m=st.none() | st.floats(0.01, 9),
+    baseline_m=st.none() | st.floats(0.01, 4.9),
     offset_px=st.floats(-50, 50),
     unit_m=st.none() | st.floats(1e-6, 1),
 )
@@ -118,6 +118,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"baseline_m": 0}, r"baseline_m is 0\.0, but the right camera stands"),
     ({"baseline_m": 532.7}, r"baseline_m is 532\.7, which looks like millimetres; divide by 1000"),
     ({"baseline_m": 54}, "baseline_m is 54, which looks like millimetres; divide by 1000"),
+    ({"baseline_m": 6}, r"looks like centimetres; divide by 100 \(0\.06\)"),
     ({"baseline_m": 12}, "looks like centimetres; .* in millimetres, divide by 1000"),
     ({"baseline_m": 1e-9}, "baseline_m is 1e-09, less than two lenses can stand apart"),
     ({"depth_unit_m": 1e-9}, "depth_unit_m is 1e-09, finer than any sensor's"),

@@ -315,7 +315,7 @@ def _swapped(path: Path) -> None:
         (make_pairs, "lidar_depth/a.png", _no_truth, "empty", "holds no value"),
         (make_pairs, "lidar_depth/a.png", _small_truth, "mismatch", "is 24x12"),
         (make_pairs, "calib.txt", _empty, "unreadable", "neither 'focal_px"),
-        (make_middlebury, "Chair/calib.txt", _empty, "unreadable", "has no line cam0="),
+        (make_middlebury, "Chair/calib.txt", _empty, "unreadable", "no camera that is known"),
         (make_middlebury, "Chair/disp0GT.pfm", _truncate, "unreadable", "it is truncated"),
         (make_raw, "2011_09_26/calib_velo_to_cam.txt", Path.unlink, "missing", "nothing of the L"),
     ],

@@ -29,8 +29,8 @@ _MM_FX_SHARE = 0.1
 _MAX_FX_SHARE = 200
 _LEAST_UNIT_M = 1e-6
 """At a smaller one 16 bits of depth end before 7 cm."""
-_FILE_BASELINE_M = 10.0
-"""Millimetres of common rigs (50 to 120) pass as metres in a plane's rig, never in a file."""
+_FILE_BASELINE_M = 5.0
+"""Common rigs in millimetres or centimetres (50 to 120 mm) pass as a plane's, never in a file."""
 WIDE_BASELINE_M = 2.0
 """Wider than cars' rigs; centimetres, or squares of a board, in a file that names no unit."""
 MIN_BASELINE_M = 1e-3
