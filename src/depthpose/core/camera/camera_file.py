@@ -174,8 +174,9 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         return centred_camera(size, camera)
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
         return centred_camera(size, float(camera))
-    facts = _from_mapping(camera, size) if isinstance(camera, Mapping) else _from_matrix(camera)
-    return camera_from_facts(facts, size)
+    if isinstance(camera, Mapping):
+        return camera_from_facts(_from_mapping(camera, size), size)
+    return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
 def choose_lens(camera: AnyLens | None, focal_px: float | None) -> AnyLens | None:
@@ -219,10 +220,6 @@ def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
         ) from error
     check_intrinsics(matrix)
     return matrix
-
-
-def _from_matrix(K: object) -> CameraFacts:
-    return CameraFacts(kind="a matrix K", K=intrinsics_of(K))
 
 
 def _from_mapping(camera: Mapping[str, Any], size: Size) -> CameraFacts:

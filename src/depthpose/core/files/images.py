@@ -236,7 +236,8 @@ def list_images(path: AnyPath) -> list[Path]:
         found = list(wanted.iterdir()) if wanted.is_dir() else _glob(wanted)
     except (OSError, ValueError, NotImplementedError) as error:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
-    pictures = sorted((p for p in found if _is_listed(p)), key=natural_order)
+    shown = (p for p in found if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
+    pictures = sorted(shown, key=natural_order)
     if not pictures:
         raise InputError(
             f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; "
@@ -302,7 +303,3 @@ def _glob(pattern: Path) -> list[Path]:
     while len(parts) > 1 and (home / parts[0]).is_dir():  # brackets in its name are no pattern
         home /= parts.pop(0)
     return [p for p in home.glob("/".join(parts)) if p.is_file()]
-
-
-def _is_listed(path: Path) -> bool:
-    return path.suffix.lower() in LISTED_SUFFIXES and not path.name.startswith(".")
