@@ -106,6 +106,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         "looks like millimetres; divide by 1000 .--unit cm or mm",
     ),
     "centimetres": ({**GOOD, "T": [-6, 0, 0]}, "looks like centimetres; .*--unit cm or mm"),
+    "squeezed": ({**GOOD, "K1": [500, 0, 320, 0, 1000, 240, 0, 0, 1]}, "K has fx 500 and fy 1000"),
+    "other size": (
+        {**GOOD, "K2": [250, 0, 160, 0, 250, 120, 0, 0, 1]},
+        "fx is 500 on the left and 250 on the right, as of images of two sizes",
+    ),
     "scaled twice": ({**GOOD, "T": [-1e-4, 0, 0]}, "less than two lenses can stand apart"),
     "another model": ({**GOOD, "distortion_model": "fov"}, "model is 'fov'; known are radtan"),
     "transposed": (

@@ -75,7 +75,8 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
     found = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
     try:
         K, right = (
-            _bracketed(found[name]) for name in ("cam0", "cam1" if "cam1" in found else "cam0")
+            np.array(re.sub(r"[\[\];,]", " ", text).split(), np.float64).reshape(3, 3)
+            for text in (found["cam0"], found.get("cam1", found["cam0"]))
         )
         size = (
             _whole({"width": float(found["width"])}, "width"),
@@ -109,11 +110,6 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
         cx_right_minus_left_px=difference_px,
         is_metric=True,
     )
-
-
-def _bracketed(text: str) -> Matrix:
-    """Take the 3x3 matrix of ``[a b c; ...]``, commas or not."""
-    return np.array(re.sub(r"[\[\];,]", " ", text).split(), dtype=np.float64).reshape(3, 3)
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:

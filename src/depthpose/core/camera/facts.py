@@ -298,8 +298,23 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
     raise InputError(f"baseline_m is {length:g}, which looks like {unit} ({remedy})")
 
 
+def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
+    """Refuse a K whose two focal lengths are not those of one lens.
+
+    Raises:
+        InputError: that is so.
+    """
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
+        raise InputError(
+            f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
+            "longer than wide; multiply both by what its direction was scaled by. Where pixels "
+            "truly are so, scale the image, and K with it, until they are square"
+        )
+
+
 def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
-    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    fx = float(camera.K[0, 0])
     size = f"{camera.width}x{camera.height}"
     _refuse_normalised(camera.K, camera.width, camera.height)
     if fx < _MM_FX_SHARE * camera.width:
@@ -312,12 +327,7 @@ def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
             f"K has fx {fx:g} for {size} pixels, which sees less than 0.3 degrees; give it in "
             "pixels of this image"
         )
-    if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
-        raise InputError(
-            f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
-            "longer than wide; multiply both by what its direction was scaled by. Where pixels "
-            "truly are so, scale the image, and K with it, until they are square"
-        )
+    refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
         if is_metric:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from depthpose.core.camera.facts import WIDE_BASELINE_M, Size, refuse_baseline
+from depthpose.core.camera.facts import WIDE_BASELINE_M, Size, refuse_baseline, refuse_squeezed
 from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.camera.storage import Names, matrix, named, numbers, read_storage
 from depthpose.core.camera.stored_camera import is_ros, read_two_files, size_of
@@ -38,6 +38,7 @@ _MODELS = {
 """Models of distortion by name: whether it is that of a fisheye lens."""
 _COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
 _MAX_BASELINE_M = 10.0
+_MOST_UNLIKE = 1.5
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -243,6 +244,7 @@ def _camera(
         )
     intrinsics = torch.from_numpy(np.ascontiguousarray(K, np.float64))
     check_intrinsics(intrinsics)
+    refuse_squeezed(intrinsics)
     return RawCamera(K=intrinsics, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
@@ -251,6 +253,12 @@ def _pair(
 ) -> RawPair:
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
+    one, other = float(left.K[0, 0]), float(right.K[0, 0])
+    if not 1 / _MOST_UNLIKE < one / other < _MOST_UNLIKE:
+        raise InputError(
+            f"fx is {one:g} on the left and {other:g} on the right, as of images of two sizes; "
+            "scale one camera matrix and its images to those of the other"
+        )
     R, t_m = (torch.from_numpy(np.array(part, np.float64)) for part in motion)
     return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
 

@@ -157,7 +157,18 @@ def summarise(
         )
     return Evaluation(
         rows=_mean_rows(dataset.name, protocol, measured),
-        per_frame=[_frame_row(dataset.name, protocol, one) for one in measured],
+        per_frame=[
+            FrameRow(
+                protocol=protocol,
+                dataset=dataset.name,
+                frame=one.frame,
+                cap_m=one.cap_m,
+                pixels=one.pixels,
+                coverage=one.coverage,
+                metrics=one.metrics,
+            )
+            for one in measured
+        ],
         deciles=_decile_rows(dataset.name, protocol, measured),
         skipped=skipped,
     )
@@ -230,18 +241,6 @@ def _score(
     score = asdict(score_confidence(error, confidence[mask]))
     deciles = error_by_decile(error, confidence[mask])
     return replace(measured, metrics={**measured.metrics, **score}, deciles=deciles)
-
-
-def _frame_row(dataset: str, protocol: str, one: Measured) -> FrameRow:
-    return FrameRow(
-        protocol=protocol,
-        dataset=dataset,
-        frame=one.frame,
-        cap_m=one.cap_m,
-        pixels=one.pixels,
-        coverage=one.coverage,
-        metrics=one.metrics,
-    )
 
 
 def _mean_rows(dataset: str, protocol: str, measured: Sequence[Measured]) -> list[MeanRow]:
