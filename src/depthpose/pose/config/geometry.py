@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from depthpose.core.config_values import check_settings
-from depthpose.core.errors import InputError, refuse_seed, refuse_unknown
+from depthpose.core.errors import InputError, refuse_seed
 
 VotingMethod = Literal["least squares", "ransac"]
 InlierTest = Literal["angle", "distance"]
