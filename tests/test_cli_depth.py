@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from tests.core.test_camera_rectified import pair, texture
 from tests.depth.constant_selection import sure_of
 from tests.depth.small_training import TINY_MATCHER, write_tiny_weights
 from tests.pages.read_page import read_page
@@ -290,7 +291,58 @@ def test_sides_of_other_names_are_not_paired_by_order(
     (tmp_path / "rig.json").write_text(json.dumps({**CAMERA, "baseline_m": 0.2}))
     words = ["--camera", str(tmp_path / "rig.json"), "--out", str(tmp_path / "out")]
     assert main(["depth", "match", *sides, *words]) == 2
-    assert "'b' is on one side alone" in capsys.readouterr().err
+    assert "no partner of the same name or number is there for 'b', 'c'" in capsys.readouterr().err
+
+
+def write_doubtful_pairs(home: Path) -> list[str]:
+    """One good pair among others: swapped, one view twice, two scenes, nothing to match."""
+    left, right = pair()
+    bare = torch.linspace(0, 1, 480).expand(3, 240, 480)
+    pairs = {
+        "a": (left, right), "b": (right, left), "c": (left, 0.9 * left),
+        "d": (left, texture(240, 480, 1)), "e": (bare, 0.9 * bare),
+    }  # fmt: skip
+    for name, views in pairs.items():
+        for side, view in zip(("left", "right"), views, strict=True):
+            write_image(home / side / f"{name}.png", view)
+    rig = {"width": 480, "height": 240, "K": [[400, 0, 240], [0, 400, 120], [0, 0, 1]]}
+    (home / "camera.json").write_text(json.dumps({**rig, "baseline_m": 0.2}))
+    return [str(home / "left"), str(home / "right"), "--camera", str(home / "camera.json")]
+
+
+def test_every_pair_is_checked_named_and_the_others_are_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["depth", "match", *write_doubtful_pairs(tmp_path), "--matcher", "sgbm"]
+    assert main([*words, "--out", str(out)]) == 1
+    said = capsys.readouterr().err
+    wrong = {"b": "left and right look swapped", "c": "left and right show the same view",
+             "d": "the images do not belong together"}  # fmt: skip
+    for name, why in wrong.items():
+        assert f"failed: {name}: {why}" in said
+    doubt = "only 0 of the 25 matches needed: cannot tell whether the pair is rectified"
+    assert f"warning: e: {doubt}" in said
+    assert sorted(path.name[0] for path in out.glob("*.depth_m.npy")) == ["a", "e"]
+    assert (out / "e.warning.txt").read_text() == f"{doubt}\n"
+    page = " ".join(read_page(out / "report.html").texts["td"])
+    assert f"e: {doubt}" in page
+    assert all(why in page for why in wrong.values())
+    assert main([*words, "--no-check", "--out", str(out)]) == 0
+    assert len(list(out.glob("*.depth_m.npy"))) == 5
+
+
+def test_the_check_of_a_folder_names_every_wrong_pair(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_doubtful_pairs(tmp_path)
+    assert main(["data", "check", str(tmp_path)]) == 1
+    said = capsys.readouterr().out
+    for name, why in (("b", "left and right look swapped"), ("c", "left and right show the same"),
+                      ("d", "the images do not belong")):  # fmt: skip
+        assert f"mismatch: {tmp_path}/right/{name}.png: beside {name}.png: {why}" in said
+    assert f"note: {tmp_path}/right/e.png: beside e.png: only 0 of the 25 matches" in said
+    assert "right/a.png" not in said
 
 
 def test_another_right_image_needs_another_folder(

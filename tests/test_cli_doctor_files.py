@@ -63,7 +63,7 @@ def test_swapped_sides_are_odd(things: Path, capsys: pytest.CaptureFixture[str])
     assert "right.png and left.png as a pair\n  odd: left and right look swapped" in out
     code, out = said(capsys, things / "left.png", things / "left.png")
     assert code == 1
-    assert "odd: they are the same picture" in out
+    assert "odd: left and right are the same picture" in out
 
 
 def test_depth_mask_and_camera_fit(things: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,9 +15,13 @@ from tests.core.engine.doubles import InProcessEngine, unpacked
 from tests.depth.small_training import write_tiny_weights
 from tests.pose.synthetic_frames import draw_frame, frame_models, make_dataset, pose_in_frame
 from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
+from tests.test_cli_depth import write_doubtful_pairs
 from tests.test_cli_pose_predict import oracle_weights
 
 from depthpose.cli import engine, main
+from depthpose.cli.depth.engine import PAIRS
+from depthpose.core.engine import find_items
+from depthpose.core.errors import InputError
 from depthpose.core.files import (
     Cloud,
     write_cloud,
@@ -124,6 +128,33 @@ def test_what_fails_is_named_and_stops_no_other(
     assert f"failed: 3: {images / '3.png'}: not a readable picture" in said.err
     assert set(unpacked(tmp_path / "out")) == set("0124")
     assert "3,000000.tar," in (tmp_path / "out" / "manifest.csv").read_text()
+
+
+def test_workers_check_every_pair(
+    tmp_path: Path, double: InProcessEngine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["depth", "match", *write_doubtful_pairs(tmp_path), "--matcher", "sgbm", *RAY]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr()
+    assert "2 of 5 pairs are in 1 shards" in said.out
+    assert "failed: b: b: left and right look swapped" in said.err
+    assert "failed: d: d: the images do not belong together" in said.err
+    assert "warning: e: only 0 of the 25 matches needed: cannot tell" in said.err
+    found = unpacked(tmp_path / "out")
+    assert set(found) == {"a", "e"}
+    assert b"cannot tell whether the pair is rectified" in found["e"]["warning.txt"]
+
+
+def test_files_of_two_sides_are_paired_by_number(tmp_path: Path) -> None:
+    for name in ("left/left_2", "left/left_10", "right/right_10", "right/right_2", "odd/right_3"):
+        (tmp_path / f"{name}.png").parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.png").touch()
+    sides = [str(tmp_path / "left"), str(tmp_path / "right")]
+    found = [[Path(file).stem for file in item.files] for item in find_items(sides, PAIRS)]
+    assert found == [["left_2", "right_2"], ["left_10", "right_10"]]
+    (tmp_path / "odd/right_3.png").rename(tmp_path / "right/right_3.png")
+    with pytest.raises(InputError, match=r"hold 2 and 3 files, and no partner .* 'right_3'"):
+        find_items(sides, PAIRS)
 
 
 def test_other_settings_need_another_folder(

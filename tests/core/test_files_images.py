@@ -1,3 +1,4 @@
+import re
 import struct
 from contextlib import nullcontext
 from pathlib import Path
@@ -21,7 +22,7 @@ from depthpose.core.files import (
     write_disparity_png,
     write_image,
 )
-from depthpose.core.files.names import refuse_unpaired
+from depthpose.core.files.names import find_partners
 from depthpose.core.files.store import list_files
 
 
@@ -173,13 +174,6 @@ def test_listing_nothing_names_what_was_sought(tmp_path: Path, wanted: str) -> N
         list_images(tmp_path / wanted)
 
 
-def test_names_on_one_side_alone_are_refused_where_others_have_partners() -> None:
-    refuse_unpaired(["a_left", "b_left"], ["a_right", "b_right"], "sides of other names")
-    refuse_unpaired(["a", "b"], ["b", "a"], "equal names")
-    with pytest.raises(InputError, match=r"l and r: 'a' is on one side alone"):
-        refuse_unpaired(["a", "b", "c"], ["b", "c", "d"], "l and r")
-
-
 def levels() -> np.ndarray:
     """Each of 256 levels on 100 pixels, so that 0.1 % is less than a level."""
     return np.arange(256, dtype=np.uint16).repeat(100).reshape(160, 160)
@@ -233,3 +227,41 @@ def test_colours_of_16_bits_keep_their_lower_bytes(tmp_path: Path, suffix: str, 
         found = read_image(path)
     wanted = torch.from_numpy(pixels / (255 * times)).permute(2, 0, 1).float()
     assert torch.allclose(found, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "places"),
+    [
+        ("a b", "b a", [1, 0]),
+        ("a_left b_left", "a_right b_right", [0, 1]),
+        ("left_0000 left_0004", "right_0004 right_0000", [1, 0]),
+        ("1_L 2_L 10_L", "10_R 1_R 2_R", [1, 2, 0]),
+        ("cam0_8_rect cam0_9_rect", "cam1_9_rect cam1_8_rect", [1, 0]),
+        ("2024_L_1 2024_L_2 2025_L_1", "2025_R_1 2024_R_2 2024_R_1", [2, 1, 0]),
+        ("frame_08 frame_09", "cam1_frame_9 cam1_frame_8", [1, 0]),
+        ("kitchen_L hall_L", "hall_R kitchen_R", [1, 0]),
+        ("left", "right", [0]),
+        ("cam0_0007", "cam1_0007", [0]),
+    ],
+)
+def test_partners_share_a_name_or_a_number(first: str, second: str, places: list[int]) -> None:
+    assert find_partners(first.split(), second.split(), "two folders") == places
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "lone"),
+    [
+        ("a b c", "b c d", "'a', 'd'"),
+        ("left_0 left_2 left_4 left_6", "right_0 right_4 right_6 right_8", "'left_2', 'right_8'"),
+        ("1_L 2_L", "2_R 3_R", "'1_L', '3_R'"),
+        ("100 101", "200 201", "'100', '101', '200', '201'"),
+        ("frame2", "img3", "'frame2', 'img3'"),
+        ("l_1_1 l_1_2", "r_1_1 r_2_1", "'l_1_2', 'r_2_1'"),
+        ("f1 f2 f3", "g1 g2", "'f3'"),
+        ("f1 f01", "g1 g2", "'f1', 'f01', 'g1', 'g2'"),
+        ("dog cat", "hund katze", "'dog', 'cat', 'hund', 'katze'"),
+    ],
+)
+def test_files_without_a_partner_are_named(first: str, second: str, lone: str) -> None:
+    with pytest.raises(InputError, match=re.escape(f"number is there for {lone}; remove these")):
+        find_partners(first.split(), second.split(), "two folders")

@@ -10,7 +10,7 @@ from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.depth.stereo import CallableMatcher
-from depthpose.depth.types import DepthEstimate, StereoSample
+from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample
 
 
 @pytest.fixture(scope="module")
@@ -156,19 +156,55 @@ def test_far_points_of_a_rig_with_principal_points_apart_are_matched(columns: in
     assert float(found.depth_m.nanmedian()) == pytest.approx(300 * 0.2 / 6, rel=0.02)
 
 
-@pytest.mark.parametrize(("matched_px", "widths"), [(8.0, [240]), (1.0, [240, 260])])
-def test_views_are_widened_where_the_scene_reaches_so_far(
-    matched_px: float, widths: list[int]
+@pytest.mark.parametrize(("columns", "width"), [(20, 260), (200, 440), (-100, 240)])
+def test_views_are_moved_by_the_difference_of_their_principal_points(
+    columns: int, width: int
 ) -> None:
-    seen: list[int] = []
-
-    def match(left: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
-        seen.append(left.shape[-1])
-        return left.mean(0) * 0 + matched_px + (left.shape[-1] - 240)
-
+    """Whatever the size and the sign: the matcher is shown a rig whose principal points agree."""
     image = torch.rand(3, 120, 240)
+
+    def match(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        assert left.shape == right.shape == (3, 120, width)
+        moved = max(columns, 0)
+        assert torch.equal(left[..., moved:], image)
+        kept = image[..., :columns] if columns < 0 else image
+        assert torch.equal(right[..., max(-columns, 0) : max(-columns, 0) + kept.shape[2]], kept)
+        return left.mean(0) * 0 + 6
+
     net = FakestereoNet(CallableMatcher(match))
-    found = net.estimate(image, apart_rig(20), right=image, with_check=False)
-    assert seen == widths
+    found = net.estimate(image, apart_rig(columns), right=image, with_check=False)
     assert found.disparity_px.shape == (120, 240)
-    assert float(found.disparity_px.median()) == pytest.approx(matched_px)
+    assert float(found.disparity_px.median()) == pytest.approx(6 - columns)
+    assert found.depth_m is not None
+    assert float(found.depth_m.median()) == pytest.approx(300 * 0.2 / 6)
+
+
+@pytest.mark.parametrize("columns", [240, -240, 5000])
+def test_principal_points_farther_apart_than_the_images_are_refused(columns: int) -> None:
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)))
+    image = torch.rand(3, 120, 240)
+    said = rf"cx_right_minus_left_px is {columns}, and the images are 240 px wide: the two views"
+    with pytest.raises(InputError, match=said):
+        net.estimate(image, apart_rig(columns), right=image, with_check=False)
+
+
+@pytest.mark.parametrize("how", ["estimate", "estimate_pair", "estimate_many"])
+def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> None:
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3))
+
+    def estimate(left: torch.Tensor, right: torch.Tensor, *, with_check: bool) -> DepthEstimate:
+        pair = StereoInput(name="street", left=left, right=right, camera=None)
+        if how == "estimate":
+            return net.estimate(left, right=right, name="street", with_check=with_check)
+        if how == "estimate_pair":
+            return net.estimate_pair(pair, with_check=with_check)
+        return net.estimate_many([pair], with_check=with_check)[0]
+
+    left, right = torch.rand(2, 3, 80, 120, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(InputError, match=r"street: the images do not belong together: 0 of \d+"):
+        estimate(left, right, with_check=True)
+    assert estimate(left, right, with_check=False).warning == ""
+    bare = torch.linspace(0, 1, 120).expand(3, 80, 120)
+    found = estimate(bare, bare.roll(2, 1) * 0.9, with_check=True)
+    assert found.warning.startswith("only 0 of the 25 matches needed: cannot tell whether the pair")
+    assert f"warning: {found.warning}" in repr(found)

@@ -16,7 +16,6 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import resized_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.estimator.far import is_cut_off, join_far
 from depthpose.depth.estimator.rig import from_pair, join_matches
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
@@ -170,7 +169,7 @@ def test_an_estimate_has_no_depth_in_the_sky(apart_px: float) -> None:
     assert found.depth_m is not None
     assert torch.equal(found.depth_m.isnan(), found.is_sky)
     assert torch.equal(found.is_sky, torch.arange(20)[:, None].expand(20, 30) < 10)
-    expected_px = torch.where(found.is_sky, 100 * 0.5 / 10_000 - apart_px, 4.0)
+    expected_px = torch.where(found.is_sky, 100 * 0.5 / 10_000, 4.0) - apart_px
     torch.testing.assert_close(found.disparity_px, expected_px)
     assert "sky 50%" in repr(found)
     assert len(found.cloud().points) == 300
@@ -196,21 +195,6 @@ def test_without_a_rig_the_disparity_of_the_sky_is_next_to_nothing() -> None:
     found = FakestereoNet(UpperHalf()).estimate(image, right=image, with_check=False)
     assert found.is_sky is not None
     assert float(found.disparity_px[found.is_sky].max()) == pytest.approx(0.01)
-
-
-def test_the_sky_is_not_what_a_rig_cuts_off() -> None:
-    left = torch.rand(3, 20, 30)
-    found = UpperHalf().match(left, left)
-    assert not is_cut_off(found)
-    far_px = torch.where(torch.arange(30) < 2, 1.0, found.disparity_px)
-    assert is_cut_off(replace(found, disparity_px=far_px))
-    assert found.is_sky is not None
-    in_sky = replace(found, disparity_px=torch.where(found.is_sky, 1.0, 4.0))
-    assert not is_cut_off(in_sky)
-    assert is_cut_off(replace(in_sky, is_sky=None))
-    joined = join_far(found, UpperHalf().match(torch.rand(3, 20, 35), left), 5)
-    assert joined.is_sky is not None
-    assert joined.is_sky.shape == (20, 30)
 
 
 def test_the_generator_is_believed_where_the_matcher_sees_the_sky() -> None:

@@ -3,6 +3,7 @@
 What is around the networks in ``nodes.py`` runs on a test double of rclpy (``rclpy_double``).
 """
 
+import dataclasses
 import importlib
 import time
 from pathlib import Path
@@ -99,6 +100,20 @@ def test_recorded_pairs_give_the_depth_of_the_estimator(
     expected = net.estimate(left, rig_of_street(street), right=right).depth_m
     assert expected is not None
     assert np.allclose(depth_of(made), expected.numpy(), rtol=1e-4, equal_nan=True)
+
+
+def test_of_a_pair_that_shows_too_little_a_warning_is_given(recorded: dict[str, Any]) -> None:
+    said: list[str] = []
+    image = recorded["/left/image_rect"]
+    row = np.linspace(0, 255, image.width).repeat(3)
+    bare = [
+        dataclasses.replace(image, data=np.tile(share * row, image.height).astype(np.uint8))
+        for share in (1.0, 0.9)
+    ]
+    infos = [recorded[f"/{side}/camera_info"] for side in ("left", "right")]
+    DepthFromPair(FakestereoNet.load(matcher="sgbm"), warn=said.append)(*bare, *infos)
+    assert len(said) == 1
+    assert "cannot tell whether the pair is rectified" in said[0]
 
 
 def test_recorded_images_give_the_depth_of_the_estimator(

@@ -30,6 +30,10 @@ class WorkNode(Node):
             self.declare_parameter(key, value)
         self._latest: Latest | None = None
 
+    def warn(self, said: str) -> None:
+        """Log a warning, at most one in five seconds."""
+        self.get_logger().warning(said, throttle_duration_sec=5.0)
+
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Give a parameter."""
         return self.get_parameter(name).value
@@ -41,7 +45,7 @@ class WorkNode(Node):
             try:
                 work(*given)
             except InputError as error:
-                self.get_logger().warning(str(error), throttle_duration_sec=5.0)
+                self.warn(str(error))
 
         self._latest = Latest(guarded)
         heard = [
@@ -71,7 +75,7 @@ class DepthImageNode(WorkNode):
             config=MatcherConfig(device=self.value("device"), speed=self.value("speed")),
             allow_ood=self.value("allow_ood"),
         )
-        work = DepthFromImage(net, self.value("encoding"))
+        work = DepthFromImage(net, self.value("encoding"), self.warn)
         depth = self.create_publisher(Image, "~/depth", NEWEST)
         topics = {"image_rect": Image, "camera_info": CameraInfo}
         self.work_on(topics, 0.0, lambda *given: depth.publish(image_message(work(*given))))
@@ -92,7 +96,7 @@ class DepthPairNode(WorkNode):
             if weights == "sgbm"
             else FakestereoNet.load(weights, config=config)
         )
-        work = DepthFromPair(net, self.value("encoding"))
+        work = DepthFromPair(net, self.value("encoding"), self.warn)
         depth = self.create_publisher(Image, "~/depth", NEWEST)
         sides = ("left", "right")
         topics = {f"{side}/image_rect": Image for side in sides}

@@ -24,10 +24,11 @@ from depthpose_ros.messages import (
 
 @dataclass
 class DepthFromImage:
-    """One rectified image and its camera to a depth image."""
+    """One rectified image and its camera to a depth image; ``warn`` is told of doubts."""
 
     net: FakestereoNet
     encoding: str = "32FC1"
+    warn: Callable[[str], None] = print
 
     def __call__(self, image: Any, info: Any) -> Image:  # noqa: ANN401
         """Estimate; stamp and frame are the image's.
@@ -36,25 +37,30 @@ class DepthFromImage:
             InputError: what the messages lack, or an image unlike those that the weights know.
         """
         found = self.net.estimate(picture_of(image), camera_of(info))
+        if found.warning:
+            self.warn(found.warning)
         assert found.depth_m is not None, "one image has a camera, and so metres"
         return image_from_depth(copied_header(image), found.depth_m, self.encoding)
 
 
 @dataclass
 class DepthFromPair:
-    """A rectified pair and both cameras to a depth image of the left view."""
+    """A rectified pair and both cameras to a depth image of the left view, as above."""
 
     net: FakestereoNet
     encoding: str = "32FC1"
+    warn: Callable[[str], None] = print
 
     def __call__(self, left: Any, right: Any, left_info: Any, right_info: Any) -> Image:  # noqa: ANN401
         """Match; stamp and frame are the left image's.
 
         Raises:
-            InputError: what the messages lack, or a pair that is swapped or not rectified.
+            InputError: what the messages lack, or a pair that is none, swapped or not rectified.
         """
         rig = rig_of(left_info, right_info)
         found = self.net.estimate(picture_of(left), rig, right=picture_of(right))
+        if found.warning:
+            self.warn(found.warning)
         assert found.depth_m is not None, "a rig gives metres"
         return image_from_depth(copied_header(left), found.depth_m, self.encoding)
 

@@ -290,8 +290,8 @@ def _look_at_pair(seen: Sequence[Seen]) -> tuple[str, bool] | None:
     assert left is not None
     assert right is not None
     names = f"{pictures[0].path.name} and {pictures[1].path.name} as a pair"
-    if torch.equal(left, right):
-        return f"{names}\n  odd: they are the same picture", True
     report = check_rectified(left, right)
-    is_odd = bool(report.is_swapped) or report.is_rectified is False
-    return f"{names}{chr(10) + '  odd' if is_odd else ''}: {report.message}", is_odd
+    return (
+        f"{names}{chr(10) + '  odd' if report.is_wrong else ''}: {report.message}",
+        report.is_wrong,
+    )

@@ -18,7 +18,7 @@ from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import left_right_difference_px
-from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
 from depthpose.depth.types import DepthEstimate, StereoInput
 
 
@@ -92,6 +92,7 @@ def label_pairs(
             continue
         try:
             pair = dataset.read_input(number)
+            refuse_unrectified(pair)
             known_px = label_pair(net, pair, config)
         except InputError as error:
             _take(error, failures)
@@ -126,7 +127,7 @@ def match_both_ways(
     """Match a pair from the left view, and give the disparity of the right view [px] too."""
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    one, other = net.estimate_pair(pair), net.estimate_pair(mirrored)
+    one, other = (net.estimate_pair(views, with_check=False) for views in (pair, mirrored))
     return one, other.disparity_px.flip(-1)
 
 

@@ -89,7 +89,7 @@ class DepthEstimate:
         image_confidence: mean confidence of the generator over the image, 0..1: low for images out
             of distribution. None for pairs, and where the generator has no confidence.
         warning: why the whole estimate is doubtful, such as an image unlike those that the
-            weights know; else empty.
+            weights know, or a pair of which it cannot be told whether it is rectified; else empty.
         seen: what it was estimated from, for its colours and camera; None where files hold the
             estimate alone.
     """
@@ -139,6 +139,8 @@ class DepthEstimate:
             said.append(f"mean confidence {float(self.confidence.nanmean()):.2f}")
         if self.is_sky is not None:
             said.append(f"sky {float(self.is_sky.float().mean()):.0%}")
+        if self.warning:
+            said.append(f"warning: {self.warning}")
         return f"DepthEstimate({', '.join(said)})"
 
 

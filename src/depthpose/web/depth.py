@@ -38,7 +38,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "'depthpose serve' with --weights that have a matcher"
         )
     _refuse_work(pair, net)
-    found = net.estimate_pair(pair, with_check=True)
+    found = net.estimate_pair(pair)
     seconds = time.perf_counter() - began
     assert found.depth_m is not None
     folder = form.results()
@@ -186,12 +186,12 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     given = "one image" if pair.right is None else "both images"
     is_sky = found.is_sky
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
+    warning = f"Careful: {found.warning}. " if found.warning else ""
     if len(known_m) == 0:
         why = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
         if pair.right is not None and sky < _ALL_SKY:
             why = ": is the pair rectified, and are left and right as they should be?"
-        return f"No pixel got a depth from {given}{why}"
-    warning = f"Careful: {found.warning}. " if found.warning else ""
+        return f"{warning}No pixel got a depth from {given}{why}"
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
     return (
         f"{warning}Depth from {given} for {share:.0%} of the pixels; half of these are nearer than "

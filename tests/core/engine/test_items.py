@@ -30,7 +30,7 @@ def test_pairs_go_together_in_the_order_of_their_names(tmp_path: Path) -> None:
     items = find_items([str(left), str(right)], TWO)
     assert [tuple(Path(f).parent.name for f in item.files) for item in items] == [("l", "r")] * 2
     (right / "2.txt").unlink()
-    with pytest.raises(InputError, match=r"holds 2, .* holds 1: each input needs one file of each"):
+    with pytest.raises(InputError, match=r"hold 2 and 1 files, and no partner .* is there for '2'"):
         find_items([str(left), str(right)], TWO)
     with pytest.raises(InputError, match="an input has left and right"):
         find_items([str(left)], TWO)

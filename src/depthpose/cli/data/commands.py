@@ -90,7 +90,8 @@ def check(
         path: the dataset's folder.
         split: only these frames: eigen-train, -val, -train-val, -test, -benchmark, or a file of
             monodepth's or monodepth2's form; of a BOP dataset, one of its splits.
-        with_decoding: decode every image in full, which finds truncation; off reads headers only.
+        with_decoding: decode every image in full, which finds truncation, and pairs that are
+            swapped, not rectified or no pair; off reads headers only.
     """
     from tqdm import tqdm
 

@@ -66,7 +66,8 @@ def rectify(
 
     Args:
         left: raw left image, a folder of them, or a quoted pattern such as 'left/*.png'.
-        right: raw right image, folder or pattern; images are paired by their names, else in order.
+        right: raw right image, folder or pattern; images are paired by their names, or the numbers
+            in them.
         camera: calibration of both cameras: a camchain of Kalibr, a file of OpenCV's K1, D1, K2,
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.

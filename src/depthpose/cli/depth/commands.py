@@ -126,7 +126,8 @@ def match(
     Args:
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
             ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
-        right: right image, folder or pattern; images are paired in the order of their names.
+        right: right image, folder or pattern; images are paired by their names, or the numbers in
+            them.
         camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
             Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
@@ -148,15 +149,15 @@ def match(
         raise InputError(f"{left}: there is no right image beside it; give it second")
     found = pairs_of.Pairs.find(left, right, camera)
     refuse_among_inputs(Path(out), (left, right), (*found.left, *found.right))
-    if pairs.check:
-        pairs_of.refuse_unusable_first(found)
     if weights is None:
         method = methods.sgbm_method(with_filled_holes=False)
     else:
         method = methods.weights_method(weights, config, with_right=True)
     if matching.tile is not None:
         pairs_of.say_tile_change(found, method)
-    return pairs_of.match_all(found, method, Path(out), with_cloud=pairs.cloud)
+    return pairs_of.match_all(
+        found, method, Path(out), with_cloud=pairs.cloud, with_check=pairs.check
+    )
 
 
 def _match_on_ray(

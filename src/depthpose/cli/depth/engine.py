@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli.depth.evaluating import signed
-from depthpose.cli.depth.matching import refuse_unrectified_pair, rig_facts
+from depthpose.cli.depth.matching import rig_facts, say_doubt
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
 from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
@@ -108,13 +108,14 @@ class MatchWork:
     spec: NetSpec
     rig: StereoRig
     with_cloud: bool
+    with_check: bool
     files: Files = PAIRS
     endings: Sequence[str] = ENDINGS
     batch: int = 1
 
     def start(self) -> Function:
         """Build the matcher."""
-        return partial(_match, self.spec.build(), self.rig, self.with_cloud)
+        return partial(_match, self.spec.build(), self)
 
 
 def predict(
@@ -151,11 +152,9 @@ def match(
 ) -> int:
     """Match by an engine; ``words`` are the left and right sides, manifests or tar shards."""
     inputs = Inputs.find(words, PAIRS)
-    with inputs.first() as (left, right):
+    with inputs.first() as (left, _):
         rig = read_rig(camera, image_size(left))
-        if with_check:
-            refuse_unrectified_pair(_read_pair("the first pair", left, right, rig))
-    work = MatchWork(spec=spec, rig=rig, with_cloud=with_cloud)
+    work = MatchWork(spec=spec, rig=rig, with_cloud=with_cloud, with_check=with_check)
     settings = {**spec.settings(), "camera": rig_facts(rig)}
     return say(run(work, inputs, out, settings, options), out, "pairs")
 
@@ -168,24 +167,20 @@ def _predict(
     return [str(predictor.failures.get(sample.name, "")) for sample in samples]
 
 
-def _match(
-    method: Method, rig: StereoRig, with_cloud: bool, samples: Sequence[Sample], out: Path
-) -> list[str]:
+def _match(method: Method, work: MatchWork, samples: Sequence[Sample], out: Path) -> list[str]:
+    assert isinstance(method.net, FakestereoNet)
     reasons: list[str] = []
     for sample in samples:
         try:
-            left, right = sample.files
-            pair = _read_pair(sample.name, left, right, rig)
-            cloud_m = CLOUD_M if with_cloud else None
-            write_estimate(out, pair, method.net.estimate_pair(pair), cloud_m=cloud_m)
+            left, right = (read_image(file) for file in sample.files)
+            pair = StereoInput(name=sample.name, left=left, right=right, camera=work.rig)
+            found = method.net.estimate_pair(pair, with_check=work.with_check)
+            say_doubt(pair, found)
+            write_estimate(out, pair, found, cloud_m=CLOUD_M if work.with_cloud else None)
             reasons.append("")
         except InputError as error:
             reasons.append(str(error))
     return reasons
-
-
-def _read_pair(name: str, left: Path, right: Path, rig: StereoRig) -> StereoInput:
-    return StereoInput(name=name, left=read_image(left), right=read_image(right), camera=rig)
 
 
 ENDING = "measured.json"

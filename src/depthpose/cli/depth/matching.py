@@ -13,13 +13,13 @@ from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
-from depthpose.core.files.names import refuse_unpaired
+from depthpose.core.files.names import find_partners
 from depthpose.core.results import note_result
 from depthpose.core.run import claim_folder, claim_names, find_rank
-from depthpose.depth.estimator import FakestereoNet, refuse_unrectified, usable_right
+from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.predictions import CLOUD_M, ENDINGS, is_finished, write_estimate
 from depthpose.depth.stereo import NetworkMatcher, tile_change_px
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import DepthEstimate, StereoInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,39 +47,19 @@ class Pairs:
 
 
 def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
-    """List the images of both sides, which are paired by their names, else in order.
+    """List the images of both sides, paired by their names or the numbers in them.
 
     Raises:
-        InputError: a side has none, the sides cannot be paired, or two results had one name.
+        InputError: a side has none, one has no partner, or two results had one name.
     """
     lefts, rights = list_images(left), list_images(right)
-    if len(lefts) != len(rights):
-        raise InputError(
-            f"{left} holds {len(lefts)} images and {right} holds {len(rights)}; a left image "
-            "needs one right image. Remove the ones without a partner."
-        )
-    stems, partners = ([path.stem for path in side] for side in (lefts, rights))
-    refuse_unpaired(stems, partners, f"{left} and {right}")
+    stems, others = ([path.stem for path in side] for side in (lefts, rights))
     if len(set(stems)) != len(stems):
         twice = next(stem for stem in stems if stems.count(stem) > 1)
         raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
-    if set(stems) == set(partners):
-        rights = [rights[partners.index(stem)] for stem in stems]
-    return lefts, rights
-
-
-def refuse_unusable_first(pairs: Pairs) -> None:
-    """Check the first pair before any work: swapped, unrectified or of the wrong size."""
-    refuse_unrectified_pair(pairs.read(0))
-
-
-def refuse_unrectified_pair(pair: StereoInput) -> None:
-    """Refuse a pair that is swapped or not rectified, and name the option that takes it."""
-    usable_right(pair)
-    try:
-        refuse_unrectified(pair)
-    except InputError as error:
-        raise InputError(f"{error} (--no-check matches them all the same.)") from error
+    if (lefts, rights) == ([Path(left)], [Path(right)]):
+        return lefts, rights
+    return lefts, [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
 
 
 def say_tile_change(pairs: Pairs, method: Method) -> None:
@@ -99,8 +79,11 @@ def rig_facts(rig: StereoRig) -> dict[str, object]:
     return facts | {"cx_right_minus_left_px": rig.cx_right_minus_left_px}
 
 
-def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> int:
+def match_all(
+    pairs: Pairs, method: Method, out: Path, *, with_cloud: bool, with_check: bool
+) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
+    assert isinstance(method.net, FakestereoNet)
     claim_folder(out, {**method.settings, "camera": rig_facts(pairs.rig)}, [PAGE])
     both = {left.stem: (left, right) for left, right in zip(pairs.left, pairs.right, strict=True)}
     claim_names(out, both, [f".{end}" for end in ENDINGS])
@@ -112,12 +95,13 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
             continue
         try:
             pair = pairs.read(index)
-            estimate = method.net.estimate_pair(pair)
+            estimate = method.net.estimate_pair(pair, with_check=with_check)
         except InputError as error:
             if len(pairs.left) == 1:
                 raise
             failures.append(str(error))
             continue
+        say_doubt(pair, estimate)
         cloud_m = CLOUD_M if with_cloud else None
         note_result(out, name, write_estimate(out, pair, estimate, cloud_m=cloud_m))
     for failure in failures:
@@ -126,6 +110,12 @@ def match_all(pairs: Pairs, method: Method, out: Path, *, with_cloud: bool) -> i
     if find_rank().rank == 0:
         _write_page(pairs, out, failures)
     return 1 if failures else 0
+
+
+def say_doubt(pair: StereoInput, estimate: DepthEstimate) -> None:
+    """Print the warning of an estimate."""
+    if estimate.warning:
+        tqdm.write(f"depthpose: warning: {pair.name}: {estimate.warning}", sys.stderr)
 
 
 def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:

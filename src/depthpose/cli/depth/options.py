@@ -79,7 +79,7 @@ class MatchOptions(MatcherOptions):
 
 @group
 class PairNetworks:
-    """What matches real pairs, whether the first is checked, and what is written."""
+    """What matches real pairs, whether they are checked, and what is written."""
 
     weights: str | None = None
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
@@ -89,7 +89,8 @@ class PairNetworks:
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     check: bool = True
-    """look at the first pair for swapped or unrectified images before any work."""
+    """refuse pairs that are swapped, not rectified or no pair, and warn where this cannot be
+    told."""
 
     @property
     def used(self) -> str | None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from depthpose.core.files.text import read_text
 from depthpose.core.run import environment
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.evaluate import PROTOCOLS, FrameRow, frame_result, ranking_metric
@@ -24,7 +25,7 @@ def write_depth_page(
     failures: Sequence[str],
     range_m: tuple[float, float] = COLOR_RANGE_M,
 ) -> None:
-    """Write a page of some of the depth maps that a folder holds, and of what failed.
+    """Write a page of some of the depth maps that a folder holds, of warnings and of what failed.
 
     Args:
         out: the folder.
@@ -37,8 +38,14 @@ def write_depth_page(
     pairs = list(read(chosen))
     which = "all" if len(pairs) == len(names) else "spread evenly"
     text = f"Shown: {len(pairs)} of {_count(len(names), 'depth map')} in this folder ({which})."
-    failed = [{"not estimated, because": reason} for reason in failures]
-    sections = [Section(title="What is here", text=text, rows=failed)]
+    noted = [{"not estimated, because": reason} for reason in failures]
+    doubts = {name: out / f"{name}.warning.txt" for name in names}
+    noted += [
+        {"warning": f"{name}: {read_text(path).strip()}"}
+        for name, path in doubts.items()
+        if path.is_file()
+    ]
+    sections = [Section(title="What is here", text=text, rows=noted)]
     for pair in pairs:
         estimate = read_estimate(out, pair.name, pair.camera)
         shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)

@@ -1,12 +1,10 @@
-"""Check from the images alone that a pair is rectified, and left and right not swapped.
+"""Check from the images alone that two images are a rectified pair, and left and right in order.
 
-Corners of the left image are sought in the right one over a window that a rectified pair does not
-need: rows above and below, columns on both sides. Where they are found shows what was done to the
-pair.
-
-Corners of one image are found in the other by zero-mean normalised cross-correlation, computed by
-FFT (Lewis 1995), of corners chosen by the smaller eigenvalue of the structure tensor (Shi and
-Tomasi 1994). A match is kept where it is good, has no rival and is mutual.
+Corners of one image are sought in the whole of the other, on a reduced copy, by zero-mean
+normalised cross-correlation (Lewis 1995); corners are chosen by the smaller eigenvalue of the
+structure tensor (Shi and Tomasi 1994). A match is kept where it is good, has no rival and is
+mutual; then it is placed to a fraction of a pixel on a larger copy. Where the matches lie shows
+what was done to the pair.
 """
 
 import math
@@ -20,135 +18,38 @@ from torch.nn import functional
 from depthpose.core.arrays import grey_of
 from depthpose.core.errors import InputError
 
-REACH_X, REACH_Y = 192, 6
-_RADIUS = 7  # of a patch: 15x15 pixels
-_SIDE = 2 * _RADIUS + 1
-_CELL = 24  # one corner a cell spreads the corners over the image
-_MAX_CORNERS = 320
+_COARSE_PIXELS, _FINE_PIXELS = 36_000, 180_000
+_RADIUS, _FINE_RADIUS = 5, 7  # of a patch: 11x11 pixels of the coarse copy, 15x15 of the fine one
+_REACH = 4  # of the fine search around a coarse match
+_CELL = 8  # one corner a cell spreads the corners over the image
+_MAX_CORNERS = 200
 _MIN_CORNER = 1e-5  # smaller eigenvalue, for grey in [0, 1]: below is noise
-_MIN_CONTRAST = 0.01 * _SIDE  # norm of a patch less its mean: a standard deviation of 0.01
+_MIN_CONTRAST, _MIN_DEVIATION = 0.01, 0.004  # of grey in a patch, and in an image
 _MIN_SCORE = 0.8
 _MAX_RIVAL = 0.95  # of the best score: a rival so near means a repeated pattern
-_RIVAL_RADIUS = 5
+_RIVAL_RADIUS = 4
 _RETURN_PX = 1
 
-
-def match_corners(
-    left: Float[Tensor, "h w"], right: Float[Tensor, "h w"]
-) -> Float[Tensor, "matches 2"]:
-    """Find corners of the left grey image in the right one.
-
-    Returns:
-        Shifts (x, y), right less left [px], of the matches that can be trusted.
-    """
-    if min(left.shape) < 2 * _CELL:
-        return left.new_empty(0, 2)
-    corners = _find_corners(left)
-    if len(corners) == 0:
-        return left.new_empty(0, 2)
-    shift, is_good = _search(left, right, corners)
-    corners, shift = corners[is_good], shift[is_good]
-    if len(corners) == 0:
-        return left.new_empty(0, 2)
-    back, is_good = _search(right, left, corners + shift.round().long())
-    is_mutual = ((back + shift).abs() <= _RETURN_PX).all(-1) & is_good
-    return shift[is_mutual]
-
-
-def _find_corners(grey: Float[Tensor, "h w"]) -> Int[Tensor, "n 2"]:
-    padded = functional.pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    dx, dy = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2, (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-    products = torch.stack([dx * dx, dx * dy, dy * dy])[None]
-    xx, xy, yy = functional.avg_pool2d(products, 7, stride=1, padding=3)[0]
-    smaller = (xx + yy) / 2 - ((xx - yy).square() / 4 + xy.square()).sqrt()
-    inside = torch.zeros_like(smaller)
-    inside[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = smaller[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-    best, index = functional.max_pool2d(inside[None, None], _CELL, return_indices=True)
-    strongest = best.flatten().topk(min(_MAX_CORNERS, best.numel()))
-    places = index.flatten()[strongest.indices[strongest.values > _MIN_CORNER]]
-    return torch.stack([places % grey.shape[1], places // grey.shape[1]], -1)
-
-
-def _search(
-    source: Float[Tensor, "h w"], target: Float[Tensor, "h w"], corners: Int[Tensor, "n 2"]
-) -> tuple[Float[Tensor, "n 2"], Bool[Tensor, " n"]]:
-    """Find the best shift of each corner, to a fraction of a pixel, and whether to trust it."""
-    scores = _scores(source, target, corners)
-    columns = scores.shape[-1]
-    best, index = scores.flatten(1).max(1)
-    row, column = index // columns, index % columns
-    is_inside = (row > 0) & (row < 2 * REACH_Y) & (column > 0) & (column < 2 * REACH_X)
-    rival = _rival(scores, row, column)
-    is_good = is_inside & (best > _MIN_SCORE) & (rival < _MAX_RIVAL * best)
-    # A best score at the rim is not trusted, so there any neighbour will do.
-    row, column = row.clamp(1, 2 * REACH_Y - 1), column.clamp(1, 2 * REACH_X - 1)
-    n = torch.arange(len(corners), device=scores.device)
-    x = column + _peak(*(scores[n, row, column + i] for i in (-1, 0, 1)))
-    y = row + _peak(*(scores[n, row + i, column] for i in (-1, 0, 1)))
-    return torch.stack([x - REACH_X, y - REACH_Y], -1), is_good
-
-
-def _scores(
-    source: Float[Tensor, "h w"], target: Float[Tensor, "h w"], corners: Int[Tensor, "n 2"]
-) -> Float[Tensor, "n rows columns"]:
-    """Correlate each corner's patch with the target at every shift of the window, in [-1, 1]."""
-    rim_x, rim_y = REACH_X + _RADIUS, REACH_Y + _RADIUS
-    rows, columns = 2 * REACH_Y + 1, 2 * REACH_X + 1
-    patches = _windows(functional.pad(source, (_RADIUS,) * 4), corners, _SIDE, _SIDE)
-    patches = patches - patches.mean((1, 2), keepdim=True)
-    padded = functional.pad(target, (rim_x, rim_x, rim_y, rim_y))
-    strips = _windows(padded, corners, rows + 2 * _RADIUS, columns + 2 * _RADIUS)
-    spectrum = torch.fft.rfft2(strips) * torch.fft.rfft2(patches, s=strips.shape[1:]).conj()
-    products = torch.fft.irfft2(spectrum, s=strips.shape[1:])[:, :rows, :columns]
-    contrast = _windows(_contrast(padded), corners, rows, columns)
-    is_image = functional.pad(torch.ones_like(target), (rim_x, rim_x, rim_y, rim_y))
-    is_whole = _windows(_box_mean(is_image) > 0.999, corners, rows, columns)
-    norm = contrast * patches.norm(dim=(1, 2))[:, None, None]
-    is_usable = is_whole & (contrast > _MIN_CONTRAST)
-    return torch.where(is_usable, products / norm.clamp_min(1e-6), -1)
-
-
-def _windows(image: Tensor, corners: Int[Tensor, "n 2"], height: int, width: int) -> Tensor:
-    """Cut ``height`` x ``width`` windows whose first pixels are the corners' (x, y)."""
-    rows = corners[:, 1, None] + torch.arange(height, device=image.device)
-    columns = corners[:, 0, None] + torch.arange(width, device=image.device)
-    return image[rows[:, :, None], columns[:, None, :]]
-
-
-def _contrast(image: Float[Tensor, "h w"]) -> Float[Tensor, "h2 w2"]:
-    variance = _box_mean(image.square()) - _box_mean(image).square()
-    return variance.clamp_min(0).sqrt() * _SIDE
-
-
-def _box_mean(image: Float[Tensor, "h w"]) -> Float[Tensor, "h2 w2"]:
-    return functional.avg_pool2d(image[None, None], _SIDE, stride=1)[0, 0]
-
-
-def _rival(
-    scores: Float[Tensor, "n rows columns"], row: Int[Tensor, " n"], column: Int[Tensor, " n"]
-) -> Float[Tensor, " n"]:
-    rows = torch.arange(scores.shape[1], device=scores.device)
-    columns = torch.arange(scores.shape[2], device=scores.device)
-    is_near_row = (rows - row[:, None]).abs() <= _RIVAL_RADIUS
-    is_near_column = (columns - column[:, None]).abs() <= _RIVAL_RADIUS
-    is_near = is_near_row[:, :, None] & is_near_column[:, None, :]
-    return scores.masked_fill(is_near, -1).flatten(1).amax(1)
-
-
-def _peak(
-    before: Float[Tensor, " n"], at: Float[Tensor, " n"], after: Float[Tensor, " n"]
-) -> Float[Tensor, " n"]:
-    """Place the top of the parabola through three scores, within half a pixel of the middle."""
-    curvature = (2 * at - before - after).clamp_min(1e-6)
-    return ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
-
-
-_WORK_WIDTH = 1280
 _MIN_MATCHES = 25
+_MIN_WRONG = 12  # so few show that rows differ, but not that they agree
+_MIN_TEXTURED, _MIN_FOUND = 60, 0.1  # of so many corners a pair has this share in common
+_MAX_ALIKE = 0.7  # of them look like some place of another scene; more is a repeated pattern
 _MAX_OFFSET_PX = 1.0  # street pairs have up to 0.3
 _MAX_SPREAD_PX = 0.75  # street pairs have 0.1 to 0.4; a turn by 0.3 degrees makes 1.2 to 2.5
+_LIMITS_WIDTH = 1280  # of wider images the limits grow with the width
 _MAX_SHARE_SWAPPED = 0.2
+_SAME_PX, _SAME_SHARE = 0.5, 0.9
 _MAD_TO_DEVIATION = 1.4826  # of a normal distribution
+_SOME_CORNERS, _MIN_SOME = 100, 20
+_CHANGES = [
+    *((sign * turn, 1.0) for turn in (90.0, 20.0, 40.0, 65.0) for sign in (1, -1)),
+    (0.0, 1.5), (0.0, 0.67),
+]  # fmt: skip
+"""Turns [degrees] and scales of the right image that are tried where it does not match."""
+
+Grey = Float[Tensor, "_ _"]
+Places = Int[Tensor, "_ 2"]
+Flags = Bool[Tensor, "_"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,30 +61,43 @@ class RectificationReport:
         vertical_spread_px: median absolute deviation of it, scaled to a standard deviation.
         positive_share: share of positive disparities among those beyond a pixel; NaN where there
             are none.
+        corners: corners of the left image that were sought in the right one.
         matches: matches that all this rests on.
+        is_pair: False where one image shows nothing, both show the same view, or they do not
+            belong together; None with too few matches.
         is_rectified: whether rows agree; None with too few matches.
         is_swapped: whether the left image is the right one; None with too few matches.
         message: the finding, and the remedy where there is one.
     """
 
-    vertical_offset_px: float
-    vertical_spread_px: float
-    positive_share: float
-    matches: int
-    is_rectified: bool | None
-    is_swapped: bool | None
+    vertical_offset_px: float = math.nan
+    vertical_spread_px: float = math.nan
+    positive_share: float = math.nan
+    corners: int = 0
+    matches: int = 0
+    is_pair: bool | None = None
+    is_rectified: bool | None = None
+    is_swapped: bool | None = None
     message: str
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether such a pair gives no true depth."""
+        return self.is_pair is False or self.is_rectified is False or bool(self.is_swapped)
 
 
 def check_rectified(
-    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h2 w2"]
+    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h2 w2"], apart_px: float = 0.0
 ) -> RectificationReport:
-    """Check that the rows of a pair agree and that left is left.
+    """Check that two images are a pair, that its rows agree and that left is left.
 
-    Offsets below 6 rows and disparities below 192 columns are found; images wider than 1280 are
-    scaled down first, which widens both. Too few matches (a dark or bare scene, a larger offset)
-    give None, not an error; if enough match once the right image is mirrored or rotated,
-    that is reported.
+    Where too few corners match, the right image is also sought mirrored, turned and scaled, and
+    what is found is reported; a scene with too few corners gives None, not an error.
+
+    Args:
+        left: RGB in [0, 1].
+        right: of the same size.
+        apart_px: principal point of the right image less that of the left one, along x [px].
 
     Raises:
         InputError: the sizes differ.
@@ -193,90 +107,248 @@ def check_rectified(
             f"the left image is {_size(left)} but the right one {_size(right)}; both images of a "
             "rectified pair have one size, rectify them again"
         )
-    scale = min(1.0, _WORK_WIDTH / left.shape[-1])
+    if torch.equal(left, right):
+        said = "left and right are the same picture; give the view of each camera"
+        return RectificationReport(is_pair=False, message=said)
     with torch.no_grad():
-        one, other = _grey(left, scale), _grey(right, scale)
-        shift_px = match_corners(one, other) / scale
-        if len(shift_px) < _MIN_MATCHES:
-            for how, turned in _turned(other).items():
-                if len(match_corners(one, turned)) >= _MIN_MATCHES:
-                    return _turned_report(shift_px, how)
-    return _report(shift_px)
+        one, other = (_grey(image, _COARSE_PIXELS) for image in (left, right))
+        for side, grey in (("left", one), ("right", other)):
+            deviation = float(grey.std(correction=0))
+            if deviation < _MIN_DEVIATION:
+                said = (
+                    f"the {side} image shows nothing that could be matched: its grey values have "
+                    f"a standard deviation of {deviation:.4f} (at least {_MIN_DEVIATION:g} is "
+                    "needed); is the lens covered, or the file empty?"
+                )
+                return RectificationReport(is_pair=False, message=said)
+        corners = _find_corners(one)
+        places, found, alike = _match(one, other, corners)
+        if len(places) < _MIN_MATCHES:
+            unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
+            done = _what_was_done(one, other, corners)
+            if done is not None:
+                return replace(unlike, is_rectified=False, message=done)
+            is_other = len(places) < _MIN_FOUND * len(corners) and alike < _MAX_ALIKE * len(corners)
+            if is_other and len(corners) >= _MIN_TEXTURED:
+                said = (
+                    f"the images do not belong together: {len(places)} of {len(corners)} corners "
+                    f"of the left image are found in the right one (at least {_MIN_FOUND:.0%} are "
+                    "needed); give both views of one moment"
+                )
+                return replace(unlike, is_pair=False, message=said)
+        where, shift_px = _place_finely(left, right, places, found)
+    return _report(where, shift_px, len(corners), left.shape[-1], apart_px)
 
 
-def _turned(grey: Float[Tensor, "h w"]) -> dict[str, Float[Tensor, "h w"]]:
-    return {
-        "mirrored": grey.flip(1),
-        "upside down": grey.flip(0, 1),
-        "mirrored top to bottom": grey.flip(0),
-    }
-
-
-def _turned_report(shift_px: Float[Tensor, "n 2"], how: str) -> RectificationReport:
-    return replace(
-        _report(shift_px),
-        is_rectified=False,
-        message=f"the right image is {how} beside the left one; turn it back",
+def _find_corners(grey: Grey) -> Places:
+    padded = functional.pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    dx, dy = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2, (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+    products = torch.stack([dx * dx, dx * dy, dy * dy])[None]
+    xx, xy, yy = functional.avg_pool2d(products, 5, stride=1, padding=2)[0]
+    smaller = (xx + yy) / 2 - ((xx - yy).square() / 4 + xy.square()).sqrt()
+    inside = torch.zeros_like(smaller)
+    inside[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] = smaller[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+    best, index = functional.max_pool2d(
+        inside[None, None], _CELL, ceil_mode=True, return_indices=True
     )
+    strongest = best.flatten().topk(min(_MAX_CORNERS, best.numel()))
+    places = index.flatten()[strongest.indices[strongest.values > _MIN_CORNER]]
+    return torch.stack([places % grey.shape[1], places // grey.shape[1]], -1)
 
 
-def _report(shift_px: Float[Tensor, "n 2"]) -> RectificationReport:
-    disparity_px = -shift_px[:, 0]
+def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
+    """Find corners in the whole of another image.
+
+    Returns:
+        Those with a mutual match, their places there, and how many look like some place there,
+        or like many.
+    """
+    found, is_alike, is_sole = _search(source, target, corners)
+    alike = int(is_alike.sum())
+    corners, found = corners[is_alike & is_sole], found[is_alike & is_sole]
+    back, is_alike, is_sole = _search(target, source, found)
+    is_mutual = ((back - corners).abs() <= _RETURN_PX).all(-1) & is_alike & is_sole
+    return corners[is_mutual], found[is_mutual], alike
+
+
+def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
+    """Find the best place of each corner's patch, whether it is good, and without a rival."""
+    if len(corners) == 0:
+        return corners, corners[:, 0].bool(), corners[:, 0].bool()
+    patches = _unit(_windows(source, corners - _RADIUS, 2 * _RADIUS + 1))
+    side = 2 * _RADIUS + 1
+    mean, mean_square = functional.avg_pool2d(torch.stack([target, target.square()]), side, 1)
+    deviation = (mean_square - mean.square()).clamp_min(0).sqrt()
+    scores = functional.conv2d(target[None, None], patches[:, None])[0]
+    scores = (scores / (side * deviation.clamp_min(1e-6))).where(deviation > _MIN_CONTRAST, -1)
+    best, index = scores.flatten(1).max(1)
+    found = torch.stack([index % scores.shape[2], index // scores.shape[2]], -1)
+    # What is near the best is no rival.
+    scores = functional.pad(scores, (_RIVAL_RADIUS,) * 4, value=-1.0)
+    near = torch.arange(2 * _RIVAL_RADIUS + 1)
+    n = torch.arange(len(found))[:, None, None]
+    scores[n, found[:, 1, None, None] + near[:, None], found[:, 0, None, None] + near] = -1
+    rival = scores.flatten(1).amax(1)
+    return found + _RADIUS, best > _MIN_SCORE, rival < _MAX_RIVAL * best
+
+
+def _windows(image: Grey, first: Places, side: int) -> Float[Tensor, "n side side"]:
+    """Cut windows whose first pixels are these (x, y)."""
+    steps = torch.arange(side)
+    return image[first[:, 1, None, None] + steps[:, None], first[:, 0, None, None] + steps]
+
+
+def _unit(patches: Tensor) -> Tensor:
+    centred = patches - patches.mean((-2, -1), keepdim=True)
+    return centred / centred.norm(dim=(-2, -1), keepdim=True).clamp_min(1e-6)
+
+
+def _place_finely(
+    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"], places: Places, found: Places
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
+    """Give where matches lie, from the centre, and their shifts, right less left [px]."""
+    one, other = (_grey(image, _FINE_PIXELS) for image in (left, right))
+    larger = one.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
+    places, found = (((p + 0.5) * larger - 0.5).round().long() for p in (places, found))
+    rim = _FINE_RADIUS + _REACH
+    padded = functional.pad(one, (rim,) * 4), functional.pad(other, (rim,) * 4)
+    patches = _unit(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
+    windows = _windows(padded[1], found, 2 * rim + 1)
+    steps = windows.unfold(1, 2 * _FINE_RADIUS + 1, 1).unfold(2, 2 * _FINE_RADIUS + 1, 1)
+    scores = (_unit(steps) * patches[:, None, None]).sum((-2, -1))
+    best, index = scores.flatten(1).max(1)
+    row, column = index // scores.shape[2], index % scores.shape[2]
+    last = 2 * _REACH
+    is_good = (best > _MIN_SCORE) & (row > 0) & (row < last) & (column > 0) & (column < last)
+    row, column = row.clamp(1, last - 1), column.clamp(1, last - 1)
+    n = torch.arange(len(places))
+    x = column + _peak(*(scores[n, row, column + i] for i in (-1, 0, 1)))
+    y = row + _peak(*(scores[n, row + i, column] for i in (-1, 0, 1)))
+    shift = found - places + torch.stack([x, y], -1) - _REACH
+    scale = one.shape[1] / left.shape[2]
+    centre = torch.tensor([one.shape[1], one.shape[0]]) / 2
+    return ((places - centre) / scale)[is_good], (shift / scale)[is_good]
+
+
+def _peak(before: Tensor, at: Tensor, after: Tensor) -> Tensor:
+    """Place the top of the parabola through three scores, within half a pixel of the middle."""
+    curvature = (2 * at - before - after).clamp_min(1e-6)
+    return ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)
+
+
+def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
+    """Seek the right image mirrored, turned and scaled back; None where it is still not found."""
+    some = corners[:_SOME_CORNERS]
+    flips = {
+        "mirrored": other.flip(1),
+        "upside down": other.flip(0, 1),
+        "mirrored top to bottom": other.flip(0),
+    }
+    for how, back in flips.items():
+        if len(_match(one, back, some)[0]) >= _MIN_SOME:
+            return f"the right image is {how} beside the left one; turn it back"
+    for turn_deg, scale in _CHANGES:
+        places, found, _ = _match(one, _changed(other, -turn_deg, 1 / scale), some)
+        if len(places) >= _MIN_SOME:
+            rest_deg, rest_scale, _ = _fit_rows(places, (found - places)[:, 1])
+            turn_deg += rest_deg  # noqa: PLW2901
+            return (
+                f"the right image is turned by about {round(turn_deg)} degrees and scaled by about "
+                f"{scale * rest_scale:.2f} beside the left one; rectify the pair"
+            )
+    return None
+
+
+def _changed(grey: Grey, turn_deg: float, scale: float) -> Grey:
+    """Turn and enlarge about the centre."""
+    height, width = grey.shape
+    c, s = (f(math.radians(turn_deg)) / scale for f in (math.cos, math.sin))
+    there = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
+    grid = functional.affine_grid(there, [1, 1, height, width], align_corners=False)
+    return functional.grid_sample(grey[None, None], grid, align_corners=False)[0, 0]
+
+
+def _report(
+    where: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
+) -> RectificationReport:
+    """Say what the matches show, ``where`` counted from the centre [px]."""
+    matches = len(shift_px)
+    disparity_px = apart_px - shift_px[:, 0]
     clear = disparity_px[disparity_px.abs() > 1]
-    offset = float(shift_px[:, 1].nanmedian()) if len(shift_px) else math.nan
-    deviation = (shift_px[:, 1] - offset).abs()
-    spread = _MAD_TO_DEVIATION * float(deviation.nanmedian()) if len(shift_px) else math.nan
     share = float((clear > 0).float().mean()) if len(clear) else math.nan
-    is_known, is_order_known = len(shift_px) >= _MIN_MATCHES, len(clear) >= _MIN_MATCHES
-    is_level = abs(offset) <= _MAX_OFFSET_PX and spread <= _MAX_SPREAD_PX
-    is_rectified = is_level if is_known else None
-    is_swapped = share <= _MAX_SHARE_SWAPPED if is_order_known else None
-    return RectificationReport(
+    offset, spread = math.nan, math.nan
+    if matches:
+        offset = float(shift_px[:, 1].median())
+        spread = _MAD_TO_DEVIATION * float((shift_px[:, 1] - offset).abs().median())
+    larger = max(1.0, width / _LIMITS_WIDTH)
+    most_offset, most_spread = larger * _MAX_OFFSET_PX, larger * _MAX_SPREAD_PX
+    is_same = shift_px.abs().amax(-1) <= larger * _SAME_PX
+    is_level = abs(offset) <= most_offset and spread <= most_spread
+    is_known = matches >= _MIN_MATCHES or (matches >= _MIN_WRONG and not is_level)
+    report = RectificationReport(
         vertical_offset_px=offset,
         vertical_spread_px=spread,
         positive_share=share,
-        matches=len(shift_px),
-        is_rectified=is_rectified,
-        is_swapped=is_swapped,
-        message=_message(shift_px, (offset, spread, share), (is_rectified, is_swapped)),
+        corners=corners,
+        matches=matches,
+        is_pair=float(is_same.float().mean()) < _SAME_SHARE if is_known else None,
+        is_rectified=is_level if is_known else None,
+        is_swapped=share <= _MAX_SHARE_SWAPPED if len(clear) >= _MIN_MATCHES else None,
+        message="",
     )
-
-
-def _message(
-    shift_px: Float[Tensor, "n 2"],
-    measured: tuple[float, float, float],
-    verdict: tuple[bool | None, bool | None],
-) -> str:
-    offset, spread, share = measured
-    is_rectified, is_swapped = verdict
-    if is_rectified is None:
-        return (
-            f"only {len(shift_px)} of the {_MIN_MATCHES} matches needed: cannot tell whether the "
-            "pair is rectified"
+    if not is_known:
+        said = (
+            f"only {matches} of the {_MIN_MATCHES} matches needed: cannot tell whether the pair is "
+            "rectified"
         )
-    findings = []
-    if is_swapped:
+        return replace(report, message=said)
+    findings: list[str] = []
+    if report.is_pair is False:
+        findings.append(
+            f"left and right show the same view: {float(is_same.float().mean()):.0%} of what "
+            f"matches lies within {larger * _SAME_PX:.2g} px of its place; give the view of each "
+            "camera"
+        )
+    elif report.is_swapped:
         findings.append(
             f"left and right look swapped (only {share:.0%} of disparities are positive); exchange "
             "the two images (or both are mirrored: mirror them back)"
         )
-    if not is_rectified:
+    if report.is_rectified is False:
+        turn_deg, scale, left_px = _fit_rows(where, shift_px[:, 1])
+        how = f", turned by {turn_deg:+.1f} degrees and scaled by {scale:.3f}"
         findings.append(
             f"rows do not agree: the right image lies {offset:+.1f} px lower, with a spread of "
-            f"{spread:.1f} px (at most {_MAX_OFFSET_PX:g} and {_MAX_SPREAD_PX:g} are allowed); "
-            "rectify the pair ('depthpose data rectify', with the calibration of both cameras)"
+            f"{spread:.1f} px{how if left_px < spread / 2 else ''} (at most "
+            f"{most_offset:.3g} and {most_spread:.3g} are allowed); rectify the pair ('depthpose "
+            "data rectify', with the calibration of both cameras)"
         )
     good = f"rows agree to {abs(offset):.1f} px, with a spread of {spread:.1f} px"
-    return f"{'. '.join(findings) or good} ({len(shift_px)} matches)"
+    return replace(report, message=f"{'. '.join(findings) or good} ({matches} matches)")
 
 
-def _grey(image: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h2 w2"]:
+def _fit_rows(where: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
+    """Fit the turn [degrees] and the scale of the right image, and give the spread that is left."""
+    where, lower_px = where.float(), lower_px.float()
+    design = torch.cat([torch.ones_like(where[:, :1]), where], -1)
+    is_near = torch.ones_like(lower_px, dtype=torch.bool)
+    rest, fit = lower_px, lower_px.new_zeros(3)
+    for _ in range(5):
+        fit = torch.linalg.lstsq(design[is_near], lower_px[is_near, None]).solution[:, 0]
+        rest = (lower_px - design @ fit).abs()
+        is_near = rest <= 2.5 * rest.median() + 1e-3
+    left = _MAD_TO_DEVIATION * float(rest.median())
+    return math.degrees(math.atan(float(fit[1]))), 1 + float(fit[2]), left
+
+
+def _grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:
     grey = grey_of(image).float()
+    scale = math.sqrt(pixels / grey.numel())
     if scale < 1:
-        height, width = (max(1, round(size * scale)) for size in grey.shape)
-        grey = functional.interpolate(grey[None, None], (height, width), mode="area")[0, 0]
-    # Correlation by FFT is the more exact the nearer the values lie to 0.
-    return grey - grey.mean()
+        size = [max(1, round(side * scale)) for side in grey.shape]
+        grey = functional.interpolate(grey[None, None], size, mode="area")[0, 0]
+    # Correlation is the more exact the nearer the values lie to 0.
+    return (grey - grey.mean()).cpu()
 
 
 def _size(image: Float[Tensor, "3 h w"]) -> str:

@@ -15,7 +15,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.files.names import refuse_unpaired
+from depthpose.core.files.names import find_partners
 from depthpose.core.files.store import (
     absolute,
     exists,
@@ -62,8 +62,8 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     """Find inputs that are no tar shards.
 
     Args:
-        words: one file, folder or pattern for each role, paired in the order of their names; or
-            of a single role any number of them; or manifests.
+        words: one file, folder or pattern for each role, paired by their names or the numbers in
+            them; or of a single role any number of them; or manifests.
         files: what an input is made of.
 
     Raises:
@@ -135,12 +135,11 @@ def _pair(words: Sequence[str], files: Files) -> list[Item]:
             "of them, or one manifest"
         )
     sides = [list_files(word, files.suffixes) for word in words]
-    counts = [len(side) for side in sides]
-    if len(set(counts)) > 1:
-        said = ", ".join(f"{word} holds {n}" for word, n in zip(words, counts, strict=True))
-        raise InputError(f"{said}: each input needs one file of each. Remove those without.")
-    for word, side in zip(words[1:], sides[1:], strict=True):
-        refuse_unpaired(map(stem, sides[0]), map(stem, side), f"{words[0]} and {word}")
+    names = [[stem(url) for url in side] for side in sides]
+    for k, word in enumerate(words[1:], 1):
+        if [stem(words[0])] != names[0] or [stem(word)] != names[k]:  # else two files were named
+            partners = find_partners(names[0], names[k], f"{words[0]} and {word}")
+            sides[k] = [sides[k][partner] for partner in partners]
     return [Item(stem(some[0]), some) for some in zip(*sides, strict=True)]
 
 

@@ -1,10 +1,13 @@
 """The check of a folder before hours of work: everything wrong, a line each."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from depthpose.core.camera import StereoRig, check_rectified
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_image, read_points_bin
 from depthpose.core.files.images import LISTED_SUFFIXES
@@ -113,17 +116,26 @@ def _unused_maps(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
 
 def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     size = None
+    images: list[Tensor] = []
     for path in (frame.left, frame.right):
         if path is None:
             yield Problem(path=frame.left, kind="note", message="has no right view")
             continue
-        problem, found = _look_at_image(path, with_decoding=with_decoding)
-        if problem is not None:
-            yield problem
-        elif size is not None and found != size:
+        try:
+            if with_decoding:
+                images.append(read_image(path))
+                found = (images[-1].shape[2], images[-1].shape[1])
+            else:
+                found = image_size(path)
+        except InputError as error:
+            yield unreadable(path, error)
+            continue
+        if size is not None and found != size:
             message = f"is {_show(found)}, but its left image is {_show(size)}"
             yield Problem(path=path, kind="mismatch", message=message)
         size = size or found
+    if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
+        yield from _check_pair(frame, frame.right, *images)
     yield from _check_calibration(frame)
     if frame.velodyne is not None:
         yield from _check_scan(frame.velodyne)
@@ -132,16 +144,15 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             yield from _check_truth(path, size, is_depth=path in (frame.scan, frame.depth))
 
 
-def _look_at_image(
-    path: Path, *, with_decoding: bool
-) -> tuple[Problem | None, tuple[int, int] | None]:
-    try:
-        if with_decoding:
-            _, height, width = read_image(path).shape
-            return None, (width, height)
-        return None, image_size(path)
-    except InputError as error:
-        return unreadable(path, error), None
+def _check_pair(frame: Frame, path: Path, left: Tensor, right: Tensor) -> Iterator[Problem]:
+    rig = None
+    with suppress(InputError):  # which is told by itself
+        rig = frame_camera(frame)
+    apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
+    report = check_rectified(left, right, apart_px)
+    if report.is_wrong or report.is_rectified is None:
+        kind = "mismatch" if report.is_wrong else "note"
+        yield Problem(path=path, kind=kind, message=f"beside {frame.left.name}: {report.message}")
 
 
 def _check_calibration(frame: Frame) -> Iterator[Problem]:

@@ -19,7 +19,6 @@ from depthpose.core.camera import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import picture_tensor, read_image
-from depthpose.depth.estimator.far import infinity_shift_px, moved_apart
 from depthpose.depth.types import StereoInput
 
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
@@ -111,20 +110,24 @@ def as_input(image: object, name: str, camera: AnyLens | None) -> StereoInput:
     return StereoInput(name=name, left=left, right=None, camera=camera)
 
 
-def refuse_unrectified(pair: StereoInput) -> None:
-    """Raise where the two images are swapped, or their rows do not correspond.
+def refuse_unrectified(pair: StereoInput) -> str:
+    """Raise where two images are no pair, are swapped, or their rows do not correspond.
+
+    Returns:
+        A warning where this cannot be told, else nothing.
 
     Raises:
         InputError: with what was measured and what to do.
     """
-    right = usable_right(pair)
-    if torch.equal(pair.left, right):
+    right, camera = usable_right(pair), pair.camera
+    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
+    report = check_rectified(pair.left, right, apart_px)
+    if report.is_wrong:
         raise InputError(
-            f"{pair.name}: left and right are the same picture; give the view of each camera"
+            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
+            "all the same.)"
         )
-    report = check_rectified(*moved_apart(pair.left, right, infinity_shift_px(pair.camera)))
-    if report.is_swapped or report.is_rectified is False:
-        raise InputError(f"{pair.name}: {report.message}")
+    return report.message if report.is_rectified is None else ""
 
 
 def usable_right(pair: StereoInput) -> Float[Tensor, "3 h w"]:

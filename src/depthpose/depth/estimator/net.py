@@ -179,12 +179,13 @@ class FakestereoNet:
             focal_px: the focal length alone [px], in place of a camera.
             right: right image, the same size and rows.
             name: what to call the input in errors; the file's name by default.
-            with_check: look whether the pair is rectified and in the right order first.
+            with_check: look first whether both images show one scene, rectified and in the right
+                order; where that cannot be told, the estimate has a ``warning``.
 
         Raises:
             InputError: a file that cannot be read, sizes that disagree, a camera without what is
-                needed, a pair that is swapped or not rectified, an image unlike what the weights
-                know.
+                needed, a pair that is none, swapped or not rectified, an image unlike what the
+                weights know.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
         pair = as_input(image, chosen, choose_lens(camera, focal_px))
@@ -194,8 +195,8 @@ class FakestereoNet:
 
     @torch.no_grad()
     @own_arithmetic()
-    def estimate_pair(self, pair: StereoInput, *, with_check: bool = False) -> DepthEstimate:
-        """Estimate depth of one input whose images are read already."""
+    def estimate_pair(self, pair: StereoInput, *, with_check: bool = True) -> DepthEstimate:
+        """Estimate depth of one input whose images are read already, as :meth:`estimate` does."""
         if pair.right is None:
             with refused_memory(pair.name):
                 return self._estimate_alone([pair])[0]
@@ -207,11 +208,10 @@ class FakestereoNet:
                 "weights pack G --matcher S --trained-on DATA --licence L --out W' makes one file "
                 "of both."
             )
-        if with_check:
-            refuse_unrectified(pair)
+        warning = refuse_unrectified(pair) if with_check else ""
         with refused_memory(pair.name):
             match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
-            return from_pair(pair, match)
+            return replace(from_pair(pair, match), warning=warning)
 
     @torch.no_grad()
     @own_arithmetic()
@@ -221,6 +221,7 @@ class FakestereoNet:
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
+        with_check: bool = True,
     ) -> list[DepthEstimate]:
         """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
 
@@ -230,6 +231,7 @@ class FakestereoNet:
             images: inputs; or pictures, or a batch of them as one array or tensor.
             camera: of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the same as its focal length alone [px].
+            with_check: of pairs, as for :meth:`estimate`.
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
@@ -238,9 +240,11 @@ class FakestereoNet:
         inputs = as_inputs(images, choose_lens(camera, focal_px))
         for sizes, group in groupby(inputs, self._sizes_alone):
             alike = list(group)
-            is_alone = sizes is not None
             with refused_memory(alike[0].name):
-                found += self._estimate_alone(alike) if is_alone else map(self.estimate_pair, alike)
+                if sizes is None:
+                    found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
+                else:
+                    found += self._estimate_alone(alike)
         return found
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:

@@ -154,7 +154,9 @@ def _pair_cases(weights: DepthWeights) -> Iterator[Case]:
             rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
             inputs["K"] = camera.K.numpy()
         found = [
-            net.estimate_pair(StereoInput(name="proof", left=one, right=other, camera=rig))
+            net.estimate_pair(
+                StereoInput(name="proof", left=one, right=other, camera=rig), with_check=False
+            )
             for one, other in zip(left, right, strict=True)
         ]
         yield _case(inputs, found, (*_PAIR_OUTPUTS, *sky))
