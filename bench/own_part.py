@@ -75,7 +75,7 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
             errors = [
                 pose_error(one, sample.truth, weights.models[0])
                 for one, sample in zip(found, samples, strict=True)
-                if one.is_ok
+                if one.is_posed
             ]
             right = int(is_within_diameter(torch.tensor(errors)).sum())
             rows.append({

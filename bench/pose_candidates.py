@@ -11,15 +11,18 @@ evaluated on the other, five times; those of all cases are printed last.
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
+from scipy.optimize import minimize
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, RefusalConfig
-from depthpose.pose.estimator import GeoPoseNet, fit_candidate_slopes
+from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies, share_out
+from depthpose.pose.estimator.evidence import log_signal
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights
@@ -28,6 +31,7 @@ from depthpose.report.tables import markdown_table
 SEED = 0xCA5E
 BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.01))
 Case = tuple[list[dict[str, float]], int]
+RIDGE = 3.0
 
 
 def add_of(pose: Rigid, truth: Rigid, copies: PoseAmbiguities) -> float:
@@ -53,7 +57,9 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
     """Pose synthetic views of the objects of weights, with all candidates, nothing refused."""
     weights = read_pose_weights(find_weights(name))
     even = dict.fromkeys(RefusalConfig().candidate_slopes, 0.0)
-    opened = RefusalConfig(max_risk=1.0, candidate_slopes=even)
+    opened = RefusalConfig(
+        min_agreement=0.0, max_beyond=1.0, min_explained=0.0, candidate_slopes=even
+    )
     net = GeoPoseNet(dataclasses.replace(weights, refusal=opened))
     config = ObjectsConfig(
         number=number * len(weights.models), seed=SEED, views=None, resolution=(1.0, 1.0),
@@ -68,6 +74,36 @@ def cases_of(name: str, number: int) -> tuple[list[Case], int]:
         truth = view.truth.camera_from_model
         found.append(case_of(estimate, truth, copies[k % len(weights.models)]))
     return [case for case in found if case is not None], len(views)
+
+
+def fit_candidate_slopes(
+    cases: Sequence[tuple[Sequence[Mapping[str, float]], int]],
+    ridge: float = RIDGE,
+) -> dict[str, float]:
+    """Learn how to share the probability of one among poses that fit, from cases of known truth.
+
+    A conditional logit (McFadden 1974) on the logarithms of the signals; no slope is negative.
+
+    Args:
+        cases: the signals of all candidates of a view, and the number of the right one.
+        ridge: of the slopes; it keeps shares nearer to each other than synthetic views give, as
+            real sensors err alike from pixel to pixel.
+    """
+    names = list(RefusalConfig().candidate_slopes)
+    x = [np.array([[log_signal(one[n]) for n in names] for one in some]) for some, _ in cases]
+
+    def loss(slopes: np.ndarray) -> tuple[float, np.ndarray]:
+        value, pull = 0.5 * ridge * float(slopes @ slopes), ridge * slopes
+        for signals, (_, right) in zip(x, cases, strict=True):
+            odds = -signals @ slopes
+            log_share = odds - np.logaddexp.reduce(odds)
+            value -= float(log_share[right])
+            pull = pull + signals[right] - np.exp(log_share) @ signals
+        return float(value), pull
+
+    start = np.ones(len(names))
+    found = minimize(loss, start, jac=True, bounds=[(0.0, None)] * len(names), method="L-BFGS-B")
+    return dict(zip(names, found.x.tolist(), strict=True))
 
 
 def measure(cases: Sequence[Case]) -> list[tuple[float, bool]]:

@@ -1,9 +1,9 @@
-"""Clouds that do not show the requested object: shares answered ``ok``.
+"""Clouds that do not show the requested object: shares ``ok``, ambiguous, identity confirmed.
 
     python bench/pose_negatives.py --weights parts ycb linemod.safetensors --number 40
 
 Eight kinds of negatives, ``--number`` of each: another object of the weights (or one of our parts,
-if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.2 (``--number`` each), mirrored ones,
+if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.25 (``--number`` each), mirrored ones,
 blobs, plates, boxes and cylinders, balls, and hands of capsules. The mirror image of
 an object that it deviates from by 3 % of the diameter at most is no negative: "mirror image alike".
 Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
@@ -11,7 +11,7 @@ themselves, four times as many: right is an ADD (to the nearest symmetric pose) 
 the diameter. ``--seed`` draws other views.
 Each is a depth image with a mask; ``--clouds`` gives the points in the mask alone.
 ``--method register`` registers the objects without a network, ``both`` what the network doubts.
-``--save`` writes all signals as JSON; then nothing is refused for its risk.
+``--save`` writes fit and signals as JSON; then nothing is refused for its fit.
 """
 
 import argparse
@@ -96,7 +96,8 @@ def measure(
         rows.append({
             "kind": ALIKE if is_alike else kind, "object": sample.input.object,
             "status": found.status,
-            "right": is_right, "risk": found.risk, "signals": found.signals,
+            "right": is_right, "fit": found.fit and vars(found.fit), "signals": found.signals,
+            "identity": found.identity and found.identity.status,
             "hidden": 1 - (sample.truth.visible_fraction or 0.0),
         })  # fmt: skip
     return rows
@@ -111,10 +112,13 @@ def groups(rows: Sequence[Row]) -> list[list[Row]]:
 def summary(rows: Sequence[Row]) -> Row:
     """Count answers."""
     ok = sum(row["status"] == "ok" for row in rows)
-    row: Row = {"kind": rows[0]["kind"], "number": len(rows), "answered": ok / len(rows)}
+    row: Row = {"kind": rows[0]["kind"], "number": len(rows), "ok": ok / len(rows)}
+    row["ambiguous"] = sum(row["status"] == "ambiguous" for row in rows) / len(rows)
+    posed = [row for row in rows if row["status"] in ("ok", "ambiguous")]
+    row["confirmed"] = sum(row["identity"] == "confirmed" for row in posed) / len(rows)
     if rows[0]["kind"] == ITSELF:
         row["right"] = sum(row["right"] for row in rows) / len(rows)
-        row["wrong"] = row["answered"] - row["right"]
+        row["ok and wrong"] = sum(r["status"] == "ok" and not r["right"] for r in rows) / len(rows)
     return row
 
 
@@ -135,7 +139,9 @@ def main() -> None:
     for name in words.weights:
         config = EstimateConfig(register_refused=words.method == "both")
         net = GeoPoseNet.load(find_weights(name), config)
-        opened = dataclasses.replace(net.refusal, max_risk=1.0)
+        opened = dataclasses.replace(
+            net.refusal, min_agreement=0.0, max_beyond=1.0, min_explained=0.0
+        )
         if words.method == "register":
             net = Registration(net.models, refusal=opened if words.save else None)
         elif words.save:

@@ -29,13 +29,14 @@ from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.evaluate import nearest_copy
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.metrics import add_m, adds_m, auc
-from depthpose.pose.types import CloudInput, PoseEstimate
+from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.tables import markdown_table, write_table
 
 POINTS = 2000
+AnyInput = CloudInput | ViewInput
 Row = dict[str, Any]
-Method = Callable[[CloudInput], PoseEstimate]
+Method = Callable[[AnyInput], PoseEstimate]
 _PREPARED: dict[str, Registration] = {}
 """By object: the model is prepared once, whatever the seed."""
 
@@ -45,7 +46,7 @@ def measure(case: RealCase, estimate: PoseEstimate) -> Row:
     row: Row = {
         "metric": "ADD-S" if case.is_symmetric else "ADD",
         "add": None, "adds": None, "error_m": None,
-        "success": False, "refused": not estimate.is_ok, "wrong": False,
+        "success": False, "refused": not estimate.is_posed, "wrong": False,
         "add_declared": None, "named": False, "certainty": estimate.certainty,
     }  # fmt: skip
     if estimate.camera_from_model is None:
@@ -74,7 +75,9 @@ def declared_add(case: RealCase, pose: Rigid, points_m: torch.Tensor) -> float:
 def open3d_method(case: RealCase, seed: int, words: argparse.Namespace) -> Method:
     """Open3D's registration for one model."""
     config = FpfhConfig(seed=seed, voxel_diameters=words.voxel)
-    return FpfhRegistration(case.model, config).estimate
+    peer = FpfhRegistration(case.model, config)
+    cloud = CloudInput(name=case.name, points_m=case.points_m, object=case.model.name)
+    return lambda _: peer.estimate(cloud)
 
 
 def zero_shot_method(case: RealCase, seed: int) -> Method:

@@ -24,7 +24,6 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, VotingConfig
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.estimator.prepare import Prepared
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
@@ -38,7 +37,7 @@ HALF = ResUNetConfig(
     encoder=(16, 32, 64, 128), decoder=(32, 32, 32, 64),
 )  # fmt: skip
 FULL = ResUNetConfig(classes=1, norm="none")
-NO_RISK = RefusalConfig(max_risk=1.0, slopes=dict.fromkeys(SIGNALS, 0.0), min_hold=0.0)
+NO_RISK = RefusalConfig(min_agreement=0.0, max_beyond=1.0, min_explained=0.0, min_hold=0.0)
 
 
 class NoisyTruth(GeoPoseNet):
@@ -90,7 +89,7 @@ def bench(voxels: int, args: argparse.Namespace) -> list[dict]:
     for method in ("ransac", "least squares"):
         net = estimator(model, args.width, VotingConfig(method=method))
         estimates = [net.estimate_many([given])[0] for _ in range(args.rounds + 1)][1:]
-        assert all(e.is_ok for e in estimates), estimates[0].reason
+        assert all(e.is_posed for e in estimates), estimates[0].reason
         stages = {stage: min(e.seconds[stage] for e in estimates) for stage in STAGES}
         rows.append({"voxels": voxels, "votes_by": method, **stages})
         rows[-1] |= {"whole": min(sum(e.seconds.values()) for e in estimates)}

@@ -34,7 +34,7 @@ def cases_in(folder: Path) -> list[Case]:
         if not case.name.endswith(("090", "270")):
             pose = case.sample.truth.camera_from_model
             pose = pose.double()
-            cases.append((case.name, case.sample.input.points_m, pose, case.model))
+            cases.append((case.name, case.points_m, pose, case.model))
     return cases
 
 

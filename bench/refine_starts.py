@@ -55,7 +55,7 @@ def is_right(case: RealCase, found: Rigid, truth: Rigid) -> bool:
 def bench(case: RealCase, tries: int) -> list[dict]:
     """Try every start on one instance."""
     surface = prepare_surface(case.model)
-    points_m = case.sample.input.points_m.double()
+    points_m = case.points_m.double()
     points_m = points_m[~is_flying(points_m, case.model.diameter_m)]
     given = case.sample.truth.camera_from_model
     truth = given.double()

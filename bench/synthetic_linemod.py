@@ -9,7 +9,8 @@
 
 Every view is rendered separately, by a seed that no training has. A method is given one view at
 a time, on one thread; of several weights each is used for its own objects. Success is ADD
-(ADD-S of symmetric objects) below 10 % of the diameter; a refusal is no success. "Nothing refused"
+(ADD-S of symmetric objects) below 10 % of the diameter, ambiguous poses too; a refusal is no
+success. "Nothing refused"
 is every answer that votes can give, whatever its risk; for ours risks.png has the share of wrong
 answers over the share that is answered. Writes rows.csv, rows.json, table.md, views.csv with each
 view, and success.png with all curves. ``--also`` adds the results of other runs.
@@ -90,7 +91,13 @@ def without_refusal(name: str, files: Sequence[str], number: int) -> Iterator[Me
     """Give every answer of a network whose points vote, however risky."""
     found = [read_pose_weights(find_weights(file)) for file in files]
     open_ = [
-        dataclasses.replace(w, refusal=dataclasses.replace(w.refusal, max_risk=1.0)) for w in found
+        dataclasses.replace(
+            w,
+            refusal=dataclasses.replace(
+                w.refusal, min_agreement=0.0, max_beyond=1.0, min_explained=0.0
+            ),
+        )
+        for w in found
     ]
     yield from _of(name, [GeoPoseNet(weights) for weights in open_], number)
 
@@ -129,6 +136,11 @@ def registration(models: Sequence[ObjectModel], number: int) -> Iterator[Method]
     )
 
 
+def metric_of(model: ObjectModel) -> Callable[..., torch.Tensor]:
+    """ADD, of a symmetric object ADD-S."""
+    return add_m if model.symmetries.is_none else adds_m
+
+
 def measure(method: Method, view: ViewSample, model: ObjectModel, points_m: torch.Tensor) -> Row:
     """Pose one view."""
     began = time.perf_counter()
@@ -136,12 +148,18 @@ def measure(method: Method, view: ViewSample, model: ObjectModel, points_m: torc
     seconds = time.perf_counter() - began
     error = None  # where there is no answer
     if estimate.camera_from_model is not None:
-        metric = add_m if model.symmetries.is_none else adds_m
         truth = view.truth.camera_from_model
-        error = float(metric(estimate.camera_from_model, truth, points_m)) / model.diameter_m
-    risk = estimate.risk if estimate.is_ok else None
+        error = float(metric_of(model)(estimate.camera_from_model, truth, points_m))
+        error /= model.diameter_m
+    risk = None if estimate.certainty is None else 1 - estimate.certainty
     row = {"method": method.name, "object": model.name, "error": error, "risk": risk}
-    return row | {"refused": not estimate.is_ok, "s": seconds}
+    is_named = any(
+        float(metric_of(model)(a.camera_from_model, view.truth.camera_from_model, points_m))
+        < 0.1 * model.diameter_m
+        for a in estimate.alternatives
+    )
+    status = {"refused": not estimate.is_posed, "ok": estimate.is_ok, "named": is_named}
+    return row | status | {"s": seconds}
 
 
 def run_condition(
@@ -177,11 +195,15 @@ def shares(rows: Sequence[Row]) -> Row:
     errors = finite(rows, "error")
     refused = sum(row["refused"] for row in rows)
     right, middle = int((errors < 0.1).sum()), float(errors.median())
+    wrong = [r for r in rows if not r["refused"] and (r["error"] or 0.0) >= 0.1]
+    named = sum(r.get("named", False) for r in wrong)
     return {
         "views": len(rows),
         "success": right / len(rows),
         "refused": refused / len(rows),
-        "wrong": (len(rows) - right - refused) / len(rows),
+        "right among the named": named / len(rows),
+        "wrong": (len(wrong) - named) / len(rows),
+        "ok and wrong": sum(r.get("ok", True) for r in wrong) / len(rows),
         # Where more than half is refused, the median is infinite.
         "median error [diameters]": round(middle, 4) if middle < torch.inf else None,
         "median ms": round(1000 * float(torch.tensor([row["s"] for row in rows]).median()), 1),

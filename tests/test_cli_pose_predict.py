@@ -39,7 +39,6 @@ from depthpose.core.files import (
     write_image,
 )
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
-from depthpose.pose.config import RefusalConfig
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.datasets.results import read_results
 from depthpose.pose.metrics import add_m
@@ -137,8 +136,7 @@ def test_a_depth_image_alone_is_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truths = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
-    refusal = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
-    oracle = Oracle(tiny_weights(bracket(), refusal=refusal), truths)
+    oracle = Oracle(tiny_weights(bracket()), truths)
     weights = oracle_weights(tmp_path, monkeypatch, oracle)
     seen, mask = view_of(bracket(), *truths)
     wall = torch.full((240, 320), 1.2)
@@ -380,7 +378,7 @@ def test_a_data_set_gives_the_csv_and_pictures(
     out = tmp_path / "out"
     words = ["--bop", str(synthetic.folder), "--weights", str(path), "--out", str(out)]
     assert main(["pose", "predict", *words]) == 0
-    answered = [p for p in read_predictions(out) if p.estimate.is_ok]
+    answered = [p for p in read_predictions(out) if p.estimate.is_posed]
     assert len(read_predictions(out)) == len(synthetic.instances)
     results = read_results(out / f"depthpose_{synthetic.folder.name}-test.csv")
     assert len(results) == len(answered) > 0

@@ -147,7 +147,7 @@ def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path, word
     found = read_predictions(tmp_path / "out")
     assert [p.place for p in found] == [(1, 0, 7), (1, 1, 7)]
     assert all(p.estimate.tracking is not None for p in found)
-    answered = [p for p in found if p.estimate.is_ok]
+    answered = [p for p in found if p.estimate.is_posed]
     assert len(read_results(tmp_path / "out/depthpose_made-test.csv")) == len(answered)
 
 

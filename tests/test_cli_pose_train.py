@@ -6,22 +6,19 @@ import shutil
 from pathlib import Path
 
 import pytest
-import torch
 
 from depthpose.cli import main
-from depthpose.core.checkpoint import LicenceNotice, find_weights
 from depthpose.core.config import read_config
 from depthpose.core.loop import Run
 from depthpose.pose.synthetic import write_part
 from depthpose.pose.train import STAGES, PoseTraining
-from depthpose.pose.weights import read_pose_weights, write_pose_weights
+from depthpose.pose.weights import read_pose_weights
 
 _TINY = """
 network: {first_kernel: 3, encoder: [4, 4, 8, 8], decoder: [4, 4, 4, 8]}
 cloud: {max_points: 200}
 objects: {views: 2}
 held_out: {number: 2, occlusions: [0.0]}
-calibration: {number: 0}
 adam: {warmup_steps: 0}
 loop: {steps: 2, batch_size: 2, device: cpu}
 """
@@ -42,7 +39,7 @@ def test_a_cad_file_becomes_weights_with_a_card(
     said = capsys.readouterr().out
     assert f"trained weights: {out / 'pose.safetensors'}" in said
     assert "| 0 | " in said
-    assert "trained; now the refusal is calibrated" in said
+    assert "trained; now it is measured" in said
     card = (out / "pose.md").read_text()
     assert f"--cad {part} --unit mm --config config.yaml --out my_part`" in card
     (model,) = read_pose_weights(out / "pose.safetensors").models
@@ -54,58 +51,11 @@ def test_a_cad_file_becomes_weights_with_a_card(
     assert "seed" in capsys.readouterr().err
 
 
-def test_what_cannot_be_calibrated_is_refused_before_hours_of_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own, blind = tmp_path / "own.safetensors", tmp_path / "blind.safetensors"
-    weights = read_pose_weights(find_weights("parts"))
-    write_pose_weights(own, weights)
-    cloud = dataclasses.replace(weights.cloud, min_points=10**6, max_points=None)
-    write_pose_weights(blind, dataclasses.replace(weights, cloud=cloud))
-    config = tmp_path / "tiny.yaml"
-    config.write_text(
-        "held_out: {number: 1, occlusions: [0.0]}\ncalibration: {number: 20, negatives: 2}\n"
-    )
-    other = str(tmp_path / "other.safetensors")
-    for words, said in (
-        ([own, "--out", str(own)], "is there already; delete it, or give another name"),
-        ([own, "--out", str(tmp_path / "bold")], "ending in .safetensors"),
-        ([own, "--out", other, "--number", "0"], "there is nothing to choose by; take 600"),
-        ([own, "--out", other, "--number", "4"], "take 600 (a training may take 0: no refusal)"),
-        ([blind, "--out", other], "answered not one synthetic view"),
-    ):
-        assert main(["pose", "calibrate", *map(str, words), "--config", str(config)]) == 2
-        assert said in capsys.readouterr().err
-    assert not Path(other).exists()
-
-
-def test_weights_are_calibrated_anew_and_stay_the_same_otherwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A bolder share of wrong answers gives more answers; terms of use stay."""
-    config = tmp_path / "tiny.yaml"
-    config.write_text(
-        "held_out: {number: 4, occlusions: [0.0]}\ncalibration: {number: 20, negatives: 0}\n"
-    )
-    old, bound = read_pose_weights(find_weights("parts")), tmp_path / "bound.safetensors"
-    facts = {**old.facts, "terms": "For research alone."}
-    write_pose_weights(bound, dataclasses.replace(old, facts=facts), with_half=True)
-    limits = []
-    for share in ("0.01", "0.5"):
-        out = tmp_path / f"bold{share}.safetensors"
-        words = ["pose", "calibrate", str(bound), "--config", str(config), "--out", str(out)]
-        with pytest.warns(LicenceNotice, match=facts["terms"]):
-            assert main([*words, "--max-wrong-share", share]) == 0
-        said = capsys.readouterr().out
-        assert f"calibrated weights: {out}" in said
-        assert "| 0 | " in said
-        new = read_pose_weights(out)
-        limits.append(new.refusal.max_risk)
-        for name, tensor in old.network.state_dict().items():
-            assert torch.equal(new.network.state_dict()[name], tensor), name
-        assert new.facts == facts
-        assert out.stat().st_size == pytest.approx(find_weights("parts").stat().st_size, rel=0.01)
-    assert limits[0] < limits[1]
+def test_a_command_of_before_says_what_to_do_instead(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pose", "calibrate", "mine.safetensors", "--max-wrong-share", "0.05"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("depthpose pose: error: no command 'calibrate'; no risk is calibrated")
+    assert "--min-certainty" in said
 
 
 @pytest.mark.parametrize(

@@ -29,10 +29,9 @@ CONFIGS = {
     "depth/view": {"generator": GENERATOR, "discriminator_width": 4, "pairs": PAIRS, "loop": LOOP},
     "depth/stereo": {"matcher": MATCHER, "pairs": PAIRS, "loop": LOOP},
     "depth/finetune": {"pairs": PAIRS, "loop": LOOP},
-    "pose/thesis": POSE | {"network": NETWORK, "calibration": {"number": 0}},
+    "pose/thesis": POSE | {"network": NETWORK},
     "pose/thesis-pointnet": POSE
-    | {"network": {"local": [4, 4], "pooled": [4, 8, 8], "head": [8, 8, 8]},
-       "calibration": {"number": 0}},
+    | {"network": {"local": [4, 4], "pooled": [4, 8, 8], "head": [8, 8, 8]}},
     "pose/thesis-depth-image": POSE | {"network": {"crop_px": 32, "widths": [4, 4, 8, 8]}},
     "pose/thesis-masks": {
         "images": {"folder": "there"},

@@ -27,7 +27,7 @@ def test_poses_are_those_of_the_cpu() -> None:
     inputs = [views.view(index).input for index in range(len(views))]
     expected, found = on_cpu.estimate_many(inputs), on_gpu.estimate_many(inputs)
     assert [one.status for one in found] == [one.status for one in expected]
-    assert sum(one.is_ok for one in found) >= 8
+    assert sum(one.is_posed for one in found) >= 8
     for mine, theirs in zip(found, expected, strict=True):
         if mine.camera_from_model is None or theirs.camera_from_model is None:
             continue

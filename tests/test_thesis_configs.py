@@ -39,8 +39,6 @@ NO_WEIGHT_FOLLOWS = frozenset({
     # How fast, and what is looked at meanwhile.
     "pairs.with_cache", "loop.steps", "loop.workers", "loop.device", "loop.save_every_steps",
     "loop.validate_every_steps", "loop.log_every_steps", "held_out",
-    "calibration.occlusion", "calibration.max_wrong_share", "calibration.negatives",
-    "calibration.max_negative_share", "calibration.noises", "calibration.without",
     # Without a meaning beside what is written.
     "encoder", "encoder_rate", "with_frozen_stem",
     "confidence_weight", "adam.halvings", "generator_adam.halvings", "discriminator_adam.halvings",

@@ -383,7 +383,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
     estimate = PoseEstimate(
         name="a", object="b", status="ok", camera_from_model=pose,
         covariance=torch.eye(6), free_motions=torch.zeros(0, 6), keypoints_m=torch.rand(8, 3),
-        inlier_share=0.5, residual_m=0.1, risk=0.1, signals={"x": 1.0}, seconds={"icp": 0.1},
+        inlier_share=0.5, residual_m=0.1, certainty=0.9, signals={"x": 1.0}, seconds={"icp": 0.1},
     )  # fmt: skip
     refusal = PoseEstimate(name="c", object="b", status="doubtful", reason="why")
     write_predictions(home, [Prediction(estimate=estimate), Prediction(estimate=refusal)])

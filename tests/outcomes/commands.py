@@ -35,7 +35,6 @@ network: {first_kernel: 3, encoder: [4, 4, 8, 8], decoder: [4, 4, 4, 8]}
 cloud: {max_points: 200}
 objects: {views: 2}
 held_out: {number: 2, occlusions: [0.0]}
-calibration: {number: 0}
 loop: {steps: 6, batch_size: 2, device: cpu, save_every_steps: 2}
 """
 
@@ -103,9 +102,6 @@ COMMANDS: Sequence[Command] = (
     ),
     Command("weights complete {home}/bare.safetensors --models {home}/parts", "whole.safetensors"),
     Command("weights import fcgf {home}/fcgf.pth --classes 2", "fcgf.safetensors"),
-    Command(
-        "pose calibrate {home}/p.safetensors --number 20 --negatives 2", "calibrated.safetensors"
-    ),
     Command("export pose --weights {home}/p.safetensors", "pose.onnx"),
     Command("export depth --weights {home}/k.safetensors", "depth.onnx"),
     Command(

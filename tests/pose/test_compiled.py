@@ -18,7 +18,6 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.compiled import choice
 from depthpose.pose.config import IcpConfig, VotingConfig
-from depthpose.pose.estimator.outline import overhang
 from depthpose.pose.estimator.scale import scale_of
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.refine import Refined, refine_best, refine_pose, refine_roughly
@@ -179,13 +178,6 @@ def test_rays(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     assert float(a[0][-1]) == float(a[1][-1]) == 1
 
 
-def test_outlines(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    pose = poses(surface, 1)[0]
-    cloud_m = seen(surface, pose)
-    a, b = both(lambda: overhang(cloud_m, pose, surface), monkeypatch)
-    assert abs(a - b) < 1e-12
-
-
 @pytest.mark.parametrize("is_weighted", [True, False])
 @pytest.mark.parametrize("refinements", [0, 3])
 def test_votes(refinements: int, is_weighted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,7 +256,6 @@ def test_what_is_not_finite_is_refused(surface: Surface) -> None:
         lambda: local_planes(cloud_m, cloud_m),
         lambda: look_along_rays(cloud_m, pose, surface),
         lambda: look_along_rays(cloud_m[5:], strange, surface),
-        lambda: overhang(cloud_m, pose[0], surface),
         lambda: refine_roughly(cloud_m[5:], strange, surface, IcpConfig()),
     )
     for call in calls:
@@ -334,7 +325,7 @@ def test_a_numba_that_cannot_be_imported_is_no_error(monkeypatch: pytest.MonkeyP
 @pytest.mark.slow
 def test_the_rest_of_the_tests_with_torch_alone() -> None:
     """Edge cases are tested once, by what is installed: here without numba."""
-    names = ("refine", "surface", "voting", "scale", "mirror", "outline", "sparse", "cloud",
+    names = ("refine", "surface", "voting", "scale", "mirror", "sparse", "cloud",
              "refusal", "keypoint_pose", "network", "estimator", "alternatives")  # fmt: skip
     files = [f"tests/pose/test_{name}.py" for name in names]
     environment = {**os.environ, "DEPTHPOSE_COMPILED": "0"}

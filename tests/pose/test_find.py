@@ -27,7 +27,7 @@ from depthpose.pose.regions import extent_m, find_regions, part_cloud, split_at_
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
-REFUSAL = RefusalConfig(max_risk=0.3, bias=2.0, slopes={"far": 3.0})
+REFUSAL = RefusalConfig()
 
 
 def table(with_thing: bool = True) -> torch.Tensor:
@@ -133,19 +133,12 @@ def test_what_the_camera_saw_through_a_found_pose_counts() -> None:
     depth_m = table(with_thing=False)
     _, mask = view_of(bracket(), TRUTHS[0])
     rows = mask.any(1).nonzero()[:, 0]
-    hole = mask & (torch.arange(240)[:, None] > int(rows.double().quantile(0.75)))
+    hole = mask & (torch.arange(240)[:, None] > int(rows.double().quantile(0.6)))
+    assert len(Oracle(tiny_weights(bracket()), TRUTHS).find(depth_m, CAMERA)) == 2
     depth_m[hole] = 1.2
-    found = {}
-    for name in ("far", "through"):
-        refusal = replace(REFUSAL, bias=10.0, slopes={name: 3.0})
-        net = Oracle(tiny_weights(bracket(), refusal=refusal), TRUTHS)
-        found[name] = net.find(depth_m, CAMERA)
-    assert len(found["far"]) == 2
-    through = sorted(estimate.signals["through"] for estimate in found["far"])
-    assert through[0] < 0.01
-    assert 0.02 < through[1] < 0.2
-    assert len(found["through"]) == 1
-    assert found["through"][0].signals["through"] == through[0]
+    (found,) = Oracle(tiny_weights(bracket()), TRUTHS).find(depth_m, CAMERA)
+    assert found.fit is not None
+    assert found.fit.agrees > 0.95
 
 
 def test_the_same_thing_is_found_once_however_it_is_parted() -> None:
@@ -196,7 +189,7 @@ def test_a_cloud_of_none_of_several_objects_is_refused() -> None:
     assert found.reason.startswith("none of bracket, bottle surely; ")
 
 
-def test_a_cloud_that_hardly_shows_its_object_is_refused_early_and_says_its_risk() -> None:
+def test_a_cloud_that_hardly_shows_its_object_is_refused_early() -> None:
     """What is likely to be there is compared in all its poses; what is not, in the best alone."""
     generator = torch.Generator().manual_seed(0)
     blob = 0.03 * torch.randn(2000, 3, generator=generator) + torch.tensor([0.0, 0.0, 0.8])
@@ -205,8 +198,6 @@ def test_a_cloud_that_hardly_shows_its_object_is_refused_early_and_says_its_risk
     (early,), (whole,) = net._try_many([given]), net.estimate_many([given])
     for refused in (early, whole):
         assert refused.status == "doubtful"
-        assert refused.risk is not None
-        assert refused.risk > REFUSAL.max_risk
     assert "check" in whole.seconds
     assert "check" not in early.seconds
 

@@ -51,20 +51,28 @@ def test_the_mirror_image_fits_a_mirrored_copy_better_and_the_object_worse(seed:
 
 
 def estimated(model: ObjectModel, seen: ObjectModel) -> PoseEstimate:
-    net = Oracle(tiny_weights(model, refusal=RefusalConfig(max_risk=1.0)), [TRUTH])
+    refusal = RefusalConfig(max_beyond=1.0, min_agreement=0.0, min_explained=0.0)
+    net = Oracle(tiny_weights(model, refusal=refusal), [TRUTH])
     return net.estimate(cloud=noisy(cloud_of(seen, TRUTH)))
+
+
+def mirror_gain_of(found: PoseEstimate) -> float:
+    assert found.identity is not None
+    assert found.identity.mirror_gain is not None
+    return found.identity.mirror_gain
 
 
 def test_a_mirrored_copy_is_refused_with_its_reason() -> None:
     refused = estimated(bracket(), mirrored(bracket()))
     assert refused.status == "doubtful"
-    assert refused.reason.startswith("the cloud fits the mirror image better (by 0.")
+    assert refused.reason.startswith("the mirror image of bracket fits better (by ")
     assert refused.camera_from_model is None
-    assert refused.signals["mirror"] > 0.05
-    assert estimated(bracket(), bracket()).signals["mirror"] < 0.005
+    assert mirror_gain_of(refused) > 0.0025
+    assert mirror_gain_of(estimated(bracket(), bracket())) < -0.001
 
 
 def test_an_object_that_is_its_own_mirror_image_is_answered() -> None:
     found = estimated(bottle(), mirrored(bottle()))
-    assert found.is_ok
-    assert found.signals["mirror"] == 0
+    assert found.is_posed
+    assert found.identity is not None
+    assert found.identity.mirror_gain is None

@@ -19,7 +19,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
     write_predictions,
 )
-from depthpose.pose.types import Alternative, PoseEstimate
+from depthpose.pose.types import Alternative, Fit, Identity, PoseEstimate
 
 
 def some_pose(seed: int) -> Rigid:
@@ -40,8 +40,9 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
         free_motions=torch.randn(1, 6, generator=generator),
         inlier_share=0.75,
         residual_m=0.002,
-        risk=0.125,
+        fit=Fit(agrees=0.875, seen=0.5, beyond=0.0, explained=0.9, noise_m=0.001),
         certainty=0.5,
+        identity=Identity(status="not excluded", size=1.02, size_deviation=0.01, reason="so"),
         alternatives=(
             Alternative(
                 camera_from_model=some_pose(seed + 9),
@@ -91,7 +92,7 @@ def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> Non
 
 
 def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
-    by_votes = replace(answer("c", 1), seconds={}, risk=None, certainty=None, alternatives=())
+    by_votes = replace(answer("c", 1), seconds={}, fit=None, certainty=None, alternatives=())
     slow = replace(refusal(), seconds={"segmentation": 0.1})
     sent = [
         Prediction(estimate=answer(), place=Place(1, 20, 6)),
@@ -142,8 +143,8 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     for change, said in (
         ({"name": 3}, "name and object are 3 and 'cat'; write two words"),
         ({"status": "okay"}, "status 'okay': did you mean 'ok'"),
-        ({"status": "votes do not meet"}, "an estimate that is ok has a camera_from_model"),
-        ({"camera_from_model": None}, "an estimate that is ok has a camera_from_model"),
+        ({"status": "votes do not meet"}, "an estimate that is ok or ambiguous has a camera"),
+        ({"camera_from_model": None}, "an estimate that is ok or ambiguous has a camera"),
         ({"camera_from_model": flipped}, "camera_from_model is no rigid transform; write 4 rows"),
         ({"covariance": [[1.0, "x"]]}, "covariance is not 6 rows of 6 numbers"),
         ({"covariance": 7 * [6 * [0.0]]}, "covariance is not 6 rows of 6 numbers"),

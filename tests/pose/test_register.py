@@ -46,7 +46,7 @@ def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:
     assert len(errors_m) >= 4
     assert max(errors_m) < 0.05 * part().diameter_m
     for one in found:
-        assert one.risk is not None
+        assert one.fit is not None
         assert {"voting", "icp", "check"} <= one.seconds.keys()
 
 
@@ -91,7 +91,7 @@ def test_copies_of_a_symmetric_part_are_one_answer() -> None:
     flange = make_part("flange")
     sample = view(flange, 1)
     found = Registration([flange]).estimate_many([sample.input])[0]
-    assert found.is_ok, found.reason
+    assert found.is_posed, found.reason
     assert all("degrees about" in other.difference for other in found.alternatives)
     assert not any(other.probability > 0.4 for other in found.alternatives)
 
@@ -125,7 +125,8 @@ def test_registration_without_icp_is_an_error() -> None:
 def doubting_net() -> GeoPoseNet:
     """Trained weights that take none of their own answers."""
     weights = read_pose_weights(find_weights("parts"))
-    nothing = replace(weights, refusal=replace(weights.refusal, max_risk=0.0))
+    strict = replace(weights.refusal, min_agreement=1.0, max_beyond=0.0, min_explained=1.0)
+    nothing = replace(weights, refusal=strict)
     return GeoPoseNet(nothing, EstimateConfig(register_refused=True))
 
 
@@ -133,7 +134,7 @@ def test_what_the_network_doubts_is_registered_where_wanted() -> None:
     model = next(m for m in doubting_net().models if m.name == "connector")
     samples = [view(model, index) for index in range(4)]
     found = doubting_net().estimate_many([sample.input for sample in samples])
-    answered = [(f, s) for f, s in zip(found, samples, strict=True) if f.is_ok]
+    answered = [(f, s) for f, s in zip(found, samples, strict=True) if f.is_posed]
     assert len(answered) >= 2
     points_m = sample_surface(model, 500)[0]
     for one, sample in answered:

@@ -6,7 +6,6 @@ import pytest
 import torch
 from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_at, tiny_weights
 
-from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -27,38 +26,42 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     scale = scale_of(cloud_m, begun.camera_from_model, surface)
     assert scale.times == pytest.approx(times, abs=0.012)
     assert scale.sigma < 0.02
-    assert (scale.error > 0.03) == (abs(times - 1) > 0.09)
+    assert (scale.gain > 0.05) == (abs(times - 1) > 0.09)
 
 
-def estimated(times: float, max_scale_error: float = 0.03) -> PoseEstimate:
+def estimated(times: float, max_size_error: float = 0.03) -> PoseEstimate:
     model = bracket()
-    refusal = RefusalConfig(max_risk=1.0, max_scale_error=max_scale_error)
+    refusal = RefusalConfig(
+        max_size_error=max_size_error, max_beyond=1.0, min_agreement=0.0, min_explained=0.0
+    )
     net = Oracle(tiny_weights(model, refusal=refusal), [TRUTH])
     return net.estimate(cloud=noisy(cloud_of(scaled(model, times), TRUTH)))
 
 
-def test_a_copy_of_another_size_is_refused_with_its_scale() -> None:
-    refused = estimated(0.9)
+def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
+    refused = estimated(0.85)
     assert refused.status == "doubtful"
-    assert refused.reason.startswith("the cloud fits the object best at 0.9")
-    assert "3% are allowed" in refused.reason
     assert refused.camera_from_model is None
-    assert refused.signals["scale"] == pytest.approx(0.9, abs=0.02)
+    assert refused.identity is not None
+    assert refused.identity.status == "contradicted"
+    assert refused.identity.size == pytest.approx(0.85, abs=0.02)
+    assert refused.reason.startswith("0.85 times the model's size fits best (standard deviation")
+    assert ", and the sensor explains " in refused.reason
     for times in (1.0, 0.98, 1.02):
-        assert estimated(times).is_ok
-    assert estimated(0.9, max_scale_error=1.0).is_ok
-    assert "scale" not in estimated(0.9, max_scale_error=1.0).signals
+        found = estimated(times)
+        assert found.is_ok
+        assert found.identity is not None
+        assert found.identity.status == "confirmed", found.identity
+    assert estimated(0.85, max_size_error=1.0).is_ok
+    assert estimated(0.85, max_size_error=1.0).identity is None
 
 
-def test_without_icp_the_scale_is_not_measured() -> None:
+def test_without_icp_nobody_asks_whether_it_is_the_object() -> None:
     config = EstimateConfig(with_icp=False)
     net = Oracle(tiny_weights(bracket()), [TRUTH], config=config)
-    assert "scale" not in net.estimate(cloud=noisy(cloud_of(bracket(), TRUTH))).signals
-
-
-def test_a_share_beyond_its_range_is_refused() -> None:
-    with pytest.raises(InputError, match=r"max_scale_error is 0.0, but it is a share above 0"):
-        RefusalConfig(max_scale_error=0.0)
+    found = net.estimate(cloud=noisy(cloud_of(bracket(), TRUTH)))
+    assert found.is_ok
+    assert found.identity is None
 
 
 @pytest.mark.parametrize("kind", get_args(NegativeKind))

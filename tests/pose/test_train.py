@@ -21,12 +21,9 @@ from depthpose.pose.config import (
     CloudConfig,
     MeshConfig,
     ObjectsConfig,
-    RefusalConfig,
     SensorConfig,
 )
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
-from depthpose.pose.estimator import risk_of
-from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import unit_directions
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
@@ -42,11 +39,9 @@ from depthpose.pose.train import (
     read_models,
     train_pose,
 )
-from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.held_out import (
     HELD_OUT_SEED,
     HeldOut,
-    calibrated,
     held_out_objects,
     score_held_out,
     table_text,
@@ -81,7 +76,6 @@ def _training(**changes: object) -> PoseTraining:
         cloud=_CLOUD,
         network=_SMALL,
         held_out=HeldOutConfig(number=2, occlusions=(0.0,)),
-        calibration=CalibrationConfig(number=0),
         loop=LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1),
     )
     return dataclasses.replace(config, **changes)
@@ -383,146 +377,40 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> 
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_weights_are_calibrated_and_measured_as_the_file_has_them(
+def test_weights_are_measured_as_the_file_has_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[PoseWeights] = []
-
-    def chosen(weights: PoseWeights, *_: object) -> PoseWeights:
-        seen.append(weights)
-        return dataclasses.replace(weights, refusal=RefusalConfig(bias=-1.0, slopes={"far": 2.0}))
 
     def counted(weights: PoseWeights, *_: object) -> dict[str, dict[str, float | None]]:
         seen.append(weights)
         return {}
 
-    monkeypatch.setattr("depthpose.pose.train.runs.calibrated", chosen)
     monkeypatch.setattr("depthpose.pose.train.runs.score_held_out", counted)
     path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
-    assert len(seen) == 2
-    for weights in seen:
-        for name, tensor in written.network.state_dict().items():
-            assert torch.equal(weights.network.state_dict()[name], tensor), name
-    assert written.refusal == seen[1].refusal
-    assert written.refusal.slopes == {"far": 2.0}
+    (measured,) = seen
+    for name, tensor in written.network.state_dict().items():
+        assert torch.equal(measured.network.state_dict()[name], tensor), name
 
 
-def _as_known(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-    """Answers of which 2 in 5 are wrong: those of a large signal. The refusal alone decides."""
-    estimates, errors = [], []
-    for index in range(len(objects)):
-        far = (37 * index % 100) / 100
-        signals = dict.fromkeys(SIGNALS, 0.0) | {"far": far}
-        risk = risk_of(signals, weights.refusal)
-        is_ok = risk is None or risk <= weights.refusal.max_risk
-        pose = Rigid(torch.eye(3), torch.ones(3)) if is_ok else None
-        status, reason = ("ok", "") if is_ok else ("doubtful", "so")
-        estimates.append(PoseEstimate(name="", object="", status=status, reason=reason,
-                                      camera_from_model=pose, signals=signals))  # fmt: skip
-        errors.append((0.02 if far < 0.6 else 0.4) if is_ok else math.inf)
-    return estimates, errors
-
-
-def test_the_refusal_is_what_limits_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", _as_known)
-    weights = tiny_weights(*_models())
-    held_out = HeldOutConfig(number=100, occlusions=(0.0,))
-    uncalibrated = score_held_out(weights, _VIEWS, held_out)["0"]
-    assert uncalibrated["wrong"] == pytest.approx(0.4)
-    views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=0)
-    chosen = calibrated(weights, _VIEWS, views)
-    table = score_held_out(chosen, _VIEWS, held_out)
-    assert (table["0"]["wrong"] or 0.0) <= 0.02
-    assert (table["0"]["right"] or 0.0) > 0.55
-    opened = dataclasses.replace(chosen.refusal, max_risk=1.0)
-    without = score_held_out(dataclasses.replace(chosen, refusal=opened), _VIEWS, held_out)["0"]
-    assert without["wrong"] == pytest.approx(0.4)
-    assert "| occluded % | right % | wrong % | refused %" in table_text(table)
-    assert table_text(table).splitlines()[-1].startswith("| 0 | ")
-
-
-def test_the_refusal_is_chosen_on_views_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Objects] = []
-
-    def posed(_: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-        seen.append(objects)
-        return _as_known(weights, objects)
-
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
-    weights = tiny_weights(*_models())
-    assert calibrated(weights, _VIEWS, CalibrationConfig(number=0)) is weights
-    _ = calibrated(weights, _VIEWS, CalibrationConfig(number=20, negatives=0))
-    _ = score_held_out(weights, _VIEWS, HeldOutConfig(number=6, occlusions=(0.0,)))
-    calibration, held_out = seen[0][0].input.points_m, seen[-1][0].input.points_m
-    assert calibration.shape != held_out.shape or not torch.equal(calibration, held_out)
-
-
-def test_the_refusal_is_chosen_on_negatives_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Negatives of a signal above 0.4, as 1 in 3 of the right answers has it, are refused."""
-    shown: list[tuple[ObjectModel, ...]] = []
-
-    def posed(given: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-        estimates, errors = _as_known(given, objects)
-        shown.append(objects.models)
-        if any(model is not given.models[k % 2] for k, model in enumerate(objects.models)):
-            signals = dict.fromkeys(SIGNALS, 0.0) | {"far": 0.5, "size": 0.5}
-            estimates = [dataclasses.replace(one, signals=signals) for one in estimates]
-        return estimates, errors
-
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
-    weights = tiny_weights(*_models())
-    views = CalibrationConfig(number=200, max_wrong_share=0.02, negatives=16)
-    config = calibrated(weights, _VIEWS, views).refusal
-    # Each at three noises: the first 50 views of an object, all, and the negatives.
-    assert [len(models) for models in shown] == [2] * 6 + [10, 12, 10]
-    assert {model.name for model in shown[-1]} == {"bracket", "bottle"}
-    right, negative = dict.fromkeys(SIGNALS, 0.0), {"far": 0.5, "size": 0.5}
-    assert (risk_of(right | {"far": 0.5}, config) or 0.0) <= config.max_risk
-    assert (risk_of(right | negative, config) or 0.0) > config.max_risk
-
-
-def test_the_refusal_is_chosen_at_several_noises(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Objects] = []
-
-    def posed(given: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-        seen.append(objects)
-        return _as_known(given, objects)
-
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", posed)
-    weights = tiny_weights(*_models())
-    config = CalibrationConfig(number=21, negatives=4, noises=(1.0, 30.0), without=("few",))
-    chosen = calibrated(weights, _VIEWS, config)
-    low, high = _VIEWS.sensor.noise
-    wanted = [(low, high), (min(20.0, 30 * low), 20.0)]
-    assert [objects.config.sensor.noise for objects in seen] == wanted * 2
-    assert [len(objects) for objects in seen] == [20, 22, 4, 4]
-    first, second = (objects[0].input.points_m for objects in seen[:2])
-    assert first.shape != second.shape or not torch.equal(first, second)
-    assert "far" in chosen.refusal.slopes
-    assert "few" not in chosen.refusal.slopes
-    for wrong in ((), (0.0,), (math.nan,), (math.inf,)):
-        with pytest.raises(InputError, match="noises is"):
-            CalibrationConfig(noises=wrong)
-    with pytest.raises(InputError, match="without is 'fwe'; did you mean 'few'"):
-        CalibrationConfig(without=("fwe",))
-
-
-def test_a_network_that_is_never_right_is_not_looked_at_for_long(
+def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    looked_at: list[int] = []
-
-    def wrong(_: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-        looked_at.append(len(objects))
-        estimates, errors = _as_known(weights, objects)
-        return estimates, [0.5 for _ in errors]
-
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", wrong)
-    weights = tiny_weights(*_models())
-    refusal = calibrated(weights, _VIEWS, CalibrationConfig(number=600)).refusal
-    assert looked_at == [34, 32, 34]
-    assert refusal.max_risk == 0
+    pose = Rigid(torch.eye(3), torch.ones(3))
+    shared = {"name": "", "object": "", "camera_from_model": pose}
+    sure = PoseEstimate(status="ok", **shared)
+    unsure = PoseEstimate(status="ambiguous", reason="others fit", **shared)
+    none = PoseEstimate(name="", object="", status="doubtful", reason="so")
+    rows = [(sure, 0.02)] * 5 + [(sure, 0.4), (unsure, 0.01), (unsure, 0.5), (none, math.inf)] * 1
+    answers = ([one for one, _ in rows], [error for _, error in rows])
+    monkeypatch.setattr("depthpose.pose.train.held_out._posed", lambda *_: answers)
+    held_out = HeldOutConfig(number=4, occlusions=(0.0,))
+    table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
+    shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}
+    assert table["0"] == pytest.approx(shares)
+    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in table_text(table)
+    assert table_text(table).splitlines()[-1].startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
 
 
 def test_models_come_from_one_source(tmp_path: Path) -> None:
@@ -586,12 +474,6 @@ def test_a_config_is_read_and_opens_with_its_own_command(path: Path) -> None:
         (FramesConfig, "frames has no folder"),
         (lambda: FramesConfig(folder="x", share=0.0), "share is 0.0, but it is above 0"),
         (lambda: HeldOutConfig(number=0), "nothing would be measured; take 25"),
-        (lambda: CalibrationConfig(number=5), "number is 5; nothing can be chosen by fewer"),
-        (lambda: CalibrationConfig(max_wrong_share=1.0), "max_wrong_share is 1.0"),
-        (
-            lambda: CalibrationConfig(occlusion=(0.6, 0.0)),
-            "calibration.occlusion is (0.6, 0.0), but it is a range within 0.0 to 0.95, the lower",
-        ),
         (lambda: HeldOutConfig(occlusions=(0.0, 1.0)), "held_out.occlusions is (1.0, 1.0)"),
         (lambda: ModelsConfig(symmetry_tolerance=-1.0), "symmetry_tolerance is -1.0"),
         (lambda: PoseTraining(confidence_weight=-1.0), "confidence_weight is -1.0; take 0"),

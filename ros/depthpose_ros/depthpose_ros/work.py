@@ -98,7 +98,7 @@ class Poses:
             if not any(one.is_ok for one in found):
                 raise InputError(f"{found[0].object}: no pose: {found[0].reason}")
         header = copied_header(depth)
-        poses = [(one.object, one.camera_from_model) for one in found]
+        poses = [(one.object, one.camera_from_model) for one in found if one.is_ok]
         return [(name, pose_from_rigid(header, pose)) for name, pose in poses if pose is not None]
 
 

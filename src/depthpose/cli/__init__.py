@@ -41,10 +41,6 @@ COMMANDS = {
     ),
     "pose track": ("pose.track:track", "follow an object through depth images or clouds"),
     "pose train": ("pose.training:train", "your CAD file, or a config, to a network that poses it"),
-    "pose calibrate": (
-        "pose.training:calibrate",
-        "recalibrate the risk above which a pose is refused",
-    ),
     "pose evaluate": ("pose.commands:evaluate", "measure poses on a BOP or LineMOD data set"),
     "depth match": ("depth.commands:match", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth.commands:predict", "one image, or many, or a video, to metric depth"),
@@ -130,6 +126,10 @@ _REMOVED_OPTIONS = {
     ("reproduce", "--made"): "synthetic views are asked for by --synthetic",
 }
 """Options of before, by the first word of their command, and what to do instead."""
+_REMOVED_COMMANDS = {
+    "pose calibrate": "no risk is calibrated any more; 'pose predict --min-certainty' says how "
+    "sure an answer must be, for all weights",
+}
 _THESIS = ("reproduce", "figure")
 """Groups of commands that reproduce the thesis."""
 _EXIT_CODES = """exit codes:
@@ -298,8 +298,8 @@ def _explain(given: list[str]) -> int:
     verb = next((word for word in given[1:] if not word.startswith("-")), "")
     if group and verb:
         verbs = [name.partition(" ")[2] for name in inside]
-        print(f"depthpose {group}: error: no command {verb!r}; {nearest_name(verb, verbs)}",
-              file=sys.stderr)  # fmt: skip
+        instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))
+        print(f"depthpose {group}: error: no command {verb!r}; {instead}", file=sys.stderr)
         return 2
     print(_overview(inside, group), file=sys.stdout if asked_help else sys.stderr)
     return 0 if asked_help else 2

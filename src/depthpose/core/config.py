@@ -39,6 +39,7 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
             f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
             "values, one 'name: value' a line."
         )
+    content = _without_retired(content, kind)
     _refuse_unknown_keys(content, kind, str(path), prefix="")
     return config_from_dict(_over_defaults(content, kind), kind, source=str(path))
 
@@ -49,6 +50,7 @@ def config_from_dict(content: Mapping[Any, Any], kind: type[ConfigT], *, source:
     Raises:
         InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
     """
+    content = _without_retired(content, kind)
     _refuse_unknown_keys(content, kind, source, prefix="")
     refuse_distorted(content, kind, source)
     try:
@@ -90,6 +92,12 @@ def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[str, Any]:
             nested = _over_defaults(own, type(default))
             laid[field.name] = kept | nested
     return laid
+
+
+def _without_retired(content: Mapping[Any, Any], kind: type) -> Mapping[Any, Any]:
+    """Leave out settings of before that mean nothing any more (``RETIRED`` in their class)."""
+    retired = getattr(kind, "RETIRED", ())
+    return {name: value for name, value in content.items() if name not in retired}
 
 
 def _plain_value(value: object) -> object:

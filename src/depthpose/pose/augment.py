@@ -105,6 +105,17 @@ def grow_mask(mask: Mask, grow_px: int) -> Mask:
     return grown if grow_px > 0 else ~grown
 
 
+def shift_mask(mask: Mask, rows: int, columns: int) -> Mask:
+    """Shift a mask by so many pixels down and right; what comes in is not of it."""
+    shifted = mask.roll((rows, columns), (0, 1))
+    for axis, steps in enumerate((rows, columns)):
+        if steps:
+            size = mask.shape[axis]
+            start = 0 if steps > 0 else max(0, size + steps)
+            shifted.narrow(axis, start, min(abs(steps), size)).fill_(False)
+    return shifted
+
+
 def measure(
     depth_m: Depth, focal_px: tuple[float, float], config: SensorConfig, generator: torch.Generator
 ) -> Depth:
@@ -148,6 +159,7 @@ def measure(
         read_m = read_m + white * (0.001 + 0.002 * read_m.square())
     else:
         read_m = depth_m + 0.0005 * white
+    read_m = read_m + uniform(generator, *config.offset_m)
     return torch.where(is_lost, torch.nan, read_m)
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
@@ -93,6 +94,12 @@ class Surface:
     ) -> Int64[Tensor, "*batch n"]:
         """Give the number of the surface point near each point: searched, or looked up."""
         return self.nearest(points_m) if is_exact else self.boxes.look_up(points_m)
+
+    @cached_property
+    def spacing_m(self) -> float:
+        """Distance from a point to the third nearest, in the median."""
+        some_m = self.points_m[:: max(1, len(self.points_m) // 1000)]
+        return float(np.median(self.tree.query(some_m.numpy(), k=4, workers=1)[0][:, -1]))
 
     @cached_property
     def least_silhouette_m2(self) -> float:

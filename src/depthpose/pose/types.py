@@ -12,6 +12,7 @@ from depthpose.core.rigid import Rigid, numbers_text
 
 Status = Literal[
     "ok",
+    "ambiguous",
     "unreadable",
     "unusable input",
     "too few points",
@@ -20,8 +21,12 @@ Status = Literal[
     "not observable",
     "doubtful",
 ]
-"""An answer, or why there is none. Unreadable: no input came; it is tried again by the next run.
-Doubtful: nothing plainly wrong, but the risk is too great."""
+"""An answer, or why there is none. Ambiguous: the pose fits, and so do others; it is given with
+them. Unreadable: no input came; it is tried again by the next run. Doubtful: the pose does not fit
+what the camera saw, or another size or the mirror image fits better than the sensor explains."""
+
+POSED: tuple[Status, ...] = ("ok", "ambiguous")
+"""With a pose."""
 
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, looked for anew, or
@@ -266,6 +271,53 @@ class Alternative:
     signals: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """Whether a pose fits what the camera saw, at the sensor's own scale.
+
+    Attributes:
+        agrees: of the posed surface that was seen, the share that lies where the camera saw
+            something; the rest it saw through, or it lies behind the object's own readings.
+        seen: share of the visible posed surface that agrees; the rest may be occluded.
+        beyond: share of the object's readings beside the posed silhouette.
+        explained: share of these readings near the posed surface; a mask's border is not.
+        noise_m: standard deviation of the sensor's readings there, estimated from them.
+    """
+
+    agrees: float
+    seen: float
+    beyond: float
+    explained: float
+    noise_m: float
+
+
+IdentityStatus = Literal["confirmed", "not excluded", "contradicted"]
+"""Confirmed: neither another size nor the mirror image fits. Not excluded: one of them fits as
+well, or it was not tested. Contradicted: one fits better by more than the sensor explains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """Whether what was posed is the object, and not a copy of it or another thing.
+
+    Attributes:
+        status: confirmed, not excluded or contradicted.
+        size: of what was seen in sizes of the model, as it fits best; None where not measured.
+        size_deviation: standard deviation of it.
+        mirror_gain: by how much nearer, in diameters, the points lie to the mirror image of the
+            model; negative where the model is nearer, None where both are one or none was measured.
+        other: another known object that it may be, the likeliest; None where there is none.
+        reason: one sentence; empty where it is confirmed.
+    """
+
+    status: IdentityStatus
+    size: float | None = None
+    size_deviation: float | None = None
+    mirror_gain: float | None = None
+    other: str | None = None
+    reason: str = ""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseEstimate:
     """The pose of one object, or the reason why there is none.
@@ -273,23 +325,23 @@ class PoseEstimate:
     Attributes:
         name: that of the input.
         object: name of the object.
-        status: ``ok``, or the kind of refusal.
+        status: ``ok``, ``ambiguous``, or the kind of refusal.
         reason: one sentence for people; empty where the status is ``ok``.
-        camera_from_model: the pose; None where it is refused.
+        camera_from_model: the pose; None where it is refused. Where it is ambiguous, the likeliest.
         keypoints_m: the found keypoints in the camera frame.
         covariance: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn
-            off may have one of 0.2 degrees; such errors are covered by ``risk``. Finite: it
+            off may have one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it
             leaves out the motions of ``free_motions``.
         free_motions: unit vectors of (rotation, translation) along which a declared continuous
             symmetry makes the variance infinite; no row where there is none.
         inlier_share: share of the votes that agree, 0..1.
         residual_m: root mean square distance: of keypoints, or of points to the surface after ICP.
-        risk: chance that neither the pose nor an alternative is right, as the weights' refusal was
-            calibrated; None where none was.
-        certainty: chance that this very pose is right, given the alternatives; None where there is
-            neither a risk nor an alternative.
+        fit: whether the pose fits what the camera saw; None where it was not compared.
+        certainty: chance that this very pose is right and none of the alternatives, where one is;
+            None where they were not compared.
+        identity: whether it is this object; None where that was not asked.
         alternatives: other poses that fit, the likeliest first.
-        signals: what the risk is computed from, by name; kept for refusals too.
+        signals: by what the poses that fit were compared, by name; kept for refusals too.
         seconds: time of each stage.
         tracking: how it came about, in a sequence; None elsewhere.
     """
@@ -304,28 +356,34 @@ class PoseEstimate:
     free_motions: Float[Tensor, "m 6"] | None = None
     inlier_share: float | None = None
     residual_m: float | None = None
-    risk: float | None = None
+    fit: Fit | None = None
     certainty: float | None = None
+    identity: Identity | None = None
     alternatives: tuple[Alternative, ...] = ()
     signals: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     tracking: Tracking | None = None
 
     def __post_init__(self) -> None:
-        # No default may look like success: an answer has a pose, a refusal has a reason.
-        assert (self.camera_from_model is not None) == self.is_ok
+        # No default may look like success: an answer has a pose, all others have a reason.
+        assert (self.camera_from_model is not None) == self.is_posed
         assert self.is_ok or self.reason
 
     @property
     def is_ok(self) -> bool:
-        """Whether there is a pose."""
+        """Whether there is one pose, and no other is nearly as likely."""
         return self.status == "ok"
+
+    @property
+    def is_posed(self) -> bool:
+        """Whether there is a pose, ok or ambiguous."""
+        return self.status in POSED
 
     def __repr__(self) -> str:
         """Say it in one line."""
         said = f"{self.object}: {self.status}"
         if self.camera_from_model is not None:
             said += f", t_m=[{numbers_text(self.camera_from_model.t_m.tolist())}]"
-        if self.risk is not None:
-            said += f", risk {self.risk:.3f}"
+        if self.certainty is not None:
+            said += f", certainty {self.certainty:.3f}"
         return f"PoseEstimate({said}{f', {self.reason}' if self.reason else ''})"

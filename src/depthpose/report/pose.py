@@ -14,7 +14,7 @@ from depthpose.core.draw import draw_outline
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import object_points
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import Identity, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.overlay import (
     alternative_layers,
     draw_pose,
@@ -75,6 +75,8 @@ def pose_sentence(found: PoseEstimate) -> str:
         return f"Refused ({found.status}): {found.reason}."
     x, y, z = found.camera_from_model.t_m.tolist()
     said = f"The {found.object} is at x {x:.4f}, y {y:.4f}, z {z:.4f} m in the camera's frame."
+    if found.status == "ambiguous":
+        said += f" It is ambiguous: {found.reason}."
     if not found.alternatives:
         return said
     return f"{said} Other poses fit as well: {'; '.join(alternative_lines(found))}."
@@ -83,6 +85,14 @@ def pose_sentence(found: PoseEstimate) -> str:
 def alternative_lines(found: PoseEstimate) -> list[str]:
     """Say of each alternative how it differs from the pose, and how likely it is."""
     return [f"{one.difference}, {one.probability:.0%}" for one in found.alternatives]
+
+
+def identity_words(identity: Identity) -> str:
+    """Say whether it is the object, and the size that fits best."""
+    said = identity.status + (f" ({identity.reason})" if identity.reason else "")
+    if identity.size is not None and identity.size_deviation is not None:
+        said += f"; size {identity.size:.3f} +- {identity.size_deviation:.3f} of the model's"
+    return said
 
 
 def pose_facts(
@@ -102,8 +112,14 @@ def pose_facts(
     facts = [("object", f"{found.object}, {model.diameter_m:.4f} m long")]
     if how:
         facts.append(("by", how))
-    if found.risk is not None:
-        facts.append(("risk that no named pose is right", f"{found.risk:.3f}"))
+    if found.fit is not None:
+        facts += [
+            ("fits", f"{found.fit.agrees:.1%} of the posed surface that was seen agrees"),
+            ("seen", f"{found.fit.seen:.0%} of the surface that faces the camera"),
+            ("the sensor's noise there", f"{1000 * found.fit.noise_m:.1f} mm"),
+        ]
+    if found.identity is not None:
+        facts.append(("identity", identity_words(found.identity)))
     if found.certainty is not None:
         facts.append(("certainty of this pose", f"{found.certainty:.3f}"))
     facts += [("another pose that fits", line) for line in alternative_lines(found)]

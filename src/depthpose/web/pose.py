@@ -11,7 +11,9 @@ from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files import MAP_SUFFIXES, read_stored_depth, write_cloud, write_image
 from depthpose.core.units import METRES, Unit
 from depthpose.pose.cloud import object_points
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
+from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
 from depthpose.pose.mesh import (
@@ -59,9 +61,11 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         found, voted = target.net.estimate_with_votes(given)
     elif found is None:
         found = target.net.estimate_many([given])[0]
+    if (least := form.number("min_certainty")) is not None:
+        found = with_status(found, EstimateConfig(min_certainty=least).min_certainty)
     folder = form.results()
     return Answer(
-        is_ok=found.is_ok,
+        is_ok=found.is_posed,
         said=pose_sentence(found),
         facts=_facts(found, target),
         tables=pose_tables(found),

@@ -96,7 +96,7 @@ def _refuse_unable(method: PoseMethod) -> None:
 def _write(found: list[tuple[Prediction, Job[Any]]], method: PoseMethod, out: Path) -> int:
     """Write what was found, files and a page of what was answered; give the exit code."""
     predictions = [prediction for prediction, _ in found]
-    answered = [pair for pair in found if pair[0].estimate.is_ok]
+    answered = [pair for pair in found if pair[0].estimate.is_posed]
     answers, own = [prediction for prediction, _ in answered], [job for _, job in answered]
     write_files(answers, own, out, method)
     write_pose_page(out, answers, own, method)

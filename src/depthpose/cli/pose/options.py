@@ -55,6 +55,8 @@ class EstimateOptions:
     """of RANSAC, for each keypoint of a network."""
     icp: bool = True
     """refine the voted pose by ICP."""
+    min_certainty: float = 0.9
+    """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
     up_to_symmetry: bool = False
     """copies of an object that look nearly alike are one answer, not alternatives."""
     register_refused: bool = False
@@ -78,6 +80,7 @@ class EstimateOptions:
         return EstimateConfig(
             voting=voting_config(self.voting, self.hypotheses),
             with_icp=self.icp,
+            min_certainty=self.min_certainty,
             up_to_symmetry=self.up_to_symmetry,
             register_refused=self.register_refused,
             device=own_device(self.device),

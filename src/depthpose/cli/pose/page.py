@@ -70,7 +70,7 @@ def _answer_sections(
     image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     models = {model.name: model for model in method.models}
     readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
-    answered = [predictions[k].estimate.is_ok for k in readable]
+    answered = [predictions[k].estimate.is_posed for k in readable]
     sections: list[Section] = []
     for k in (readable[chosen] for chosen in choose_answers(answered)):
         given = jobs[k].read()
@@ -117,7 +117,7 @@ def _results(predictions: Sequence[Prediction], shown: int) -> Section:
     """List every refusal, then the answers."""
     counts = Counter(prediction.estimate.status for prediction in predictions)
     said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_ok)]
+    rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_posed)]
     text = f"{len(predictions)} inputs: {said}. Shown below: {shown}"
     text += "." if shown == len(predictions) else ", answers and refusals spread evenly."
     if len(rows) > _MOST_ROWS:
@@ -138,7 +138,8 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         "x_m": x_m,
         "y_m": y_m,
         "z_m": z_m,
-        "risk": estimate.risk,
+        "fit": None if estimate.fit is None else estimate.fit.agrees,
+        "identity": None if estimate.identity is None else estimate.identity.status,
         "certainty": estimate.certainty,
         "alternatives": "; ".join(alternative_lines(estimate)),
         "reason": estimate.reason,

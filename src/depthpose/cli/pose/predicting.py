@@ -143,7 +143,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
         print(plain_table([_answer_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
         print(_FRAME)
     if len(shown) == 1 and not shown[0].is_ok:
-        print(f"refused: {shown[0].reason}")
+        what = "refused" if shown[0].camera_from_model is None else shown[0].status
+        print(f"{what}: {shown[0].reason}")
     for prediction in predictions[:_SAID]:
         for line in alternative_lines(prediction.estimate):
             print(f"{prediction.estimate.name}: {line}")
@@ -154,7 +155,7 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
 
 
 def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Say what was found of one input: object, status, translation, quaternion, risk."""
+    """Say what was found of one input: object, status, translation, quaternion, the answers."""
     row: dict[str, Any] = {
         "input": estimate.name,
         "object": estimate.object,
@@ -165,8 +166,10 @@ def _answer_row(estimate: PoseEstimate) -> dict[str, Any]:
         quaternion = Rotation.from_matrix(pose.R.double().numpy()).as_quat()
         row |= {"x, y, z [m]": numbers_text(pose.t_m.tolist())}
         row |= {"qx, qy, qz, qw": numbers_text(quaternion.tolist())}
-    for name, chance in (("certainty", estimate.certainty), ("risk", estimate.risk)):
-        row[name] = None if chance is None else f"{chance:.3f}"
+    fit, certainty, identity = estimate.fit, estimate.certainty, estimate.identity
+    row["fit"] = None if fit is None else f"{fit.agrees:.3f}"
+    row["certainty"] = None if certainty is None else f"{certainty:.3f}"
+    row["identity"] = None if identity is None else identity.status
     return row if estimate.tracking is None else row | {"tracking": estimate.tracking}
 
 
@@ -200,7 +203,7 @@ def write_bop_files(
     image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
     found: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
     for prediction in predictions:
-        if prediction.place is not None and prediction.estimate.is_ok:
+        if prediction.place is not None and prediction.estimate.is_posed:
             found[prediction.place[:2]].append(prediction.estimate)
     for (scene, image), estimates in found.items():
         name = _picture_name(scene, image)
@@ -216,7 +219,7 @@ def _picture_name(scene: int, image: int) -> str:
 def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
     picture = picture_of(instance)
     for estimate in estimates:
-        assert estimate.camera_from_model is not None
+        assert estimate.is_posed
         model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture

@@ -32,6 +32,8 @@ class SequenceOptions:
     """which of the known objects; of a data set its name or number."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
+    min_certainty: float = 0.9
+    """below it a pose that is found is ambiguous, not ok, and so are those that follow from it."""
     device: Device = "cpu"
 
     def refuse_unusable(self) -> None:
@@ -91,7 +93,7 @@ def track(
     from depthpose.cli.pose.tracking import track_bop, track_folder
 
     frames.refuse_unusable()
-    config = EstimateConfig(device=frames.device)
+    config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
     method = source_of(weights, register, frames.unit, frames.dataset, config).build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")

@@ -1,11 +1,9 @@
-"""``depthpose pose train`` and ``pose calibrate``."""
+"""``depthpose pose train``."""
 
 import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-
-import tyro
 
 from depthpose.cli.help import group
 from depthpose.cli.options import TrainingOptions, changed
@@ -82,8 +80,8 @@ def train(
     """Train a network on your CAD file, or by a config.
 
     Views of the object are rendered while it trains: no photograph is needed. At the end the
-    refusal is calibrated and the whole is measured on held-out views; OUT holds the weights with
-    the model in them, their card, config, metrics and states. A training that stopped goes on with
+    whole is measured on held-out views; OUT holds the weights with the model in them, their card,
+    config, metrics and states. A training that stopped goes on with
     --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
     line is printed each minute.
 
@@ -118,59 +116,6 @@ def train(
         path = run_stage(chosen, run)
     if is_first:
         say_trained(path)
-    return 0
-
-
-@group
-class CalibrationOptions:
-    """How the refusal is chosen."""
-
-    config: Path | None = None
-    """YAML of the training: its sensor and distances, and what is not said here."""
-    max_wrong_share: float | None = None
-    """accepted share of wrong answers among all answers."""
-    number: int | None = None
-    """views of each object to choose by."""
-    negatives: int | None = None
-    """views of something else in the place of each object to choose by; 0: none."""
-    max_negative_share: float | None = None
-    """accepted share of such views that get an answer."""
-
-    @property
-    def chosen(self) -> "PoseTraining":
-        """Settings of the training with these."""
-        from depthpose.core.config import read_config
-        from depthpose.pose.train import PoseTraining
-
-        chosen = PoseTraining() if self.config is None else read_config(self.config, PoseTraining)
-        limits = {name: value for name, value in vars(self).items() if name != "config"}
-        return dataclasses.replace(chosen, calibration=changed(chosen.calibration, **limits))
-
-
-def calibrate(
-    weights: tyro.conf.Positional[str],
-    out: Path,
-    calibration: CalibrationOptions = CalibrationOptions(),
-) -> int:
-    """Recalibrate the risk above which a pose is refused.
-
-    Synthetic views decide: of the objects, and of other things in their place (other objects,
-    copies of another size, mirrored ones, boxes, balls, hands). A larger share of wrong answers
-    gives more answers. The network stays as it is, and is then measured on other views.
-
-        depthpose pose calibrate mine.safetensors --max-wrong-share 0.05 --out bold.safetensors
-
-    Args:
-        weights: a file, a name or hf://OWNER/NAME.
-        out: the .safetensors file to write.
-    """
-    from depthpose.core.checkpoint import find_weights
-    from depthpose.core.run import refuse_to_replace
-    from depthpose.pose.train import recalibrate
-
-    refuse_to_replace(out)
-    print(recalibrate(find_weights(weights), out, calibration.chosen))
-    print(f"calibrated weights: {out}")
     return 0
 
 

@@ -127,7 +127,9 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Panel]:
         poses = (view.truth.camera_from_model, found.camera_from_model)
         picture, K = close_up(views.picture(k), view.input.mask, view.input.K)
         image = draw_boxes(picture, poses, models[view.input.object], K)
-        caption = view.input.name if found.is_ok else f"{view.input.name}: refused, {found.reason}"
+        caption = (
+            view.input.name if found.is_posed else f"{view.input.name}: refused, {found.reason}"
+        )
         panels.append(Panel(caption, image))
     return panels
 
@@ -151,7 +153,7 @@ def picture_sections(
             image = draw_boxes(picture, poses, model, K)
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
             write_image(path, image)
-            caption = instance.name if estimate.is_ok else f"{instance.name}: {estimate.reason}"
+            caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
             pictures.append(Picture(path=path, caption=caption))
         if pictures:
             title = f"Figure 3-5: {folder.name}"

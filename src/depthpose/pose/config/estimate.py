@@ -1,8 +1,9 @@
 """Settings of an estimate and of the metrics: when a pose is withheld, when it is right."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
+from depthpose.core.config_values import check_settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.pose.config.geometry import IcpConfig, VotingConfig
 
@@ -20,22 +21,27 @@ _CANDIDATE_SLOPES = {
 
 @dataclass(frozen=True, kw_only=True)
 class RefusalConfig:
-    """When an estimate is withheld: one risk of being wrong, from signals that need no truth."""
+    """When an estimate is withheld. The limits are shares of what was seen, on any sensor."""
 
-    max_risk: float = 0.5
-    """An estimate of a larger risk is refused; chosen on data by ``calibrate_refusal``. 1: none is,
-    as calibration needs it."""
+    RETIRED: ClassVar[frozenset[str]] = frozenset(
+        {"max_risk", "bias", "slopes", "means", "max_scale_error"}
+    )
+    """Settings of a calibrated risk, in weights written before 2026-11-27; they are left out."""
 
-    bias: float = 0.0
-    """Log odds of being wrong where every signal is 0.99, its logarithm 0."""
+    min_agreement: float = 0.8
+    """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
+    of a real sensor takes a tenth, other objects leave a fifth and more."""
 
-    slopes: dict[str, float] = field(default_factory=dict)
-    """How much the logarithm of each signal adds to the log odds; none: no estimate is refused for
-    its risk. That of ``rough`` may be negative: it says how much tilted normals mean."""
+    max_beyond: float = 0.03
+    """Of the object's readings so many may lie beside the posed silhouette, its border apart."""
 
-    means: dict[str, float] = field(default_factory=dict)
-    """Of each signal's logarithm over right answers: a refusal names the signal that lies farthest
-    above its mean, weighed by its slope. That of 0 where there is none."""
+    min_explained: float = 0.75
+    """Of the object's readings so many must lie near the posed surface; the rest may be of what a
+    loose mask takes in."""
+
+    max_size_error: float = 0.03
+    """The size of the model that fits best may differ from 1 by so much beyond what the sensor
+    explains; 1: neither size nor mirror image is tested. Without ICP they are not."""
 
     candidate_slopes: dict[str, float] = field(default_factory=lambda: dict(_CANDIDATE_SLOPES))
     """Weight of each signal's logarithm as evidence against a pose among several that fit."""
@@ -45,32 +51,16 @@ class RefusalConfig:
     share of what it moves the object's points; one that moves it within itself (of a plane or
     ball) is not observable."""
 
-    max_scale_error: float = 0.03
-    """The scale of the model that fits the cloud best may differ from 1 by so much, beside two of
-    its standard deviations; 1: it is not measured. Without ICP it is not."""
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether a risk is known, or is about to be learnt from all answers."""
-        return bool(self.slopes) or self.max_risk == 1
-
     def __post_init__(self) -> None:
-        """Refuse a risk that is no probability, and limits that refuse everything."""
-        if not 0 <= self.max_risk <= 1:
-            raise InputError(
-                f"max_risk is {self.max_risk}, but a risk lies between 0 and 1; 0.5 refuses "
-                "what is more likely wrong than right"
-            )
-        if not 0 < self.max_scale_error <= 1:
-            raise InputError(
-                f"max_scale_error is {self.max_scale_error}, but it is a share above 0 up to 1 "
-                "(any size is taken); take 0.03"
-            )
-        if not 0 <= self.min_hold < 1:
-            raise InputError(
-                f"min_hold is {self.min_hold}, but it is a share from 0 (refuse no view for its "
-                "shape) to 1; take 0.02"
-            )
+        """Refuse limits that are no share, or refuse everything."""
+        check_settings(
+            self,
+            min_agreement="[0, 1]",
+            max_beyond="[0, 1]",
+            min_explained="[0, 1]",
+            max_size_error="(0, 1]",
+            min_hold="[0, 1)",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +76,10 @@ class EstimateConfig:
     with_icp: bool = True
     """Whether it does; without, the voted pose is the answer."""
 
+    min_certainty: float = 0.9
+    """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
+    all the same. 0: the likeliest pose is always the answer."""
+
     up_to_symmetry: bool = False
     """Whether copies of the object that look nearly alike count as one answer: its certainty is
     then of them all, and they are not named as alternatives."""
@@ -97,9 +91,9 @@ class EstimateConfig:
     for, as in ``find``, because it may not be there."""
 
     rough_rigidity_diameters: float = 0.3
-    """In place of ``voting.rigidity_diameters`` where a calibrated risk decides: ICP
-    corrects rough votes, and the risk detects those that stay wrong. Nothing is refused for it
-    then: where fewer than four keypoints agree all are fitted, and ICP begins at both fits."""
+    """In place of ``voting.rigidity_diameters`` where ICP refines the votes: it corrects rough
+    ones, and what does not fit then is refused. Where fewer than four keypoints agree all are
+    fitted, and ICP begins at both fits."""
 
     max_cloud_points: int = 100_000
     """Of a larger cloud so many points are taken, evenly in their order, before anything else."""
@@ -111,7 +105,8 @@ class EstimateConfig:
     """Where the network runs: cpu, cuda, cuda:1, ..."""
 
     def __post_init__(self) -> None:
-        """Refuse counts of nothing."""
+        """Refuse counts of nothing, and a certainty that is none."""
+        check_settings(self, min_certainty="[0, 1]")
         if self.rough_rigidity_diameters < self.voting.rigidity_diameters:
             raise InputError(
                 f"rough_rigidity_diameters is {self.rough_rigidity_diameters}, but the strict one, "

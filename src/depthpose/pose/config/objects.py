@@ -37,6 +37,10 @@ class SensorConfig:
     missing: tuple[float, float] = (0.0, 0.1)
     """Share of readings lost beside those of shadows and grazing surfaces; half in patches."""
 
+    offset_m: tuple[float, float] = (-0.005, 0.005)
+    """Added to all readings of a view alike: real sensors are off by 3 to 6 mm as a whole. Not of
+    ``none``."""
+
     def __post_init__(self) -> None:
         """Refuse unknown kinds and empty ranges."""
         known = get_args(SensorKind)
@@ -46,6 +50,7 @@ class SensorConfig:
         if self.noise_correlation_px is not None:
             refuse_range("noise_correlation_px", self.noise_correlation_px, (0.0, 30.0), "(3, 6)")
         refuse_range("missing", self.missing, (0.0, 0.9), "(0.0, 0.1)")
+        refuse_range("offset_m", self.offset_m, (-0.1, 0.1), "(-0.005, 0.005), in metres")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +99,9 @@ class ObjectsConfig:
     mask_error_px: int = 3
     """The mask is grown or shrunk by up to so many pixels of the full image."""
 
+    mask_shift_px: int = 2
+    """And shifted by up to so many of them along each axis, as a predicted mask is."""
+
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """What measures the depth."""
 
@@ -116,8 +124,10 @@ class ObjectsConfig:
         self._place_centre()
         if not 0 <= self.occluded_share <= 1:
             raise InputError(f"occluded_share is {self.occluded_share}, but a share is 0 to 1")
-        if not 0 <= self.mask_error_px <= 20:
-            raise InputError(f"mask_error_px is {self.mask_error_px}; take 0 to 20, usually 3")
+        for name, usual in (("mask_error_px", 3), ("mask_shift_px", 2)):
+            if not 0 <= getattr(self, name) <= 20:
+                given = getattr(self, name)
+                raise InputError(f"{name} is {given}; take 0 to 20, usually {usual}")
         for name in ("frame_objects", "frame_clutter"):
             low, high = getattr(self, name)
             least = 1 if name == "frame_objects" else 0

@@ -2,8 +2,5 @@
 
 from depthpose.pose.estimator.net import GeoPoseNet as GeoPoseNet
 from depthpose.pose.estimator.pose import Voted as Voted
-from depthpose.pose.estimator.refusal import calibrate_refusal as calibrate_refusal
-from depthpose.pose.estimator.refusal import fit_candidate_slopes as fit_candidate_slopes
-from depthpose.pose.estimator.refusal import risk_of as risk_of
 from depthpose.pose.estimator.register import Registration as Registration
 from depthpose.pose.estimator.regression import DepthImageRegressor as DepthImageRegressor

@@ -1,5 +1,6 @@
 """The best of the poses that fit, as an answer, or the reason why it is withheld."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,19 +10,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import (
     Candidate,
     PoseAmbiguities,
     alternatives_among,
     share_out,
 )
-from depthpose.pose.estimator.doubt import Posed, find_refusal
-from depthpose.pose.estimator.evidence import without_motions
-from depthpose.pose.estimator.prepare import Refusal
-from depthpose.pose.estimator.refusal import risk_of
+from depthpose.pose.estimator.evidence import observability, without_motions
+from depthpose.pose.estimator.fit import fit_of, seen_about
+from depthpose.pose.estimator.identity import identity_of
+from depthpose.pose.estimator.prepare import Prepared, Refusal
 from depthpose.pose.refine import Refined
-from depthpose.pose.types import Alternative, ObjectModel, PoseEstimate, PoseFit, Vote
+from depthpose.pose.surface import Surface
+from depthpose.pose.types import Alternative, Fit, ObjectModel, PoseEstimate, PoseFit, Vote
 from depthpose.pose.voting import free_motions
 
 
@@ -37,6 +39,16 @@ class Clock:
         now = time.perf_counter()
         self.seconds[stage] = now - self.last
         self.last = now
+
+
+class Posed(NamedTuple):
+    """A cloud and the pose that was found for it; ``free``: the motions that symmetries allow."""
+
+    cloud: Prepared
+    pose: Rigid
+    model: ObjectModel
+    surface: Surface
+    free: Float[Tensor, "m 6"]
 
 
 class Found(NamedTuple):
@@ -58,7 +70,6 @@ def candidate_of(source: PoseFit | Refined) -> Candidate:
 def choose(
     candidates: Sequence[Candidate],
     evidence: Sequence[dict[str, float]],
-    signals: dict[str, float],
     copies: PoseAmbiguities,
     refusal: RefusalConfig,
 ) -> Found:
@@ -66,8 +77,7 @@ def choose(
     shares = share_out(evidence, refusal.candidate_slopes)
     number = int(shares.argsort(descending=True, stable=True)[0])
     alternatives = alternatives_among(candidates, evidence, shares, copies)
-    every = {**signals, **evidence[number]}
-    return Found(*candidates[number], every, float(shares[number]), alternatives)
+    return Found(*candidates[number], evidence[number], float(shares[number]), alternatives)
 
 
 def answer_of(model: ObjectModel, found: Found, vote: Vote | None = None) -> PoseEstimate:
@@ -88,51 +98,89 @@ def answer_of(model: ObjectModel, found: Found, vote: Vote | None = None) -> Pos
     )
 
 
-def checked(
+def judged(
     posed: Posed,
     found: Found,
     answer: PoseEstimate,
     refusal: RefusalConfig,
+    config: EstimateConfig,
     clock: Clock,
-    *,
-    with_icp: bool = True,
 ) -> PoseEstimate:
-    """Withhold an answer that is doubtful; its signals gain those that are measured last."""
-    reason = find_refusal(posed, found.signals, refusal, with_icp=with_icp)
+    """Ask whether the pose fits, whether it is that object, and whether others are as likely."""
+    seen = seen_about(posed.cloud.cloud_m, posed.cloud.view, posed.surface.diameter_m)
+    fit = fit_of(seen, posed.pose, posed.surface)
+    reason, identity = misfit_of(fit, refusal) or _not_observable(posed, refusal), None
+    if reason is None and config.with_icp and refusal.max_size_error < 1:
+        identity = identity_of(
+            posed.cloud, posed.pose, posed.model, posed.surface, fit, seen, refusal.max_size_error
+        )
+        if identity.status == "contradicted":
+            reason = Refusal(status="doubtful", reason=identity.reason)
     clock.note("check")
-    risk = risk_of(found.signals, refusal)
+    answer = replace(answer, fit=fit, identity=identity)
     if reason is not None:
-        return withheld(answer.object, reason, clock, answer, risk)
-    return _with_certainty(replace(answer, risk=risk, seconds=clock.seconds), found)
+        return withheld(answer.object, reason, clock, answer)
+    sure = replace(answer, certainty=found.share, alternatives=found.alternatives,
+                   seconds=clock.seconds)  # fmt: skip
+    return with_status(sure, config.min_certainty)
 
 
-def _with_certainty(answer: PoseEstimate, found: Found) -> PoseEstimate:
-    """Share what the risk leaves among the pose and its alternatives."""
-    if answer.risk is None and not found.alternatives:
+def with_status(answer: PoseEstimate, min_certainty: float) -> PoseEstimate:
+    """Say that a pose is ambiguous where its certainty is below the limit, and else ok."""
+    if answer.camera_from_model is None:
         return answer
-    known = 1.0 if answer.risk is None else 1 - answer.risk
-    others = tuple(replace(a, probability=known * a.probability) for a in found.alternatives)
-    return replace(answer, certainty=known * found.share, alternatives=others)
+    if answer.certainty is None or answer.certainty >= min_certainty:
+        return replace(answer, status="ok", reason="")
+    others = f"{len(answer.alternatives)} others fit too" if answer.alternatives else "others fit"
+    reason = (
+        f"this pose has a certainty of {answer.certainty:.0%}, below min_certainty "
+        f"{min_certainty:.0%}: {others}"
+    )
+    return replace(answer, status="ambiguous", reason=reason)
+
+
+def misfit_of(fit: Fit, limits: RefusalConfig) -> Refusal | None:
+    """Say why a pose does not fit what the camera saw; None where it does."""
+    if fit.agrees < limits.min_agreement:
+        reason = (
+            f"of the posed surface that was seen {1 - fit.agrees:.0%} lies where the camera saw "
+            f"something else, and {1 - limits.min_agreement:.0%} may: another object or pose"
+        )
+    elif fit.beyond > limits.max_beyond:
+        reason = (
+            f"{fit.beyond:.1%} of the object's readings lie beside the posed silhouette, and "
+            f"{limits.max_beyond:.0%} may: another object, a larger one, or a mask of more than it"
+        )
+    elif fit.explained < limits.min_explained:
+        reason = (
+            f"{1 - fit.explained:.0%} of the object's readings are nowhere near the posed surface, "
+            f"and {1 - limits.min_explained:.0%} may be: another object, or a mask of more than it"
+        )
+    else:
+        return None
+    return Refusal(status="doubtful", reason=reason)
+
+
+def _not_observable(posed: Posed, config: RefusalConfig) -> Refusal | None:
+    observable, motion = observability(posed.cloud.cloud_m, posed.pose, posed.surface, posed.free)
+    if observable >= config.min_hold:
+        return None
+    what = "turn" if float(motion[:3].norm()) > math.sqrt(0.5) else "shift"
+    return Refusal(
+        status="not observable",
+        reason=f"the seen part of the object leaves one {what} undetermined: it moves the surface "
+        f"along its normals by {observable:.1%} of the motion only; no declared symmetry allows "
+        "it. Declare the symmetry, or look from a side that shows more",
+    )
 
 
 def withheld(
-    object: str,
-    refusal: Refusal,
-    clock: Clock,
-    answer: PoseEstimate | None = None,
-    risk: float | None = None,
+    object: str, refusal: Refusal, clock: Clock, answer: PoseEstimate | None = None
 ) -> PoseEstimate:
     """Keep what was found out but the pose: a refusal cannot be taken for an answer."""
-    known = answer is not None
-    return PoseEstimate(
-        name="",
-        object=object,
-        status=refusal.status,
-        reason=refusal.reason,
-        keypoints_m=answer.keypoints_m if known else None,
-        inlier_share=answer.inlier_share if known else None,
-        residual_m=answer.residual_m if known else None,
-        risk=risk,
-        signals=answer.signals if known else {},
-        seconds=clock.seconds,
-    )
+    known = PoseEstimate(name="", object=object, status=refusal.status, reason=refusal.reason,
+                         seconds=clock.seconds)  # fmt: skip
+    if answer is None:
+        return known
+    kept = ("keypoints_m", "inlier_share", "residual_m", "fit", "identity", "signals")
+    return replace(known, **{name: getattr(answer, name) for name in kept})

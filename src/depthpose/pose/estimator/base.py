@@ -12,6 +12,7 @@ from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig, Unit
 from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_copies
+from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import SearchTargets, find_objects, nothing_found, which_object
 from depthpose.pose.estimator.given import (
     AnyArray,
@@ -118,7 +119,7 @@ class PoseEstimator(ABC):
         if len(names) == 1:
             return self.estimate_many([given])[0]
         estimates = self._try_many([replace(given, object=name) for name in names])
-        return which_object(estimates, self.refusal)
+        return with_status(which_object(estimates, self.refusal), self.config.min_certainty)
 
     @own_arithmetic()
     def estimate_instances(
@@ -176,7 +177,7 @@ class PoseEstimator(ABC):
             unit: of the depth, where its camera says none.
 
         Returns:
-            Estimates that are ok; none where nothing was found.
+            Estimates that have a pose, ok or ambiguous; none where nothing was found.
 
         Raises:
             InputError: as for :meth:`estimate`.

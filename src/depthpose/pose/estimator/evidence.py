@@ -1,7 +1,4 @@
-"""Evidence for and against a pose: signals that need no truth.
-
-Each is larger where the pose is worse, but for those of :data:`CONTEXT`.
-"""
+"""By what poses that fit are compared: signals that need no truth, larger for a worse pose."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +13,6 @@ from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import local_planes
 from depthpose.pose.estimator.prepare import Prepared
 from depthpose.pose.surface import NEAR, Surface, look_along_rays
-from depthpose.pose.types import PoseFit
 
 _SAMPLED = 1000
 """At most so many points of the cloud are used, evenly taken."""
@@ -29,44 +25,6 @@ _COMPARED = 100
 """At about so many points a copy is chosen."""
 _FLOOR = 0.01
 """Added to a signal before its logarithm is taken."""
-
-SIGNALS: dict[str, str] = {
-    "misfit": "the keypoints fit the model badly for how sure they are (log misfit {:.2g})",
-    "disagree": "the directions miss the pose's keypoints by {:.2g} rad in the mean",
-    "scatter": "{:.0%} of ICP's starts end at another pose",
-    "tilt": "the cloud's normals differ from the posed surface's (1 - cosine {:.2g})",
-    "gap": "the points lie {:.1%} of the diameter off the posed surface",
-    "far": "{:.0%} of the points are nowhere near the posed surface",
-    "front": "the posed surface would occlude {:.0%} of the points that were seen",
-    "unseen": "{:.0%} of the posed surface that faces the camera has no point",
-    "through": "the camera saw through {:.0%} of the posed surface",
-    "few": "the cloud fills few voxels: ten are {:.1%} of it",
-    "size": "the size that fits the cloud best may differ from the model's by {:.0%}",
-    "grown": "a copy of another size lies nearer to the points (by {:.2g} limits of nearness)",
-    "mirror": "the cloud fits the mirror image better (by {:.2g} limits of nearness)",
-    "overhang": "the points reach {:.1%} of the diameter beyond the posed silhouette",
-    "shortfall": "the posed silhouette reaches {:.1%} of the diameter beyond the points, where the "
-    "camera saw what lies behind",
-    "rough": "the cloud has a curvature of {:.2g} in the median, where a ball has 1",
-}
-"""Name of each signal, and what it says to people."""
-CONTEXT = ("rough",)
-"""Signals that are neither for nor against a pose, but say how much others mean: under a noisy
-sensor the normals of a right pose differ from the cloud's as well. A refusal never names them."""
-_SMOOTH = 0.1
-"""Below this roughness a sensor counts as without noise: what is smoother says nothing more."""
-LATE = ("size", "grown", "mirror", "overhang", "shortfall")
-"""Signals that are measured where nothing else refuses the pose; without ICP they are not."""
-
-
-def vote_signals(cloud: Prepared, fit: PoseFit) -> dict[str, float]:
-    """Say how well the keypoints fit the model, and how little there was to vote.
-
-    Args:
-        cloud: what voted.
-        fit: of the voted keypoints.
-    """
-    return {"misfit": float(fit.misfit.log1p()), "few": 10 / len(cloud.points_m)}
 
 
 def disagreement(
@@ -101,14 +59,10 @@ def log_signal(signal: float) -> float:
 
 
 class CloudNormals(NamedTuple):
-    """Some points of a cloud in float64, their normals, and the median curvature there.
-
-    The curvature shows how noisy the sensor is.
-    """
+    """Some points of a cloud in float64, and their normals."""
 
     points_m: Float64[Tensor, "n 3"]
     normals: Float64[Tensor, "n 3"]
-    rough: float
 
 
 def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
@@ -119,8 +73,7 @@ def cloud_normals(cloud_m: Float[Tensor, "n 3"]) -> CloudNormals:
     """
     thinned_m = take_evenly(cloud_m.double(), _THINNED)
     some_m = take_evenly(thinned_m, _TILTED)
-    normals, bend = local_planes(thinned_m, some_m)
-    return CloudNormals(some_m, normals, max(_SMOOTH, float(bend.median())))
+    return CloudNormals(some_m, local_planes(thinned_m, some_m)[0])
 
 
 def surface_signals(
@@ -156,7 +109,7 @@ def surface_signals(
         "unseen": unseen,
     }
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [{**dict(zip(columns, row, strict=True)), "rough": normals.rough} for row in rows]
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def observability(

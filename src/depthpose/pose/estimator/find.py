@@ -35,10 +35,10 @@ _REST = 0.25
 _LEAST_POINTS = 60
 _SHARED = 0.3
 """Answers that explain so large a share of the same points are of one thing; one of them stays."""
-_SEEN_THROUGH = 0.2
-"""Where the camera saw through more of the posed surface, there is no such object."""
 _SUNK = 0.15
 """Where a table or wall lies before more of the posed surface, there is no such object."""
+_NAMED = 0.02
+"""Other objects of a larger share are named."""
 _ONE = 0.8
 """Where no object among several has so large a share of the probability, none is answered."""
 _WHOLE, _HALF = 0.9, 0.5
@@ -92,8 +92,9 @@ class _Answer:
     @property
     def worth(self) -> float:
         """How sure it is, and how much it explains: of two that are equally sure the larger."""
-        risk = 0.0 if self.estimate.risk is None else self.estimate.risk
-        return (1 - risk) * self.share * float(self.explained.double().mean())
+        fit = self.estimate.fit
+        agrees = 1.0 if fit is None else fit.agrees
+        return agrees * self.share * float(self.explained.double().mean())
 
 
 def find_objects(view: ViewInput, known: SearchTargets) -> list[PoseEstimate]:
@@ -187,7 +188,7 @@ def _estimate_regions(
     found = known.estimate_many([given for _, given in inputs]) if inputs else []
     of_cloud: dict[int, list[PoseEstimate]] = {}
     for (k, _), estimate in zip(inputs, found, strict=True):
-        if estimate.is_ok and _is_possible(scene, estimate, known):
+        if estimate.is_posed and _is_possible(scene, estimate, known):
             of_cloud.setdefault(k, []).append(estimate)
     return [_best(some, clouds[k], known) for k, some in of_cloud.items()]
 
@@ -217,12 +218,12 @@ def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> P
         The best, its certainty given the others; refused where none is ok, or where another object
         is too likely.
     """
-    some = [estimate for estimate in estimates if estimate.is_ok]
+    some = [estimate for estimate in estimates if estimate.is_posed]
     spent: Counter[str] = Counter()
     for estimate in estimates:
         spent.update(estimate.seconds)
     if not some:
-        least = min(estimates, key=lambda one: 1.0 if one.risk is None else one.risk)
+        least = max(estimates, key=lambda one: 0.0 if one.fit is None else one.fit.agrees)
         names = ", ".join(one.object for one in estimates)
         reason = f"none of {names} surely; {least.object} comes nearest: {least.reason}"
         return replace(least, reason=reason, seconds=dict(spent))
@@ -234,7 +235,7 @@ def which_object(estimates: Sequence[PoseEstimate], refusal: RefusalConfig) -> P
         )
         return PoseEstimate(
             name=best.name, object=best.object, status="doubtful", signals=best.signals,
-            reason=f"it may be {said}; say which by object", risk=best.risk, seconds=dict(spent),
+            reason=f"it may be {said}; say which by object", seconds=dict(spent),
         )  # fmt: skip
     return replace(best, seconds=dict(spent))
 
@@ -245,8 +246,13 @@ def _given_others(some: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEst
     share, estimate = float(shares[number]), some[number]
     certainty = None if estimate.certainty is None else share * estimate.certainty
     others = tuple(replace(a, probability=share * a.probability) for a in estimate.alternatives)
-    risk = None if estimate.risk is None else 1 - share * (1 - estimate.risk)
-    return replace(estimate, certainty=certainty, risk=risk, alternatives=others), share
+    found = replace(estimate, certainty=certainty, alternatives=others)
+    if len(some) > 1 and estimate.identity is not None and share < 1 - _NAMED:
+        second = some[int(shares.topk(2).indices[1])].object
+        reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
+        identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
+        found = replace(found, identity=identity)
+    return found, share
 
 
 def _best(some: Sequence[PoseEstimate], cloud: Tensor, known: SearchTargets) -> _Answer:
@@ -286,7 +292,7 @@ def _is_possible(scene: _Scene, estimate: PoseEstimate, known: SearchTargets) ->
     """Whether the camera saw enough of the surface, not through it, and no plane before it."""
     pose, signals = estimate.camera_from_model, estimate.signals
     assert pose is not None
-    if signals["unseen"] > _HIDDEN or signals["through"] > _SEEN_THROUGH:
+    if signals["unseen"] > _HIDDEN:
         return False
     surface = known.surface_of(estimate.object)
     posed_m = pose.double().apply(surface.points_m)

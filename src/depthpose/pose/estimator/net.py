@@ -157,7 +157,7 @@ class GeoPoseNet(PoseEstimator):
 
     @property
     def refusal(self) -> RefusalConfig:
-        """When an answer is withheld: calibrated with the weights."""
+        """When an answer is withheld."""
         return self.weights.refusal
 
     @torch.no_grad()
@@ -194,7 +194,7 @@ class GeoPoseNet(PoseEstimator):
         start = time.perf_counter()
         (found,) = self._registration.estimate_many([given])
         spent_s = time.perf_counter() - start
-        best = found if found.is_ok else doubted
+        best = found if found.is_posed else doubted
         return replace(best, seconds={**doubted.seconds, "registration": spent_s})
 
     @torch.no_grad()

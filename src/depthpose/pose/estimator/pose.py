@@ -8,14 +8,15 @@ from depthpose.pose.estimator.alternatives import PoseAmbiguities, evidence_of, 
 from depthpose.pose.estimator.answer import (
     Clock,
     Found,
+    Posed,
     answer_of,
     candidate_of,
-    checked,
     choose,
+    judged,
+    misfit_of,
     withheld,
 )
-from depthpose.pose.estimator.doubt import Posed, refuse_risky
-from depthpose.pose.estimator.evidence import vote_signals
+from depthpose.pose.estimator.fit import fit_of, seen_about
 from depthpose.pose.estimator.prepare import Refusal
 from depthpose.pose.estimator.prepare import Voted as Voted
 from depthpose.pose.refine import refine_best
@@ -44,27 +45,27 @@ def pose_from_directions(
         refusal: when the answer is withheld.
         config: voting and ICP.
         is_likely: whether the cloud is likely to show the object; else the other poses that fit are
-            not compared where the best is too risky by itself.
+            not compared where the best does not fit by itself.
     """
     model, surface, _ = known
     clock = Clock()
     vote = cast_votes(voted, config.voting)
     clock.note("voting")
-    fits = _fits(vote, model, config, refusal.is_calibrated)
+    fits = _fits(vote, model, config)
     if isinstance(fits, Refusal):
         return withheld(model.name, fits, clock)
     clock.note("svd")
     found = _refine(voted, fits, known, refusal, config, is_likely)
     if isinstance(found, Refusal):
         clock.note("icp")
-        return withheld(model.name, found, clock, risk=found.risk)
+        return withheld(model.name, found, clock)
     if config.with_icp:
         clock.note("icp")
     answer = answer_of(model, found, vote)
     assert answer.free_motions is not None
     free = answer.free_motions.double()
     posed = Posed(voted.cloud, found.pose, model, surface, free)
-    return checked(posed, found, answer, refusal, clock, with_icp=config.with_icp)
+    return judged(posed, found, answer, refusal, config, clock)
 
 
 def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
@@ -77,10 +78,8 @@ def cast_votes(voted: Voted, config: VotingConfig) -> Vote:
     return meet_lines(points, directions, weight, config.refinements)
 
 
-def _fits(
-    vote: Vote, model: ObjectModel, config: EstimateConfig, with_risk: bool
-) -> PoseFit | Refusal:
-    """Fit the keypoints that agree; where a risk decides, also all of them."""
+def _fits(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+    """Fit the keypoints that agree; where ICP refines the fits, also all of them."""
     found = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
     total = len(found)
     if int(found.sum()) < _LEAST:
@@ -90,10 +89,10 @@ def _fits(
             "are needed: too few points, or not the object that the mask promises",
         )
     strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if with_risk else strict)
+    limit_m = model.diameter_m * (rough if config.with_icp else strict)
     used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, found)
     choices = [used] if int(used.sum()) >= _LEAST else []
-    if with_risk and (not choices or config.with_icp) and not torch.equal(used, found):
+    if config.with_icp and not torch.equal(used, found):
         choices.append(found)
     if not choices:
         return Refusal(
@@ -120,27 +119,24 @@ def _refine(
 ) -> Found | Refusal:
     model, surface, copies = known
     cloud_m = voted.cloud.cloud_m
-    fit, scatter, refined = _row(fits, 0), 0.0, None
+    fit, refined = _row(fits, 0), None
     others = _none_of(fit.camera_from_model)
     if config.with_icp:
         best = refine_best(cloud_m.double(), fits.camera_from_model, surface, config.icp)
-        scatter = 1.0  # where ICP finds no near surface, nothing supports the pose
         if float(best.refined.inlier_share) > 0:
-            fit, scatter, refined = _row(fits, best.start), best.scatter, best.refined
+            fit, refined = _row(fits, best.start), best.refined
             others = best.others
     first = candidate_of(fit if refined is None else refined)
     icp = None if refined is None else config.icp
-    signals = {**vote_signals(voted.cloud, fit), "scatter": scatter}
     if not is_likely:
-        (own,) = evidence_of(voted, first.pose[None], model, copies, surface)
-        measured = {**signals, **own}
-        refused = refuse_risky(measured, measured, refusal)
+        seen = seen_about(cloud_m, voted.cloud.view, surface.diameter_m)
+        refused = misfit_of(fit_of(seen, first.pose, surface), refusal)
         if refused is not None:
             return refused
     candidates = find_candidates(cloud_m, first, others, copies, surface, icp)
     poses = Rigid.stack([one.pose for one in candidates])
     evidence = evidence_of(voted, poses, model, copies, surface)
-    return choose(candidates, evidence, signals, copies, refusal)
+    return choose(candidates, evidence, copies, refusal)
 
 
 def _none_of(pose: Rigid) -> Rigid:

@@ -50,11 +50,10 @@ class Prepared:
 
 @dataclass(frozen=True, kw_only=True)
 class Refusal:
-    """Why there is no pose, and the risk of a wrong one, where that is the reason."""
+    """Why there is no pose."""
 
     status: Status
     reason: str
-    risk: float | None = None
 
 
 class Voted(NamedTuple):

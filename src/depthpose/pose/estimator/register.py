@@ -18,14 +18,14 @@ from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig, Un
 from depthpose.pose.estimator.alternatives import PoseAmbiguities, find_candidates
 from depthpose.pose.estimator.answer import (
     Clock,
+    Posed,
     answer_of,
     candidate_of,
-    checked,
     choose,
+    judged,
     withheld,
 )
 from depthpose.pose.estimator.base import PoseEstimator, refused
-from depthpose.pose.estimator.doubt import Posed
 from depthpose.pose.estimator.evidence import (
     CloudNormals,
     cloud_normals,
@@ -43,22 +43,7 @@ CANDIDATE_SLOPES = {
     name: slope for name, slope in RefusalConfig().candidate_slopes.items() if name != "disagree"
 }
 """As of :class:`RefusalConfig`; no network disagrees."""
-REFUSAL = RefusalConfig(
-    max_risk=0.1409,
-    bias=48.084,
-    slopes={
-        "scatter": 0.132, "tilt": 0.577, "far": 0.194, "unseen": 0.236, "through": 1.835,
-        "few": 0.392, "size": 1.233, "grown": 2.243, "mirror": 4.097, "overhang": 1.283,
-        "shortfall": 0.257,
-    },
-    means={
-        "scatter": -3.22, "tilt": -4.12, "far": -3.6, "unseen": -1.54, "through": -4.59,
-        "few": -3.17, "size": -3.47, "grown": -4.38, "mirror": -4.6, "overhang": -3.86,
-        "shortfall": -4.03,
-    },
-    candidate_slopes=CANDIDATE_SLOPES,
-)  # fmt: skip
-"""As ``bench/calibrate_register.py`` printed it for 60 random parts."""
+REFUSAL = RefusalConfig(candidate_slopes=CANDIDATE_SLOPES)
 _VOXEL = 0.05
 """Of the diameter."""
 _LEAST = 500
@@ -72,8 +57,7 @@ class Registration(PoseEstimator):
     """Poses of objects whose models are seen for the first time.
 
     Pairs of points of the cloud propose poses, ICP refines them, and the evidence against the best
-    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`; the risk was
-    calibrated on other parts (``bench/calibrate_register.py``).
+    decides whether it is the answer, as it does for :class:`~depthpose.GeoPoseNet`.
 
     Example::
 
@@ -83,7 +67,7 @@ class Registration(PoseEstimator):
     Args:
         models: the objects.
         config: ICP, limits; the seed is that of voting.
-        refusal: when an answer is withheld; None: as calibrated.
+        refusal: when an answer is withheld; None: by the usual limits.
 
     Raises:
         InputError: no model, two of one name, or one of few points without faces.
@@ -195,7 +179,7 @@ def pose_from_proposals(
         cloud: of the object.
         proposals: poses, the likeliest first; one at least.
         known: the object, its surface and what it may be confused with.
-        refusal: when the answer is withheld; it weighs no signal of votes for keypoints.
+        refusal: when the answer is withheld.
         config: of ICP, which begins at the proposals alone.
     """
     model, surface, copies = known
@@ -209,14 +193,13 @@ def pose_from_proposals(
     candidates = find_candidates(cloud.cloud_m, first, best.others, copies, surface, icp)
     normals = cloud_normals(cloud.cloud_m)
     evidence = [_evidence_of(cloud.cloud_m, normals, one.pose, surface) for one in candidates]
-    signals = {"few": 10 / len(cloud.points_m), "scatter": best.scatter}
-    found = choose(candidates, evidence, signals, copies, refusal)
+    found = choose(candidates, evidence, copies, refusal)
     clock.note("icp")
     answer = answer_of(model, found)
     assert answer.free_motions is not None
     free = answer.free_motions.double()
     posed = Posed(cloud, found.pose, model, surface, free)
-    return checked(posed, found, answer, refusal, clock)
+    return judged(posed, found, answer, refusal, config, clock)
 
 
 def _evidence_of(

@@ -24,11 +24,6 @@ _ROUGH_POINTS = 150
 _TRUST = 0.03
 """A scale beside 1 must lower the mean squared distance, in squared limits, by so much."""
 _CONVERGED = 3e-4
-_SURE = 2.0
-"""Standard deviations."""
-_GAIN = 0.05
-"""Where another scale gains less (0.25 % of the diameter), what is seen of the surface fits at many
-scales, or a sensor errs so: the right pose of a real bowl gains 0.032 at 1.07."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +40,6 @@ class Scale:
     times: float
     sigma: float
     gain: float
-
-    @property
-    def error(self) -> float:
-        """How far from 1 it surely is; 0 where the model itself fits hardly worse."""
-        return max(0.0, abs(self.times - 1) - _SURE * self.sigma) if self.gain > _GAIN else 0.0
-
-    @property
-    def doubt(self) -> float:
-        """How far from 1 it may be: no evidence of the size is no evidence of the right one."""
-        return abs(self.times - 1) + self.sigma
 
 
 def scale_of(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Scale:

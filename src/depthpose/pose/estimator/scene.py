@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -10,7 +9,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.surface import Surface, compare_depths
+from depthpose.pose.surface import Surface
 from depthpose.pose.types import ViewInput
 
 MARGIN = 0.15
@@ -18,22 +17,6 @@ MARGIN = 0.15
 object's; between two frames it moves by less."""
 _MOST_POINTS = 10_000
 """Of what a camera saw about the object, evenly taken."""
-
-
-def seen_through(view: ViewInput, pose: Rigid, surface: Surface) -> float:
-    """Give the share of the posed surface through which the camera saw what lies behind.
-
-    The whole depth image is used, whatever the mask.
-
-    Args:
-        view: depth and camera.
-        pose: ``camera_from_model``.
-        surface: of the model.
-    """
-    pose = pose.double()
-    whole = replace(view, mask=torch.ones_like(view.mask))
-    scene_m = scene_about(whole, pose[None], surface)
-    return compare_depths(scene_m, pose, surface)[1]
 
 
 def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:

@@ -111,11 +111,10 @@ def _next(given: AnyInput, last: _Last | None, known: TrackedObject) -> PoseEsti
     if doubt is not None:
         return PoseEstimate(
             name=given.name, object=found.object, status=doubt.status, reason=doubt.reason,
-            signals=found.signals, risk=found.risk, seconds=spent, tracking="lost",
+            signals=found.signals, seconds=spent, tracking="lost",
         )  # fmt: skip
-    return replace(
-        found, name=given.name, seconds=spent, tracking="found" if found.is_ok else "lost"
-    )
+    tracking = "lost" if found.camera_from_model is None else "found"
+    return replace(found, name=given.name, seconds=spent, tracking=tracking)
 
 
 def _doubt_of(given: AnyInput, pose: Rigid | None, surface: Surface) -> Refusal | None:
@@ -224,7 +223,8 @@ def _answer(
     return PoseEstimate(
         name="",
         object=known.model.name,
-        status="ok",
+        status="ok" if origin is None else origin.status,
+        reason="" if origin is None else origin.reason,
         camera_from_model=pose.float(),
         covariance=without_motions(refined.covariance, free).float(),
         free_motions=free.float(),

@@ -45,7 +45,7 @@ def convention_advice(
         rulers: of each object, by its number.
         limit: the ADD (ADD-S) of a success, in diameters.
     """
-    answers = [p for p in predictions if p.estimate.is_ok]
+    answers = [p for p in predictions if p.estimate.is_posed]
     there = match(dataset.instances, answers, dataset.objects)
     seen = [instance for instance in dataset.instances if instance.name in there]
     some = seen[:: max(1, len(seen) // _TRIED)][:_TRIED]

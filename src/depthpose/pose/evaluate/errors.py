@@ -312,7 +312,7 @@ def _is_own(prediction: Prediction, places: Mapping[str, Place]) -> bool:
 def _assign(
     instances: list[Instance], estimates: list[PoseEstimate], model: ObjectModel
 ) -> dict[str, PoseEstimate]:
-    ranked = sorted((e for e in estimates if e.is_ok), key=score_of, reverse=True)
+    ranked = sorted((e for e in estimates if e.is_posed), key=score_of, reverse=True)
     answers = ranked[: len(instances)]
     chosen: dict[str, PoseEstimate] = {}
     if len(instances) == 1 and answers:
@@ -321,7 +321,7 @@ def _assign(
         costs = np.array([[_cost(i, e, model) for e in answers] for i in instances])
         for row, column in zip(*linear_sum_assignment(costs), strict=True):
             chosen[instances[row].name] = answers[column]
-    refusals = [estimate for estimate in estimates if not estimate.is_ok]
+    refusals = [estimate for estimate in estimates if not estimate.is_posed]
     left = [instance for instance in instances if instance.name not in chosen]
     return chosen | {i.name: e for i, e in zip(left, refusals, strict=False)}
 

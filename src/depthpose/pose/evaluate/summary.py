@@ -16,7 +16,7 @@ from depthpose.pose.evaluate.errors import METRICS
 from depthpose.pose.evaluate.rows import InstanceRow, Number, ObjectRow, RiskRow
 from depthpose.pose.metrics import risk_coverage
 from depthpose.pose.predictions import Place, place_of
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import POSED, ObjectModel
 
 _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
 _DECILES = 10
@@ -34,7 +34,7 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
     """
     count = len(rows)
     success = sum(row.is_success for row in rows) / count
-    coverage = sum(row.status == "ok" for row in rows) / count
+    coverage = sum(row.status in POSED for row in rows) / count
     return ObjectRow(
         object=name,
         instances=count,
@@ -74,7 +74,7 @@ def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
 
     ``coverage`` 0.1 is the surest tenth of the instances. It ends with the answers.
     """
-    answered = [row for row in rows if row.status == "ok" and row.score is not None]
+    answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
     ranks = torch.full((len(rows),), math.inf, dtype=torch.float64)
     ranks[: len(answered)] = torch.arange(len(answered), dtype=torch.float64)
@@ -97,7 +97,7 @@ def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
 
 def _scores(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     """Sum up every metric; then BOP's average recall; then the medians of the answers."""
-    answered = [row for row in rows if row.status == "ok"]
+    answered = [row for row in rows if row.status in POSED]
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
     found: dict[str, Number] = {}
     for name, metric in METRICS.items():

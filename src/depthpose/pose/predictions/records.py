@@ -3,20 +3,30 @@
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, TypeVar, cast, get_args
 
 import torch
 from torch import Tensor
 
+from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import Instance
 from depthpose.pose.datasets.parse import integer, number, read_rows
-from depthpose.pose.types import Alternative, PoseEstimate, Status, Tracking
+from depthpose.pose.types import (
+    POSED,
+    Alternative,
+    Fit,
+    Identity,
+    PoseEstimate,
+    Status,
+    Tracking,
+)
 
+AnswerT = TypeVar("AnswerT", Fit, Identity)
 POSES = "poses.json"
 PICTURE, CLOUD = "pose.png", "pose.ply"
 """What follows ``NAME.`` in the names of the files that show a pose."""
@@ -105,8 +115,6 @@ def score_of(estimate: PoseEstimate) -> float:
     """
     if estimate.certainty is not None:
         return estimate.certainty
-    if estimate.risk is not None:
-        return 1 - estimate.risk
     return 1.0 if estimate.inlier_share is None else estimate.inlier_share
 
 
@@ -121,10 +129,13 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    for name in ("inlier_share", "residual_m", "risk", "certainty"):
+    for name in ("inlier_share", "residual_m", "certainty"):
         value: float | None = getattr(estimate, name)
         # JSON has no infinity, and nothing near the surface is no distance.
         row[name] = value if value is not None and math.isfinite(value) else None
+    for name in ("fit", "identity"):
+        answer = getattr(estimate, name)
+        row[name] = None if answer is None else asdict(answer)
     row["alternatives"] = [
         {
             "camera_from_model": _matrix(other.camera_from_model),
@@ -158,10 +169,10 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
     status, reason = _status(row.get("status"), source), row.get("reason", "")
     pose = _pose(row.get("camera_from_model"), source)
-    if (pose is not None) != (status == "ok") or (status != "ok" and not reason):
+    if (pose is not None) != (status in POSED) or (status != "ok" and not reason):
         raise InputError(
-            f"{source}: an estimate that is ok has a camera_from_model, a refused one none, but a "
-            f"reason; its status is {status!r}"
+            f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
+            f"none; all but ok have a reason; its status is {status!r}"
         )
     estimate = PoseEstimate(
         name=name,
@@ -174,8 +185,9 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         free_motions=_table(row, "free_motions", 6, source),
         inlier_share=_optional(row, "inlier_share", source),
         residual_m=_optional(row, "residual_m", source),
-        risk=_optional(row, "risk", source),
+        fit=_fields_of(row, "fit", Fit, source),
         certainty=_optional(row, "certainty", source),
+        identity=_fields_of(row, "identity", Identity, source),
         alternatives=_alternatives(row.get("alternatives", []), source),
         signals=_named(row, "signals", source),
         seconds=_named(row, "seconds", source),
@@ -244,6 +256,16 @@ def _numbers(entry: object, width: int, source: str, rows: int | None = None) ->
         raise InputError(
             f"{source} is not {count}rows of {width} numbers; write them so"
         ) from error
+
+
+def _fields_of(row: dict[str, Any], key: str, kind: type[AnswerT], source: str) -> AnswerT | None:
+    """Read one of the three answers; numbers that it does not say are None."""
+    entry = row.get(key)
+    if entry is None:
+        return None
+    if not isinstance(entry, dict):
+        raise InputError(f"{source}: {key} is {entry!r}, where names to values belong")
+    return config_from_dict(entry, kind, source=f"{source}: {key}")
 
 
 def _optional(row: dict[str, Any], key: str, source: str) -> float | None:

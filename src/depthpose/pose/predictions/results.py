@@ -69,7 +69,7 @@ def write_bop_results(
             image = prediction.place[:2]
             spent = sum(prediction.estimate.seconds.values())
             seconds[image] = seconds.get(image, 0.0) + spent
-    answered = [p for p in known if p.estimate.is_ok]
+    answered = [p for p in known if p.estimate.is_posed]
     if with_alternatives:
         answered = [other for p in answered for other in [p, *_others(p)]]
     write_results(path, [_result(p, seconds) for p in answered])

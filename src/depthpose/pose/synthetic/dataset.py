@@ -19,6 +19,7 @@ from depthpose.pose.augment import (
     occlude,
     random_levels,
     random_rotation,
+    shift_mask,
     uniform,
     whole,
 )
@@ -151,6 +152,9 @@ class Objects:
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
+        most = self.config.mask_shift_px
+        rows, columns = (whole(generator, 2 * most + 1) - most for _ in range(2))
+        mask = shift_mask(mask, round(rows * scale), round(columns * scale))
         return self._as_sample(index, clean, measured_m, mask, visible)
 
     def _as_sample(

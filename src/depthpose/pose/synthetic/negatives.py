@@ -17,7 +17,7 @@ NegativeKind = Literal[
     "another object", "scaled", "mirrored", "blob", "plate", "box or cylinder", "ball", "hand"
 ]
 """What a negative is."""
-SCALES = (0.8, 0.9, 1.1, 1.2)
+SCALES = (0.8, 0.9, 1.1, 1.25)
 """Of a scaled copy."""
 _SIZES = (0.5, 1.1)
 """Of what has no model, in diameters of the object that is searched for."""

@@ -4,7 +4,6 @@ from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch
 from depthpose.pose.train.clouds import TrainingClouds as TrainingClouds
 from depthpose.pose.train.clouds import read_models as read_models
-from depthpose.pose.train.config import CalibrationConfig as CalibrationConfig
 from depthpose.pose.train.config import FramesConfig as FramesConfig
 from depthpose.pose.train.config import HeldOutConfig as HeldOutConfig
 from depthpose.pose.train.config import ModelsConfig as ModelsConfig
@@ -16,6 +15,5 @@ from depthpose.pose.train.other_configs import (
     SegmentationTraining as SegmentationTraining,
 )
 from depthpose.pose.train.runs import STAGES as STAGES
-from depthpose.pose.train.runs import recalibrate as recalibrate
 from depthpose.pose.train.runs import train_pose as train_pose
 from depthpose.pose.train.task import PoseTask as PoseTask

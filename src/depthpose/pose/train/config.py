@@ -1,14 +1,13 @@
 """Settings of a training of the direction network."""
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Unit
 from depthpose.pose.config.objects import OCCLUSIONS, refuse_range
-from depthpose.pose.estimator.evidence import SIGNALS
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.network import ResUNetConfig
 
@@ -106,56 +105,11 @@ class HeldOutConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationConfig:
-    """Synthetic views by which the refusal is chosen, after the training."""
-
-    number: int = 600
-    """Of each object; 0: nothing is ever refused for its risk."""
-
-    occlusion: tuple[float, float] = (0.0, 0.6)
-    """Occluded shares of the silhouette, from easy to hard."""
-
-    max_wrong_share: float = 0.01
-    """Wrong answers among the answers that are given."""
-
-    negatives: int = 200
-    """Of each object: views of something else in its place, copies of another size and mirrored
-    ones among them. 0: the refusal is chosen by views of the objects alone."""
-
-    max_negative_share: float = 0.01
-    """Of these the share that may be answered."""
-
-    noises: tuple[float, ...] = (1.0, 1.0, 3.0)
-    """Factors on the training's noise, so that a noisier sensor's right poses are answered and its
-    wrong ones refused. Views and negatives are split into equal parts, one for each factor; a
-    factor that stands twice has twice as many. No noise is above 20, as everywhere."""
-
-    without: tuple[str, ...] = ()
-    """Signals that do not count, where real clouds contradict what synthetic ones say; their names
-    are those of ``depthpose.pose.estimator.evidence.SIGNALS``."""
-
-    def __post_init__(self) -> None:
-        """Refuse too few views to choose by, and shares that are none."""
-        if self.number and self.number < 20:
-            raise InputError(f"number is {self.number}; nothing can be chosen by fewer than 20 "
-                             "views: take 600 (a training may take 0: no refusal)")  # fmt: skip
-        refuse_range("calibration.occlusion", self.occlusion, OCCLUSIONS, "(0.0, 0.6)")
-        if self.negatives < 0:
-            raise InputError(f"negatives is {self.negatives}; take 200, or 0 for none")
-        for name in self.without:
-            refuse_unknown("a signal in calibration.without", name, SIGNALS)
-        if not self.noises or not all(0 < factor < math.inf for factor in self.noises):
-            raise InputError(f"noises is {self.noises}; give factors above 0, such as (1.0, 3.0)")
-        for name in ("max_wrong_share", "max_negative_share"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(
-                    f"{name} is {getattr(self, name)}, but a share is between 0 and 1; take 0.01"
-                )
-
-
-@dataclass(frozen=True, kw_only=True)
 class PoseTraining:
     """The direction network learns to point at keypoints."""
+
+    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration"})
+    """Settings of before: no risk is calibrated any more."""
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """What is learnt."""
@@ -198,9 +152,6 @@ class PoseTraining:
 
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
     """Views of the validation."""
-
-    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    """By what the refusal is chosen."""
 
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(

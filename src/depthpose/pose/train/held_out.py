@@ -1,4 +1,4 @@
-"""Held-out synthetic views: how often the network finds the pose, and its refusal calibrated."""
+"""Held-out synthetic views: how often the network finds the pose."""
 
 import dataclasses
 import math
@@ -8,19 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.errors import InputError
 from depthpose.core.loop import ValidationResult, sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import refusal_of
-from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig, RefusalConfig
-from depthpose.pose.config.objects import MOST_NOISE
-from depthpose.pose.estimator import GeoPoseNet, calibrate_refusal
+from depthpose.pose.config import CloudConfig, EstimateConfig, ObjectsConfig
+from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import add_of_nearest_m, is_within_diameter
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.synthetic.negatives import negative_kinds, negative_of
 from depthpose.pose.train.clouds import Cloud, collate_clouds, voxelised_cloud
-from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig
+from depthpose.pose.train.config import HeldOutConfig
 from depthpose.pose.types import ObjectModel, PoseEstimate, PoseTruth, Vote
 from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.weights import DirectionNet, PoseWeights
@@ -150,112 +147,31 @@ def _share(found: Rigid, truth: Rigid, model: ObjectModel, points_m: Tensor) -> 
     return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
 
 
-_CALIBRATION_SEED = 0xCA11B
-_FIRST = 50
 _CLOUDS_AT_ONCE = 32
-_KEPT = ("min_hold", "max_scale_error", "candidate_slopes")
-"""Of a refusal: not chosen by calibration."""
 
 Table = Mapping[str, Mapping[str, float | None]]
-"""By occlusion in percent: shares of right, wrong and refused, and the median error of the answers
-in diameters, None where there is no answer."""
-
-
-def calibrated(
-    weights: PoseWeights, synthetic: ObjectsConfig, config: CalibrationConfig
-) -> PoseWeights:
-    """Choose when answers are withheld, on synthetic views from easy to hard and on negatives.
-
-    Where not one view is answered there is nothing to choose by, and the weights stay as they are.
-    Where none of the first 50 of each object is right, no more are looked at.
-    """
-    if config.number == 0:
-        return weights
-    kept = {name: getattr(weights.refusal, name) for name in _KEPT}
-    opened = RefusalConfig(max_risk=1.0, **kept)
-    open_weights = dataclasses.replace(weights, refusal=opened)
-    views = dataclasses.replace(
-        synthetic,
-        seed=synthetic.seed + _CALIBRATION_SEED,
-        views=None,
-        resolution=(1.0, 1.0),
-        occluded_share=1.0,
-        occlusion=config.occlusion,
-    )
-    estimates: list[PoseEstimate] = []
-    is_right: list[bool] = []
-    for number in dict.fromkeys((min(_FIRST, config.number), config.number)):
-        estimates, is_right = [], []
-        for here, some in _noisy(views, range(number), config.noises):
-            count = len(some) * len(weights.models)
-            shown = Objects(weights.models, dataclasses.replace(here, number=count), weights.cloud)
-            found, errors = _posed(open_weights, shown)
-            estimates += found
-            is_right += is_within_diameter(torch.tensor(errors)).tolist()
-        if not any(is_right):
-            break
-    try:
-        refusal = calibrate_refusal(
-            estimates,
-            is_right,
-            config.max_wrong_share,
-            _negatives(open_weights, views, config) if any(is_right) else (),
-            config.max_negative_share,
-            config.without,
-        )
-    except InputError:
-        return weights
-    refusal = dataclasses.replace(refusal, **kept)
-    return dataclasses.replace(weights, refusal=refusal)
-
-
-def _negatives(
-    weights: PoseWeights, synthetic: ObjectsConfig, config: CalibrationConfig
-) -> list[PoseEstimate]:
-    """Estimate views of something else in the place of each object, kinds by turns."""
-    found: list[PoseEstimate] = []
-    for here, some in _noisy(synthetic, range(config.negatives), config.noises):
-        shown: list[ObjectModel] = []
-        for k in some:
-            for number, model in enumerate(weights.models):
-                kinds = negative_kinds(model)
-                generator = sample_generator(k * len(weights.models) + number, _CALIBRATION_SEED)
-                kind = kinds[k % len(kinds)]
-                shown.append(negative_of(model, kind, weights.models, generator))
-        shown = [model for model in shown if model.diameter_m < here.distance_m[0]]
-        if shown:
-            views = dataclasses.replace(here, number=len(shown), seed=here.seed + 1)
-            found += _posed(weights, Objects(shown, views, weights.cloud))[0]
-    return found
-
-
-def _noisy(
-    synthetic: ObjectsConfig, numbers: range, noises: Sequence[float]
-) -> Iterator[tuple[ObjectsConfig, range]]:
-    """Part some numbers by noise; views of each part are others and have its noise."""
-    ends = [round(len(numbers) * k / len(noises)) for k in range(len(noises) + 1)]
-    low, high = synthetic.sensor.noise
-    for part, (times, begin, end) in enumerate(zip(noises, ends[:-1], ends[1:], strict=True)):
-        noise = (min(times * low, MOST_NOISE), min(times * high, MOST_NOISE))
-        sensor = dataclasses.replace(synthetic.sensor, noise=noise)
-        here = dataclasses.replace(synthetic, sensor=sensor, seed=synthetic.seed + 2 * part)
-        if begin < end:
-            yield here, numbers[begin:end]
+"""By occlusion in percent: shares of right, ambiguous, wrong and refused, and the median error of
+all poses in diameters, None where there is none."""
 
 
 def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
-    """Count right, wrong and refused answers of the whole estimator, by occlusion."""
+    """Count right, wrong and refused answers of the whole estimator, by occlusion.
+
+    Ambiguous are those whose certainty is too low for an answer, whether right or not.
+    """
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
         objects = held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
         estimates, errors = _posed(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
+        posed = sorted(e for e in errors if e < math.inf)
         right = int(is_within_diameter(torch.tensor(answered)).sum())
         table[f"{round(100 * occlusion)}"] = {
             "right": right / len(errors),
+            "ambiguous": (len(posed) - len(answered)) / len(errors),
             "wrong": (len(answered) - right) / len(errors),
-            "refused": 1 - len(answered) / len(errors),
-            "median": sorted(answered)[len(answered) // 2] if answered else None,
+            "refused": 1 - len(posed) / len(errors),
+            "median": posed[len(posed) // 2] if posed else None,
         }
     return table
 
@@ -266,11 +182,11 @@ def table_text(table: Table) -> str:
         "Synthetic views that no training saw, posed with voting, ICP and refusal; right is an "
         "ADD, to the nearest symmetric pose, below a tenth of the diameter.",
         "",
-        "| occluded % | right % | wrong % | refused % | median error, % of diameter |",
-        "| --- | --- | --- | --- | --- |",
+        "| occluded % | right % | ambiguous % | wrong % | refused % | median error, % of size |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for occlusion, row in table.items():
-        given = [row[k] for k in ("right", "wrong", "refused", "median")]
+        given = [row[k] for k in ("right", "ambiguous", "wrong", "refused", "median")]
         values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
         lines.append(f"| {occlusion} | {values} |")
     return "\n".join(lines)

@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from depthpose.core.checkpoint import find_weights, warn_of_terms
+from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
@@ -18,7 +18,7 @@ from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import TrainingClouds, read_models
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.depth_image import train_depth_image
-from depthpose.pose.train.held_out import HeldOut, calibrated, score_held_out, table_text
+from depthpose.pose.train.held_out import HeldOut, score_held_out, table_text
 from depthpose.pose.train.other_configs import (
     DepthImageTraining,
     PointNetTraining,
@@ -69,44 +69,10 @@ def train_pose(config: PoseTraining, run: Run) -> Path:
     task = PoseTask(network, models, config, held_out)
     seconds = run.train(task, clouds, config.loop)
     if run.on_message is not None:
-        run.on_message(
-            "trained; now the refusal is calibrated and measured on synthetic views: minutes"
-        )
+        run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if isinstance(network, PointNet):
         return _leave(run.folder / "pointnet.safetensors", network, models, config, seconds)
     return _leave(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
-
-
-def recalibrate(weights: Path, out: Path, config: PoseTraining) -> str:
-    """Choose anew when the answers of weights are withheld; the network stays as it is.
-
-    Args:
-        weights: of a network of directions, with the meshes of its objects.
-        out: the file to write.
-        config: how views are made, how many calibrate, and how many measure.
-
-    Returns:
-        What was counted on views that did not calibrate, for people.
-
-    Raises:
-        InputError: a file to write that is the one to read or of another kind, no views to choose
-            by, or none that is answered.
-    """
-    if out.suffix != ".safetensors" or (out.exists() and out.samefile(weights)):
-        raise InputError(f"{out}: name another file than the weights, ending in .safetensors")
-    if config.calibration.number == 0:
-        raise InputError("calibration.number is 0, so there is nothing to choose by; take 600")
-    found = read_pose_weights(weights)
-    warn_of_terms(found.facts)
-    chosen = calibrated(found, config.objects, config.calibration)
-    if chosen is found:
-        raise InputError(
-            f"{weights}: answered not one synthetic view, so nothing can be chosen; give the "
-            "training's own --config, whose distances and sensor the views have, or train longer"
-        )
-    with_half = all(torch.equal(p, p.half().float()) for p in found.network.parameters())
-    write_pose_weights(out, chosen, with_half=with_half)
-    return table_text(score_held_out(read_pose_weights(out), config.objects, config.held_out))
 
 
 STAGES = {
@@ -125,11 +91,10 @@ def _leave(
     config: PoseTraining,
     seconds: float,
 ) -> Path:
-    """Calibrate the refusal, write the weights, measure the file, and write its card."""
+    """Write the weights, measure the file, and write its card."""
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
     weights = _as_written(packed(network, models, config), with_half=config.with_half)
-    weights = calibrated(weights, config.objects, config.calibration)
     write_pose_weights(path, weights, with_half=config.with_half)
     table = score_held_out(read_pose_weights(path), config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": table})
