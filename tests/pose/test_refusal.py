@@ -163,7 +163,7 @@ def test_settings_beyond_their_range_are_refused(values: dict, text: str) -> Non
 def test_settings_of_an_estimate_beyond_their_range_are_refused() -> None:
     with pytest.raises(InputError, match="batch_voxels 0; take 100 and 1 at least"):
         EstimateConfig(batch_voxels=0)
-    with pytest.raises(InputError, match="starts is 8; take 1, the voted pose, to 7"):
+    with pytest.raises(InputError, match=r"starts must be in \[1, 7\], got 8"):
         IcpConfig(starts=8)
     with pytest.raises(InputError, match=r"rough_rigidity_diameters is 0\.05, but the strict one"):
         EstimateConfig(rough_rigidity_diameters=0.05)
