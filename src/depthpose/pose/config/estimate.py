@@ -26,7 +26,7 @@ class RefusalConfig:
     RETIRED: ClassVar[frozenset[str]] = frozenset(
         {"max_risk", "bias", "slopes", "means", "max_scale_error"}
     )
-    """Settings of a calibrated risk, in weights written before 2026-11-27; they are left out."""
+    """Settings of a calibrated risk, in weights written before 2026-11-26; they are left out."""
 
     min_agreement: float = 0.8
     """Of the posed surface that the camera saw, so much must lie where it saw something: an edge
