@@ -72,7 +72,9 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
+    kind: tyro.conf.Positional[
+        Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0", "efficientnet-lite2"]
+    ],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -86,8 +88,8 @@ def import_weights(
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
             MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an
-            encoder that 'depth train select' can start from.
+            can start from (.pth of tensors or .safetensors); efficientnet-lite0 and -lite2,
+            encoders that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
@@ -116,7 +118,7 @@ def import_weights(
     else:
         from depthpose.depth.encoder import import_encoder
 
-        import_encoder(file, out)
+        import_encoder(file, out, kind)
     return show_weights(str(out))
 
 

@@ -74,6 +74,35 @@ class Match:
     is_sky: Bool[Tensor, "h w"] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """The plane of the road in a depth map, in the map's own metres.
+
+    Attributes:
+        height_m: of the camera above it.
+        tilt_deg: of the optical axis against it; positive looks up.
+        roll_deg: positive where the horizon falls to the right.
+        share: of the lower part of the image that lies on it, 0..1.
+        height_std_m: how far the height moves by the choice of columns (a jackknife's standard
+            deviation); the scale of the depth itself is not in it.
+        tilt_std_deg: the same of the tilt.
+    """
+
+    height_m: float
+    tilt_deg: float
+    roll_deg: float
+    share: float
+    height_std_m: float
+    tilt_std_deg: float
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        return (
+            f"road {self.height_m:.2f} +- {self.height_std_m:.2f} m below the camera, tilt "
+            f"{self.tilt_deg:.1f} +- {self.tilt_std_deg:.1f} degrees, roll {self.roll_deg:.1f}"
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthEstimate:
     """Depth of one left image.
@@ -88,6 +117,7 @@ class DepthEstimate:
         is_sky: where the image shows the sky, or None where the weights do not know it.
         image_confidence: mean confidence of the generator over the image, 0..1: low for images out
             of distribution. None for pairs, and where the generator has no confidence.
+        ground: the road, of one image alone; None where none was found.
         warning: why the whole estimate is doubtful, such as an image unlike those that the
             weights know, or a pair of which it cannot be told whether it is rectified; else empty.
         seen: what it was estimated from, for its colours and camera; None where files hold the
@@ -100,6 +130,7 @@ class DepthEstimate:
     right: Float[Tensor, "3 h w"] | None = None
     is_sky: Bool[Tensor, "h w"] | None = None
     image_confidence: float | None = None
+    ground: Ground | None = None
     warning: str = ""
     seen: StereoInput | None = None
 

@@ -1,0 +1,190 @@
+"""The road in a depth map: how high the camera stands, how it is tilted, and metres by that."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera
+from depthpose.core.errors import InputError
+from depthpose.depth.types import DepthEstimate, Ground
+
+_INLIER = 0.06
+"""Inverse depths within this share of the plane's belong to it."""
+_POINTS = 3000
+_DRAWS = 300
+_STRIPS = 8
+_LEAST_SHARE = 0.25
+"""Of the points in the lower part of the image, on the plane; with less there is no ground."""
+_MOST_TILT_DEG = 25.0
+_WINDOW_PX = 5
+"""Side of the square around a pixel whose distance is known."""
+
+
+def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
+    """Fit a plane to the lower part of a depth map: RANSAC on inverse depth, then least squares.
+
+    Args:
+        depth_m: camera z; NaN where unknown.
+        camera: of the map.
+
+    Returns:
+        The plane, or None where a quarter of the lower part does not lie on one that could be
+        ground.
+    """
+    rays, inverse, strips = _lower_points(depth_m, camera)
+    if len(inverse) < 60:
+        return None
+    chance = torch.Generator().manual_seed(0)
+    drawn = torch.randint(len(inverse), (_DRAWS, 3), generator=chance)
+    planes = torch.linalg.solve_ex(rays[drawn], inverse[drawn])[0]
+    is_usable = planes.isfinite().all(1) & _could_be_ground(planes)
+    errors = (planes[is_usable] @ rays.T / inverse - 1).abs()
+    if not len(errors):
+        return None
+    is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
+    for _ in range(3):
+        plane = _least_squares(rays[is_on], inverse[is_on])
+        is_on = (rays @ plane / inverse - 1).abs() < _INLIER
+        if int(is_on.sum()) < 30:
+            return None
+    share = float(is_on.double().mean())
+    if share < _LEAST_SHARE or not bool(_could_be_ground(plane[None])[0]):
+        return None
+    left_out = [_angles(_least_squares(rays[k], inverse[k])) for k in
+                (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]  # fmt: skip
+    found, parts = _angles(plane), torch.tensor(left_out)
+    # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
+    spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
+    return Ground(
+        height_m=found[0], tilt_deg=found[1], roll_deg=found[2], share=share,
+        height_std_m=float(spread[0]), tilt_std_deg=float(spread[1]),
+    )  # fmt: skip
+
+
+def _lower_points(
+    depth_m: Float[Tensor, "h w"], camera: Camera
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Rays (z = 1), inverse depths and column strips of points in the lower two fifths."""
+    height, width = depth_m.shape
+    top = height * 3 // 5
+    step = max(math.isqrt((height - top) * width // _POINTS), 1)
+    rows, columns = torch.arange(top, height, step), torch.arange(0, width, step)
+    v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
+    inverse = 1 / depth_m.detach().cpu().double()[v, u]
+    known = inverse.isfinite() & (inverse > 0)
+    pixels = torch.stack([u, v, torch.ones_like(u)], 1).double()
+    rays = pixels @ torch.linalg.inv(camera.K).T
+    return rays[known], inverse[known], (u * _STRIPS // width)[known]
+
+
+def _least_squares(rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]) -> Float[Tensor, "3"]:
+    weighed = rays / inverse[:, None]
+    return torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
+
+
+def _could_be_ground(planes: Float[Tensor, "n 3"]) -> Tensor:
+    """Below the camera, and tilted and rolled as cameras of vehicles and hands are."""
+    size = planes.norm(dim=1).clamp(min=1e-9)
+    upright = planes[:, 1] / size
+    return (upright > math.cos(math.radians(_MOST_TILT_DEG))) & (size > 1 / 20) & (size < 1 / 0.2)
+
+
+def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
+    """Height [m], tilt and roll [degrees] of ``plane @ ray = 1 / depth``."""
+    x, y, z = (float(value) for value in plane)
+    return 1 / math.hypot(x, y, z), -math.degrees(math.atan2(z, y)), -math.degrees(math.atan2(x, y))
+
+
+def scale_by_mount(found: DepthEstimate, name: str, camera: Camera) -> DepthEstimate:
+    """Find the ground and, where the camera's height is known, make its height that one.
+
+    With a tilt too the plane is known, and the scale is the median over the ground.
+
+    Args:
+        found: an estimate of one image.
+        name: of the image, for errors.
+        camera: with ``height_m`` and ``tilt_deg`` where they are known.
+
+    Raises:
+        InputError: the height is known, and no ground was found.
+    """
+    assert found.depth_m is not None
+    ground = fit_ground(found.depth_m, camera)
+    if camera.height_m is None:
+        return replace(found, ground=ground)
+    if ground is None:
+        raise InputError(
+            f"{name}: no road is seen in its lower part, so a camera height of "
+            f"{camera.height_m:g} m cannot set the scale; omit it, or give --known-distance"
+        )
+    factor = camera.height_m / ground.height_m
+    if camera.tilt_deg is not None:
+        rays, inverse, _ = _lower_points(found.depth_m, camera)
+        tilt, roll = math.radians(camera.tilt_deg), math.radians(ground.roll_deg)
+        down = [-math.sin(roll), math.cos(roll) * math.cos(tilt), -math.cos(roll) * math.sin(tilt)]
+        known = rays @ torch.tensor(down, dtype=torch.float64) / camera.height_m
+        own = rays @ _plane(ground)
+        is_on = ((own / inverse - 1).abs() < _INLIER) & (known > 0)
+        if int(is_on.sum()) < 30:
+            raise InputError(
+                f"{name}: the road that is seen lies above the horizon of a tilt of "
+                f"{camera.tilt_deg:g} degrees; the estimate says {ground.tilt_deg:.1f}. Negative "
+                "is down; correct it, or omit it"
+            )
+        factor = float((inverse[is_on] / known[is_on]).median())
+    return rescale(found, factor, fit=ground)
+
+
+def _plane(ground: Ground) -> Float[Tensor, "3"]:
+    tilt, roll = (math.tan(math.radians(angle)) for angle in (ground.tilt_deg, ground.roll_deg))
+    plane = torch.tensor([-roll, 1.0, -tilt], dtype=torch.float64)
+    return plane / plane.norm() / ground.height_m
+
+
+def rescale(found: DepthEstimate, factor: float, *, fit: Ground | None = None) -> DepthEstimate:
+    """Multiply the depth of an estimate by ``factor``, and divide its disparity; not the sky's."""
+    assert found.depth_m is not None
+    ground = found.ground if fit is None else fit
+    if ground is not None:
+        ground = replace(
+            ground, height_m=ground.height_m * factor, height_std_m=ground.height_std_m * factor
+        )
+    px = found.disparity_px / factor
+    if found.is_sky is not None:
+        px = torch.where(found.is_sky, found.disparity_px, px)
+    return replace(found, depth_m=found.depth_m * factor, disparity_px=px, ground=ground)
+
+
+def scale_by_distance(
+    found: DepthEstimate, name: str, known: tuple[float, float, float]
+) -> DepthEstimate:
+    """Make the depth around one pixel what was measured there.
+
+    Args:
+        found: an estimate with metres.
+        name: of the image, for errors.
+        known: column and row [px] and camera z [m] of a measured point; the median of 5x5 pixels
+            counts.
+
+    Raises:
+        InputError: a pixel outside the image, no depth around it (the sky), or no distance.
+    """
+    column, row, metres = known
+    assert found.depth_m is not None
+    height, width = found.depth_m.shape
+    said = f"{name}: known distance {column:g},{row:g},{metres:g}"
+    if not (math.isfinite(metres) and metres > 0):
+        raise InputError(f"{said}: metres must be a positive number")
+    if not (-0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5):
+        raise InputError(
+            f"{said}: the image is {width}x{height}, columns 0 to {width - 1} and rows 0 to "
+            f"{height - 1}; give X,Y,METRES of a pixel of it"
+        )
+    reach, x, y = _WINDOW_PX // 2, round(column), round(row)
+    around = found.depth_m[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+    if not bool(found.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
+        raise InputError(f"{said}: there is no depth at this pixel (the sky?); take another")
+    return rescale(found, metres / float(around[around.isfinite()].median()))
