@@ -3,14 +3,16 @@
     python bench/out_of_distribution.py --samples $DEPTHPOSE_DATA [--weights default kitti-nc]
 
 Streets: KITTI's, KITTI-360's and those of six cameras of another car (DGP), with their own focal
-lengths. Unlike: scikit-image's pictures, indoor pictures, noise, one colour; streets turned,
-cut to the part above the horizon, or enlarged four times, all with an unchanged focal length.
+lengths. Unlike: pictures of scikit-image, scikit-learn and matplotlib and their quarters, indoor
+pictures, noise, one colour, gradients; streets turned, in inverted colours upside down, cut to the
+part above the horizon, or enlarged four times, all with an unchanged focal length. Writes what was
+measured of each image to images.json.
 """
 
 import argparse
 import dataclasses
+import importlib.util
 import json
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,9 +25,10 @@ from torch import Tensor
 from depthpose.core.camera import Camera
 from depthpose.core.files import read_image
 from depthpose.demo.depth import read_motorcycle
+from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.out_of_distribution import measure_image_confidence
+from depthpose.depth.ground import is_road
 from depthpose.depth.types import StereoInput
 from depthpose.report.tables import markdown_table, write_table
 
@@ -80,18 +83,44 @@ def picture(name: str) -> Tensor:
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255
 
 
+def others() -> Iterator[tuple[str, Tensor]]:
+    """Give the pictures that scikit-learn and matplotlib bring along, as far as they are there."""
+    for package, pattern in (("sklearn", "datasets/images/*.jpg"),
+                             ("matplotlib", "mpl-data/sample_data/*.jpg")):  # fmt: skip
+        found = importlib.util.find_spec(package)
+        if found is not None and found.origin is not None:
+            for path in sorted(Path(found.origin).parent.glob(pattern)):
+                yield path.stem, read_image(path)
+
+
 def unlike(samples: Path) -> Iterator[tuple[str, StereoInput]]:
     """Give images that are no street, or streets with a wrong focal length."""
     generator = torch.Generator().manual_seed(0)
     for name in PICTURES:
         yield "scikit-image's pictures", given(name, picture(name))
+    for name, whole in others():
+        yield "other packages' pictures", given(name, whole)
+    whole_pictures = [(name, picture(name)) for name in PICTURES] + list(others())
+    for name, whole in whole_pictures:
+        rows, columns = (side // 2 for side in whole.shape[1:])
+        for k in range(4):
+            down, right = k // 2 * rows, k % 2 * columns
+            part = whole[:, down : down + rows, right : right + columns]
+            yield "quarters of pictures", given(f"{name} {k}", part.contiguous())
     for path in sorted((samples / "depth/middlebury").glob("*/*/im0.png")):
         yield "indoors", given(path.parent.name, read_image(path))
     for path in sorted((samples / "pose").glob("*/test/**/rgb/*")):
         yield "indoors", given(path.stem, read_image(path), 570.0)
-    for number in range(6):
-        yield "noise", given("noise", torch.rand(3, 375, 1242, generator=generator), 721.5)
-        yield "one colour", given("flat", torch.full((3, 375, 1242), number / 5), 721.5)
+    for number in range(12):
+        size = (3, 375 // (1 + number % 4), 1242 // (1 + number % 4))
+        rough = torch.rand(size, generator=generator)
+        smooth = torch.nn.functional.interpolate(rough[None], (375, 1242), mode="bilinear")[0]
+        yield "noise", given("noise", smooth, 721.5)
+        colour = torch.rand(3, 1, 1, generator=generator).expand(3, 375, 1242)
+        yield "one colour", given("flat", colour.contiguous(), 721.5)
+        fade = torch.linspace(0, 1, 375)[:, None].expand(3, 375, 1242)
+        fade = (fade.flip(1) if number % 2 else fade) * colour
+        yield "gradients", given("fade", fade.contiguous(), 721.5)
     dataset = open_dataset(samples / "depth" / PAIRS[0])
     for index in range(0, len(dataset), 3):
         street = dataset.read_input(index)
@@ -100,28 +129,40 @@ def unlike(samples: Path) -> Iterator[tuple[str, StereoInput]]:
         turned = image.rot90(1, (1, 2)).contiguous()
         yield "streets turned by 90 degrees", given("r", turned, focal_px)
         yield "streets upside down", given("u", image.rot90(2, (1, 2)).contiguous(), focal_px)
+        yield "negatives upside down", given("n", 1 - image.flip(1), focal_px)
         yield "streets above the horizon", given("s", image[:, :130], focal_px)
         yield "streets enlarged four times", given("z", image[:, 140:240, 450:800], focal_px)
         yield "streets of twice the focal length", given("f", image, 2 * focal_px)
 
 
-def measure(weights: str, samples: Path) -> list[dict[str, Any]]:
-    """Give, for each kind of image, how many are refused."""
-    net = FakestereoNet.load(weights, allow_ood=True)
-    assert net.synthesiser is not None
-    least = getattr(net.synthesiser.config, "least_confidence", 0.0)
-    found: dict[tuple[str, bool], list[float]] = defaultdict(list)
-    for is_known, images in ((True, streets(samples)), (False, unlike(samples))):
+def look_at(weights: str, samples: Path) -> Iterator[dict[str, Any]]:
+    """Give what decides on each image, and whether it is refused."""
+    config = MatcherConfig(speed="quick")
+    net = FakestereoNet.load(weights, allow_ood=True, config=config)
+    for is_street, images in ((True, streets(samples)), (False, unlike(samples))):
         for kind, image in images:
-            found[kind, is_known] += measure_image_confidence(net, [image])
-    return [
-        {
-            "weights": weights, "images": kind, "known": is_known, "number": len(values),
-            "refused": sum(value < least for value in values), "least": min(values),
-            "median": float(np.median(values)), "most": max(values), "threshold": least,
-        }
-        for (kind, is_known), values in found.items()
-    ]  # fmt: skip
+            found = net.estimate_pair(dataclasses.replace(image, right=None))
+            yield {
+                "weights": weights, "images": kind, "street": is_street, "name": image.name,
+                "confidence": found.image_confidence, "road": is_road(found.ground),
+                "refused": bool(found.warning),
+            }  # fmt: skip
+
+
+def measure(looks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give, for each kind of image, how many show a road and how many are refused."""
+    kinds = dict.fromkeys((one["weights"], one["images"], one["street"]) for one in looks)
+    rows = []
+    for weights, kind, is_street in kinds:
+        mine = [one for one in looks if (one["weights"], one["images"]) == (weights, kind)]
+        confidence = [one["confidence"] for one in mine]
+        rows.append({
+            "weights": weights, "images": kind, "street": is_street, "number": len(mine),
+            "refused": sum(one["refused"] for one in mine), "road": sum(o["road"] for o in mine),
+            "least": min(confidence), "median": float(np.median(confidence)),
+            "most": max(confidence),
+        })  # fmt: skip
+    return rows
 
 
 def indoors(weights: str) -> dict[str, Any]:
@@ -145,7 +186,10 @@ def main() -> None:
     parser.add_argument("--weights", nargs="+", default=["default", "kitti-nc"])
     parser.add_argument("--out", type=Path, default=Path("out/bench/out_of_distribution"))
     options = parser.parse_args()
-    rows = [row for weights in options.weights for row in measure(weights, options.samples)]
+    looks = [one for weights in options.weights for one in look_at(weights, options.samples)]
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "images.json").write_text(json.dumps(looks, indent=0))
+    rows = measure(looks)
     write_table(options.out, rows, name="out_of_distribution")
     print(markdown_table(rows))
     print(markdown_table([indoors(weights) for weights in options.weights]))

@@ -165,7 +165,7 @@ def load_encoder(encoder: LiteEncoder, path: Path) -> None:
     if any(name not in state or state[name].shape != own[name].shape for name in own):
         raise InputError(
             f"{path}: holds {found.kind} at its full width, and this encoder is {encoder.kind} or "
-            f"narrower; set encoder_kind to {found.kind} and encoder_width to 1, or begin at random."
+            f"narrower; set encoder_kind to {found.kind} and encoder_width: 1, or begin at random."
         )
     encoder.load_state_dict({name: state[name] for name in own})
 

@@ -1,24 +1,25 @@
 """The road in a depth map: how high the camera stands, how it is tilted, and metres by that."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
-from depthpose.depth.types import DepthEstimate, Ground
+from depthpose.depth.types import DepthEstimate, Ground, StereoInput
 
 _INLIER = 0.06
 """Inverse depths within this share of the plane's belong to it."""
-_POINTS = 3000
-_DRAWS = 300
+_POINTS = 2000
+_DRAWS = 200
 _STRIPS = 8
 _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
-_MOST_TILT_DEG = 25.0
+_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, 10))
+_ROAD_TILT_DEG = 15.0
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
 
@@ -45,6 +46,7 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
     if not len(errors):
         return None
     is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
+    plane = _least_squares(rays[is_on], inverse[is_on])
     for _ in range(3):
         plane = _least_squares(rays[is_on], inverse[is_on])
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
@@ -64,14 +66,21 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
     )  # fmt: skip
 
 
+def is_road(ground: Ground | None) -> bool:
+    """Whether a ground lies as deep and as level below the camera as roads do below vehicles."""
+    return (
+        ground is not None and 0.8 < ground.height_m < 4 and abs(ground.tilt_deg) < _ROAD_TILT_DEG
+    )
+
+
 def _lower_points(
     depth_m: Float[Tensor, "h w"], camera: Camera
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Rays (z = 1), inverse depths and column strips of points in the lower two fifths."""
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Int[Tensor, " n"]]:
+    """Rays (z = 1), inverse depths and column strips of points below and not at the sides."""
     height, width = depth_m.shape
     top = height * 3 // 5
     step = max(math.isqrt((height - top) * width // _POINTS), 1)
-    rows, columns = torch.arange(top, height, step), torch.arange(0, width, step)
+    rows, columns = torch.arange(top, height, step), torch.arange(width // 7, width * 6 // 7, step)
     v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
     inverse = 1 / depth_m.detach().cpu().double()[v, u]
     known = inverse.isfinite() & (inverse > 0)
@@ -85,11 +94,12 @@ def _least_squares(rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]) -> 
     return torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
 
 
-def _could_be_ground(planes: Float[Tensor, "n 3"]) -> Tensor:
+def _could_be_ground(planes: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Below the camera, and tilted and rolled as cameras of vehicles and hands are."""
     size = planes.norm(dim=1).clamp(min=1e-9)
-    upright = planes[:, 1] / size
-    return (upright > math.cos(math.radians(_MOST_TILT_DEG))) & (size > 1 / 20) & (size < 1 / 0.2)
+    tilt, roll = (planes[:, k].abs() / planes[:, 1] for k in (2, 0))
+    is_upright = (planes[:, 1] > 0) & (tilt < _MOST_TILT) & (roll < _MOST_ROLL)
+    return is_upright & (size > 1 / 20) & (size < 1 / 0.2)
 
 
 def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
@@ -98,34 +108,34 @@ def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
     return 1 / math.hypot(x, y, z), -math.degrees(math.atan2(z, y)), -math.degrees(math.atan2(x, y))
 
 
-def scale_by_mount(found: DepthEstimate, name: str, camera: Camera) -> DepthEstimate:
+def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
     """Find the ground and, where the camera's height is known, make its height that one.
 
     With a tilt too the plane is known, and the scale is the median over the ground.
 
     Args:
         found: an estimate of one image.
-        name: of the image, for errors.
-        camera: with ``height_m`` and ``tilt_deg`` where they are known.
+        image: what was estimated; its camera has ``mount_height_m`` and ``tilt_deg`` where known.
 
     Raises:
         InputError: the height is known, and no ground was found.
     """
-    assert found.depth_m is not None
+    camera, name = image.camera, image.name
+    assert camera is not None and found.depth_m is not None  # noqa: PT018
     ground = fit_ground(found.depth_m, camera)
-    if camera.height_m is None:
+    if camera.mount_height_m is None:
         return replace(found, ground=ground)
     if ground is None:
         raise InputError(
             f"{name}: no road is seen in its lower part, so a camera height of "
-            f"{camera.height_m:g} m cannot set the scale; omit it, or give --known-distance"
+            f"{camera.mount_height_m:g} m cannot set the scale; omit it, or give --known-distance"
         )
-    factor = camera.height_m / ground.height_m
+    factor = camera.mount_height_m / ground.height_m
     if camera.tilt_deg is not None:
         rays, inverse, _ = _lower_points(found.depth_m, camera)
         tilt, roll = math.radians(camera.tilt_deg), math.radians(ground.roll_deg)
         down = [-math.sin(roll), math.cos(roll) * math.cos(tilt), -math.cos(roll) * math.sin(tilt)]
-        known = rays @ torch.tensor(down, dtype=torch.float64) / camera.height_m
+        known = rays @ torch.tensor(down, dtype=torch.float64) / camera.mount_height_m
         own = rays @ _plane(ground)
         is_on = ((own / inverse - 1).abs() < _INLIER) & (known > 0)
         if int(is_on.sum()) < 30:

@@ -1,7 +1,7 @@
 """Estimates as files: what they are called, writing them all or nothing, reading them back."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -17,10 +18,12 @@ from depthpose.core.files import (
     read_depth_png,
     read_disparity_png,
     read_image,
+    read_json,
     read_map,
     write_cloud,
     write_depth_png,
     write_image,
+    write_json,
     write_map,
 )
 from depthpose.core.files.disk import write_bytes
@@ -29,7 +32,7 @@ from depthpose.core.results import is_whole, note_result
 from depthpose.core.run import claim_folder, claim_names
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import DepthEstimate, Ground, StereoInput
 
 
 @runtime_checkable
@@ -53,7 +56,7 @@ EXPECTED = (
 CLOUD = "cloud.ply"
 ENDINGS = (
     "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
-    "disparity_px.npy", "warning.txt", CLOUD,
+    "disparity_px.npy", "warning.txt", "ground.json", CLOUD,
 )  # fmt: skip
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
@@ -74,9 +77,10 @@ def write_estimate(
 
     ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
     ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
-    ``NAME.warning.txt`` and ``NAME.disparity_px.npy``, each where the estimate has it, and
-    ``NAME.cloud.ply`` (:func:`estimate_cloud`) of what is nearer than ``cloud_m``, if that is
-    given. The disparity is that of the frame's own rig.
+    ``NAME.ground.json`` (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt`` and
+    ``NAME.disparity_px.npy``, each where the estimate has it, and ``NAME.cloud.ply``
+    (:func:`estimate_cloud`) of what is nearer than ``cloud_m``, if that is given. The disparity is
+    that of the frame's own rig.
     """
     written: list[Path] = []
 
@@ -88,6 +92,8 @@ def write_estimate(
         write_cloud(new(CLOUD), estimate_cloud(pair, estimate, cloud_m))
     if estimate.warning:
         write_bytes(new("warning.txt"), f"{estimate.warning}\n".encode())
+    if estimate.ground is not None:
+        write_json(new("ground.json"), asdict(estimate.ground))
     if estimate.depth_m is not None:
         write_map(new("depth_m.npy"), estimate.depth_m)
         write_depth_png(new("depth.png"), estimate.depth_m)
@@ -211,7 +217,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     disparity_px = read_disparity(folder, name, camera)
     base = folder / name
     depth_m, right = _file(base, "depth_m.npy"), _file(base, "right.png")
-    warning = _file(base, "warning.txt")
+    warning, ground = _file(base, "warning.txt"), _file(base, "ground.json")
     metres = read_map(depth_m) if depth_m.is_file() else None
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
@@ -221,8 +227,16 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         confidence=read_confidence(folder, name),
         right=read_image(right) if right.is_file() else None,
         is_sky=read_sky(folder, name),
+        ground=_read_ground(ground) if ground.is_file() else None,
         warning=read_text(warning).strip() if warning.is_file() else "",
     )
+
+
+def _read_ground(path: Path) -> Ground:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no ground, but {type(content).__name__}; predict again")
+    return config_from_dict(content, Ground, source=str(path))
 
 
 def predict(

@@ -104,6 +104,8 @@ def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> lis
             facts.append(("1, 50, 99 % are nearer than", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
     if found.is_sky is not None:
         facts.append(("sky", f"{float(found.is_sky.float().mean()):.1%} of the pixels"))
+    if found.ground is not None:
+        facts.append(("ground", str(found.ground)))
     if found.warning:
         facts.insert(0, ("warning", found.warning))
     if found.confidence is not None:

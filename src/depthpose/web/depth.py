@@ -6,7 +6,7 @@ import time
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
-from depthpose.core.files import read_image, write_image
+from depthpose.core.files import read_exif_focal, read_image, write_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.rig import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
@@ -17,6 +17,7 @@ from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
 
 _MOST_WORK_PIXELS = 8_000_000
 """Of the image as networks get it, resized to the focal length that they were trained at."""
+_GUESSED = " (guessed as 0.75 widths: the metres are as wrong as the guess)"
 _ALL_SKY = 0.5
 """Share of the sky from which a pair without a depth is not taken for a wrong one."""
 _PHONE = 0.75
@@ -30,7 +31,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         InputError: a file that cannot be read, or a camera that cannot be.
     """
     began = time.perf_counter()
-    pair, is_guess = _input(form)
+    pair, focal = _input(form)
     near_m, far_m = _range_m(form)
     if pair.right is not None and net.matcher is None:
         raise InputError(
@@ -44,7 +45,6 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     folder = form.results()
     write_estimate(folder, pair, found, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    focal = " (guessed as 0.75 widths: the metres are as wrong as the guess)" if is_guess else ""
     pictures = _pictures(pair, found, (near_m, far_m))
     if found.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - found.confidence))
@@ -59,8 +59,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     )
 
 
-def _input(form: Form) -> tuple[StereoInput, bool]:
-    """Read the picture or pair; say whether its focal length is a guess."""
+def _input(form: Form) -> tuple[StereoInput, str]:
+    """Read the picture or pair; say where its focal length comes from, if nobody gave it."""
     path = form.file("image")
     width, height = small_size(path)
     has_right = "right" in form.files
@@ -71,13 +71,18 @@ def _input(form: Form) -> tuple[StereoInput, bool]:
             "baseline in metres (of KITTI's 2011_09_26: 0.5327), or choose a camera file that has "
             "it"
         )
-    is_guess = focal_px is None and "camera" not in form.files
-    camera = _with_baseline(form, form.camera(_keys(form, width, height), (width, height)))
+    origin = ""
+    if focal_px is None and "camera" not in form.files:
+        exif = None if has_right else read_exif_focal(path)
+        focal_px, tags = (_PHONE * width, "") if exif is None else exif
+        origin = f" (EXIF: {tags})" if tags else _GUESSED
+    keys = _keys(form, width, height, focal_px)
+    camera = _with_baseline(form, form.camera(keys, (width, height)))
     if has_right:
         small_size(form.file("right"))
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
-    return pair, is_guess
+    return pair, origin
 
 
 def _with_baseline(form: Form, camera: Camera) -> Camera:
@@ -94,10 +99,8 @@ def _with_baseline(form: Form, camera: Camera) -> Camera:
     )
 
 
-def _keys(form: Form, width: int, height: int) -> dict[str, object]:
+def _keys(form: Form, width: int, height: int, focal_px: float | None) -> dict[str, object]:
     """Give the keys of a camera file from the fields."""
-    focal_px = form.number("focal_px")
-    focal_px = _PHONE * width if focal_px is None else focal_px
     middle = ((width - 1) / 2, (height - 1) / 2)
     cx, cy = (
         default if (typed := form.number(name)) is None else typed
@@ -107,6 +110,7 @@ def _keys(form: Form, width: int, height: int) -> dict[str, object]:
     baseline_m = form.number("baseline_m")
     doffs_px = None if baseline_m is None else form.number("cx_right_minus_left_px")
     rig = {"baseline_m": baseline_m, "cx_right_minus_left_px": doffs_px}
+    rig |= {key: form.number(key) for key in ("mount_height_m", "tilt_deg")}
     return {"width": width, "height": height, "K": K, **rig}
 
 

@@ -7,12 +7,14 @@ import tyro
 
 from depthpose.cli.depth.options import (
     ImageNetworks,
+    LensOptions,
     MatcherOptions,
     MatchOptions,
     MethodOptions,
     PairNetworks,
     PredictOutput,
     ProtocolOptions,
+    ScaleOptions,
     refuse_ignored,
 )
 from depthpose.cli.engine import EngineOptions, Weights
@@ -23,8 +25,8 @@ from depthpose.depth.config import MatcherConfig
 def predict(
     images: tyro.conf.Positional[tuple[str, ...]],
     out: str,
-    camera: Path | None = None,
-    focal_px: float | None = None,
+    lens: LensOptions = LensOptions(),
+    scale: ScaleOptions = ScaleOptions(),
     networks: ImageNetworks = ImageNetworks(),
     matching: MatcherOptions = MatcherOptions(),
     output: PredictOutput = PredictOutput(),
@@ -40,15 +42,11 @@ def predict(
     settings need another --out. Only files of the same run are overwritten.
 
         depthpose depth predict street.png --camera cam.json --out out
-        depthpose depth predict drive.mp4 --focal-px 1100 --out out
+        depthpose depth predict drive.mp4 --fov 90 --camera-height 1.4 --out out
 
     Args:
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
-        camera: JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D,
-            BOP, ROS or OpenCV. A baseline in it is ignored: one image has none.
-        focal_px: focal length in pixels, in place of a camera; the principal point is then the
-            centre of the image.
     """
     from depthpose.cli.depth import methods, predicting
 
@@ -56,11 +54,12 @@ def predict(
         raise InputError("name images, folders of them, patterns or videos to predict from")
     config = matching.config
     output.refuse_unusable()
+    scale.refuse_unusable()
     networks.refuse_contradiction(matching)
     if engine.is_ray:
-        return _predict_on_ray(images, (camera, focal_px), networks, config, output, out, engine)
+        return _predict_on_ray(images, (lens, scale), networks, config, output, out, engine)
     sources = predicting.find_sources(images, Path(out))
-    lens = predicting.read_lens(camera, focal_px, sources)
+    known = predicting.read_lens(lens, sources, scale)
     method = methods.weights_method(
         networks.weights,
         config,
@@ -71,12 +70,12 @@ def predict(
     )
     if method.settings.get("answer") == "own":
         matching.refuse_matcher_options()
-    return predicting.predict_all(sources, lens, method, Path(out), output)
+    return predicting.predict_all(sources, known, method, Path(out), output)
 
 
 def _predict_on_ray(
     images: tuple[str, ...],
-    lens: tuple[Path | None, float | None],
+    lens: tuple[LensOptions, ScaleOptions],
     networks: ImageNetworks,
     config: MatcherConfig,
     output: PredictOutput,

@@ -15,7 +15,7 @@ from typing import Any
 from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.matching import rig_facts, say_doubt
 from depthpose.cli.depth.methods import Method, sgbm_method, weights_method
-from depthpose.cli.depth.options import PredictOutput
+from depthpose.cli.depth.options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.depth.predicting import Lens, Predictor, read_lens
 from depthpose.cli.engine import EngineOptions, Inputs, Weights, run, say
 from depthpose.core.camera import StereoRig, read_rig
@@ -120,19 +120,19 @@ class MatchWork:
 
 def predict(
     words: Sequence[str],
-    given: tuple[Path | None, float | None],
+    given: tuple[LensOptions, ScaleOptions],
     spec: NetSpec,
     look: PredictOutput,
     out: str,
     options: EngineOptions,
 ) -> int:
-    """Predict by an engine; ``given`` is the camera's file, or its focal length [px]."""
+    """Predict by an engine; ``given`` is what is known of the camera, and what sets the scale."""
     video = next((word for word in words if word.lower().endswith(tuple(VIDEO_SUFFIXES))), None)
     if video is not None:
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, IMAGES)
     with inputs.first() as (image,):
-        lens = read_lens(*given, [image])
+        lens = read_lens(given[0], [image], given[1])
     settings = {
         **spec.settings(), "camera": lens.facts(), "color_range_m": list(look.color_range)
     }  # fmt: skip

@@ -60,6 +60,65 @@ class MatcherOptions:
 
 
 @group
+class LensOptions:
+    """What is known of the camera of single images; without any of it their EXIF is read."""
+
+    camera: Path | None = None
+    """JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D, BOP, ROS
+    or OpenCV. A baseline in it is ignored: one image has none."""
+    focal_px: float | None = None
+    """focal length in pixels, in place of a camera; the principal point is then the centre of the
+    image."""
+    fov: float | None = None
+    """horizontal field of view in degrees, in place of both."""
+
+
+@group
+class ScaleOptions:
+    """What sets the metres of single images."""
+
+    camera_height: float | None = None
+    """height of the camera above the road in metres: depth is scaled so that the road in it is so
+    far below ("mount_height_m" of a camera file)."""
+    camera_tilt: float | None = None
+    """tilt of the camera in degrees, negative downwards, for --camera-height ("tilt_deg" of a
+    camera file); without it that of the road in the depth is taken."""
+    known_distance: str | None = None
+    """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
+    sets the scale of each image in place of the camera's height."""
+
+    @property
+    def distance(self) -> tuple[float, float, float] | None:
+        """The known distance: column, row [px], metres.
+
+        Raises:
+            InputError: it is not three numbers.
+        """
+        if self.known_distance is None:
+            return None
+        try:
+            column, row, metres = (float(word) for word in self.known_distance.split(","))
+        except ValueError as error:
+            raise InputError(
+                f"--known-distance {self.known_distance}: write X,Y,METRES, such as 640,300,12.5"
+            ) from error
+        return column, row, metres
+
+    def refuse_unusable(self) -> None:
+        """Refuse numbers that are no height, no tilt and no distance, and a tilt alone.
+
+        Raises:
+            InputError: such a one is given.
+        """
+        if self.camera_height is not None and not 0.1 <= self.camera_height <= 20:
+            raise InputError(f"--camera-height {self.camera_height:g}: give 0.1 to 20 metres")
+        if self.camera_tilt is not None and not -45 <= self.camera_tilt <= 45:
+            raise InputError(f"--camera-tilt {self.camera_tilt:g}: give -45 to 45 degrees")
+        if self.distance is not None and self.camera_height is not None:
+            raise InputError("--known-distance and --camera-height both set the scale; omit one")
+
+
+@group
 class MatchOptions(MatcherOptions):
     """How the matcher of the weights runs; sgbm takes none of these."""
 

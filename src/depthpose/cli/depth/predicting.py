@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli.depth.methods import Method
-from depthpose.cli.depth.options import PredictOutput
+from depthpose.cli.depth.options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.depth.page import PAGE, write_depth_page
-from depthpose.core.camera import Camera, StereoRig, centred_camera, read_camera
+from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
+from depthpose.core.camera.facts import camera_keys
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
     image_size,
     list_images,
+    read_exif_focal,
     read_image,
     read_map,
     read_video,
@@ -32,6 +34,7 @@ from depthpose.core.files import (
 from depthpose.core.results import note_result
 from depthpose.core.run import claim_folder, claim_names, find_rank, refuse_among_inputs
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD_M,
     ENDINGS,
@@ -42,45 +45,94 @@ from depthpose.depth.types import StereoInput
 from depthpose.report.viewer import Viewer, open_viewer
 
 _VIDEO = ".color.mp4"
+_SAME_FOCAL = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """What is known of the camera: all of it, or its focal length alone."""
+    """What is known of the camera, and what sets the scale."""
 
-    camera: Camera | None
-    focal_px: float | None
+    given: Camera | FieldOfView | float
+    scale: ScaleOptions
 
     def camera_of(self, image: Tensor) -> Camera:
         """Make the camera of an image."""
-        if self.camera is not None:
-            return self.camera
-        assert self.focal_px is not None
-        return centred_camera((image.shape[2], image.shape[1]), self.focal_px)
+        camera = camera_of(self.given, (image.shape[2], image.shape[1]))
+        assert camera is not None
+        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
+        return replace(camera, **{key: value for key, value in mount.items() if value is not None})
 
     def facts(self) -> dict[str, Any]:
         """Give what is known as JSON values: it decides the results."""
-        return {"K": self.camera.K.tolist()} if self.camera else {"focal_px": self.focal_px}
+        known: dict[str, Any] = {"focal_px": self.given}
+        if isinstance(self.given, FieldOfView):
+            known = {"fov_deg": self.given.degrees}
+        elif isinstance(self.given, Camera):
+            keys = camera_keys(self.given)
+            known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
+        return known | {
+            key: value for key, value in asdict(self.scale).items() if value is not None
+        }
 
 
-def read_lens(camera: Path | None, focal_px: float | None, sources: Sequence[Path]) -> Lens:
+def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions) -> Lens:
     """Read what the user knows of the camera; where its file says no size, that of the images.
 
+    Without any of it the EXIF of the images is asked.
+
     Raises:
-        InputError: neither of the two is given, or both.
+        InputError: several are given, or none and the EXIF says none or several.
     """
-    if (camera is None) == (focal_px is None):
-        raise InputError(
-            "metres from one image need its focal length: give --camera FILE, or --focal-px "
-            "(a phone's main camera has about 0.75 times the image's width)."
-        )
+    focal_px, fov = options.focal_px, options.fov
+    named = {"--camera": options.camera, "--focal-px": focal_px, "--fov": fov}
+    words = [word for word, value in named.items() if value is not None]
+    if len(words) > 1:
+        raise InputError(f"{' and '.join(words)} all give the focal length; omit all but one")
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
-    read = None if camera is None else read_camera(camera, _first_size(sources))
+    if fov is not None:
+        return Lens(given=FieldOfView(fov), scale=scale)
+    if options.camera is None:
+        return Lens(given=_exif_of_all(sources) if focal_px is None else focal_px, scale=scale)
+    read = read_camera(options.camera, _first_size(sources))
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
-        read = Camera(width=read.width, height=read.height, K=read.K)
-    return Lens(camera=read, focal_px=focal_px)
+        keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
+        read = Camera(width=read.width, height=read.height, K=read.K, **keys)
+    return Lens(given=read, scale=scale)
+
+
+def _exif_of_all(sources: Sequence[Path]) -> float:
+    """Read the focal length that the EXIF of all images says, and say it."""
+    known: dict[str, tuple[float, str]] = {}
+    for source in sources:
+        found = None
+        if not _is_video(source):
+            try:
+                found = read_exif_focal(source)
+            except InputError:  # what cannot be read fails by itself, later
+                continue
+        if found is None:
+            raise InputError(
+                f"metres from one image need its focal length, and {source.name} has none in its "
+                "EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to right (a "
+                "phone's main camera has about 0.75 times the image's width, or 67 degrees)"
+            )
+        known[source.name] = found
+    if not known:
+        raise InputError(
+            "no image can be read; give --camera, --focal-px or --fov, and intact ones"
+        )
+    (first, (focal_px, tags)), *others = known.items()
+    other = next((one for one in others if abs(one[1][0] / focal_px - 1) > _SAME_FOCAL), None)
+    if other is not None:
+        raise InputError(
+            f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of {other[0]} "
+            f"{other[1][0]:.0f} px; predict them apart"
+        )
+    print(f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
+          "picture it is another", file=sys.stderr)  # fmt: skip
+    return focal_px
 
 
 def find_sources(words: Sequence[str], out: Path) -> list[Path]:
@@ -213,12 +265,16 @@ class Predictor:
         ]
         try:
             found = self.net.estimate_many(wanted)
-            for given, estimate in zip(wanted, found, strict=True):
+            known = self.lens.scale.distance
+            for given, one in zip(wanted, found, strict=True):
+                estimate = one if known is None else scale_by_distance(one, given.name, known)
                 cloud_m = CLOUD_M if self.look.cloud else None
                 files = write_estimate(self.out, given, estimate, self.look.color_range, cloud_m)
                 note_result(self.out, given.name, files)
                 if estimate.warning:
                     tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
+                if estimate.ground is not None:
+                    tqdm.write(f"{given.name}: {estimate.ground}")
                 if self.viewer is not None:
                     self.viewer.show_depth(given, estimate)
         except InputError as error:

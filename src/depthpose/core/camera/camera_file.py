@@ -3,9 +3,10 @@
 What a caller has in place of a file, a matrix, a mapping or a focal length, becomes a camera too.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from depthpose.core.camera.camera_text import facts_from_json, facts_from_text
 from depthpose.core.camera.facts import (
     KNOWN_FILES,
+    OPTIONAL_KEYS,
     CameraFacts,
     Size,
     camera_from_facts,
@@ -28,6 +30,8 @@ from depthpose.core.camera.stored_camera import facts_from_names, is_ros, read_f
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_json, read_text, write_json
 from depthpose.core.files.text import MAX_LIST_BYTES
+
+_DOFFS = "cx_right_minus_left_px"
 
 
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
@@ -122,11 +126,10 @@ def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | Non
     """Take what files of ROS and OpenCV lack from the keys of our JSON, where they were added."""
     if facts is None:
         return None
-    known = {"baseline_m": facts.baseline_m, "depth_unit_m": facts.depth_unit_m}
     added: dict[str, float] = {}
-    for key in ("baseline_m", "cx_right_minus_left_px", "depth_unit_m"):
+    for key in ("baseline_m", _DOFFS, *OPTIONAL_KEYS):
         value = names.get(key.replace("_", ""))
-        if value is None or known.get(key) is not None:
+        if value is None or (key != _DOFFS and getattr(facts, key) is not None):
             continue
         number = scalar(names, key.replace("_", ""))
         if number is None:
@@ -151,8 +154,26 @@ AnyCamera = (
     str | Path | Camera | Mapping[str, Any] | Sequence[Sequence[float]] | np.ndarray | Tensor
 )
 """A camera, its file, what our JSON or BOP's holds as a dict, or its 3x3 matrix K alone."""
-AnyLens = AnyCamera | float | np.number[Any]
-"""The same, or the focal length alone [px]: the principal point is then the image's centre."""
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """The horizontal angle that an image spans, in place of a focal length [degrees]."""
+
+    degrees: float
+
+    def __post_init__(self) -> None:
+        """Refuse angles that no pinhole has."""
+        if not 1 <= self.degrees <= 170:
+            raise InputError(
+                f"fov is {self.degrees:g} degrees; a pinhole camera spans 1 to 170 degrees from "
+                "left to right"
+            )
+
+
+AnyLens = AnyCamera | FieldOfView | float | np.number[Any]
+"""The same, or the focal length [px] or field of view alone: the principal point is then the
+image's centre."""
 
 
 def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
@@ -170,6 +191,8 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         return camera
     if isinstance(camera, str | Path):
         return read_camera(Path(camera), size)
+    if isinstance(camera, FieldOfView):
+        return centred_camera(size, size[0] / 2 / math.tan(math.radians(camera.degrees / 2)))
     if isinstance(camera, int | float):
         return centred_camera(size, camera)
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
@@ -179,15 +202,20 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
-def choose_lens(camera: AnyLens | None, focal_px: float | None) -> AnyLens | None:
-    """Give the one of the two that was given; None where neither was.
+def choose_lens(
+    camera: AnyLens | None, focal_px: float | None, fov_deg: float | None = None
+) -> AnyLens | None:
+    """Give the one that was given; None where none was.
 
     Raises:
-        InputError: both were.
+        InputError: several were, or the field of view is none.
     """
-    if camera is not None and focal_px is not None:
-        raise InputError("camera and focal_px are both given; omit one of the two")
-    return camera if focal_px is None else focal_px
+    fov = None if fov_deg is None else FieldOfView(fov_deg)
+    named = {"camera": camera, "focal_px": focal_px, "fov_deg": fov}
+    given = {name: lens for name, lens in named.items() if lens is not None}
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} are given; omit all but one of them")
+    return next(iter(given.values()), None)
 
 
 def centred_camera(size: Size, focal_px: float) -> Camera:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from depthpose.core.camera.facts import (
     KNOWN_FILES,
+    OPTIONAL_KEYS,
     SAME_DIFFERENCE_PX,
     CameraFacts,
     Size,
@@ -235,7 +236,7 @@ def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
 
 _NEEDED = ("width", "height", "K")
 _RIG = ("baseline_m", "cx_right_minus_left_px")
-_KEYS = (*_NEEDED, *_RIG, "depth_unit_m")
+_KEYS = (*_NEEDED, *_RIG, *OPTIONAL_KEYS)
 _BOP = ("fx", "fy", "cx", "cy")
 _MM = 0.001
 
@@ -265,6 +266,7 @@ def facts_from_json(content: object) -> CameraFacts:
 
 
 def _from_keys(keys: dict[str, Any]) -> CameraFacts:
+    optional: dict[str, Any] = {k: _json_number(keys, k) for k in OPTIONAL_KEYS if k in keys}
     return CameraFacts(
         kind="a camera",
         K=_matrix(keys["K"]),
@@ -272,7 +274,7 @@ def _from_keys(keys: dict[str, Any]) -> CameraFacts:
         baseline_m=_json_number(keys, "baseline_m") if "baseline_m" in keys else None,
         cx_right_minus_left_px=_json_number({_RIG[1]: 0, **keys}, _RIG[1]),
         is_metric=True,
-        depth_unit_m=_json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None,
+        **optional,
     )
 
 

@@ -23,6 +23,9 @@ KNOWN_FILES = (
 )
 """Formats of camera files, for errors."""
 
+OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")
+"""What any camera may have beside its matrix."""
+
 _NORMALISED_FX = 2
 _MM_FX_SHARE = 0.1
 """A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
@@ -63,6 +66,8 @@ class CameraFacts:
         cx_right_minus_left_px: difference of the principal points of a rig.
         is_metric: whether the format says the unit of the baseline.
         depth_unit_m: metres per unit of the depth images, where the file has it.
+        mount_height_m: height of the camera above the road, where the file has it.
+        tilt_deg: of the camera, positive upwards, where the file has it.
         distortion: coefficients of the lens; none, or zeros, for a pinhole.
         undistort: what takes the distortion out of an image.
     """
@@ -74,6 +79,8 @@ class CameraFacts:
     cx_right_minus_left_px: float = 0.0
     is_metric: bool = False
     depth_unit_m: float | None = None
+    mount_height_m: float | None = None
+    tilt_deg: float | None = None
     distortion: tuple[float, ...] = ()
     undistort: str = "cv2.undistort(image, K, distortion)"
 
@@ -162,17 +169,12 @@ def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
             f"{facts.kind} without the image's size; give it beside the image, or write a camera "
             "of ours (width, height, K)"
         )
-    width, height = known
+    common: dict[str, Any] = {"width": known[0], "height": known[1], "K": facts.K}
+    common |= {key: getattr(facts, key) for key in OPTIONAL_KEYS}
     if facts.baseline_m is None:
-        return Camera(width=width, height=height, K=facts.K, depth_unit_m=facts.depth_unit_m)
-    return StereoRig(
-        width=width,
-        height=height,
-        K=facts.K,
-        depth_unit_m=facts.depth_unit_m,
-        baseline_m=facts.baseline_m,
-        cx_right_minus_left_px=facts.cx_right_minus_left_px,
-    )
+        return Camera(**common)
+    doffs_px = facts.cx_right_minus_left_px
+    return StereoRig(**common, baseline_m=facts.baseline_m, cx_right_minus_left_px=doffs_px)
 
 
 def camera_keys(camera: Camera) -> dict[str, Any]:
@@ -182,9 +184,8 @@ def camera_keys(camera: Camera) -> dict[str, Any]:
         keys["baseline_m"] = camera.baseline_m
         if camera.cx_right_minus_left_px:
             keys["cx_right_minus_left_px"] = camera.cx_right_minus_left_px
-    if camera.depth_unit_m is not None:
-        keys["depth_unit_m"] = camera.depth_unit_m
-    return keys
+    known = {key: getattr(camera, key) for key in OPTIONAL_KEYS}
+    return keys | {key: value for key, value in known.items() if value is not None}
 
 
 def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) -> None:

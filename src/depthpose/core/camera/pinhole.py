@@ -31,6 +31,8 @@ class Camera:
         height: image height [px].
         K: intrinsic matrix ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` [px], float64.
         depth_unit_m: metres a unit of this camera's depth images, where it has any.
+        mount_height_m: height above the road, where known.
+        tilt_deg: of the optical axis against the road, where known; positive looks up.
 
     Raises:
         InputError: a value is out of its range.
@@ -40,6 +42,8 @@ class Camera:
     height: int
     K: Float[Tensor, "3 3"]
     depth_unit_m: float | None = None
+    mount_height_m: float | None = None
+    tilt_deg: float | None = None
 
     def __post_init__(self) -> None:
         for name, size in (("width", self.width), ("height", self.height)):
@@ -53,6 +57,16 @@ class Camera:
             raise InputError(
                 f"depth_unit_m is {self.depth_unit_m}, but a unit is a positive number of metres; "
                 "0.001 means millimetres"
+            )
+        if self.mount_height_m is not None and not 0.1 <= self.mount_height_m <= 20:
+            raise InputError(
+                f"mount_height_m is {self.mount_height_m}, but a camera stands 0.1 to 20 m above "
+                "the road; give metres"
+            )
+        if self.tilt_deg is not None and not -45 <= self.tilt_deg <= 45:
+            raise InputError(
+                f"tilt_deg is {self.tilt_deg}, but a road is seen at -45 to 45 degrees; negative "
+                "looks down"
             )
 
 

@@ -14,6 +14,7 @@ from depthpose.core.files.disk import atomic_write as atomic_write
 from depthpose.core.files.disk import cache_folder as cache_folder
 from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
+from depthpose.core.files.exif import read_exif_focal as read_exif_focal
 from depthpose.core.files.images import encode_image as encode_image
 from depthpose.core.files.images import image_size as image_size
 from depthpose.core.files.images import list_images as list_images

@@ -1,5 +1,6 @@
 """What an estimate can take: pictures of any form, pairs that are pairs."""
 
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from depthpose.core.camera import (
     check_image_matches_camera,
     check_rectified,
 )
-from depthpose.core.errors import InputError
-from depthpose.core.files import picture_tensor, read_image
+from depthpose.core.errors import InputError, Notice
+from depthpose.core.files import picture_tensor, read_exif_focal, read_image
 from depthpose.depth.types import StereoInput
 
 Picture = str | Path | Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
@@ -99,15 +100,29 @@ def as_inputs(images: object, camera: AnyLens | None) -> list[StereoInput]:
     ]
 
 
-def as_input(image: object, name: str, camera: AnyLens | None) -> StereoInput:
-    """Take a picture and what is known of its camera.
+def as_input(
+    image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
+) -> StereoInput:
+    """Take a picture and what is known of its camera; without that, ask the picture's EXIF.
 
     Raises:
         InputError: as :func:`as_tensor`, or no camera of this image.
     """
     left = as_tensor(image)
+    if camera is None and with_exif:
+        camera = exif_focal_px(image, name)
     camera = camera_of(camera, (left.shape[2], left.shape[1]))
     return StereoInput(name=name, left=left, right=None, camera=camera)
+
+
+def exif_focal_px(image: object, name: str) -> float | None:
+    """Give the focal length of a photograph's EXIF [px], with a :class:`Notice` of it, or None."""
+    found = read_exif_focal(image) if isinstance(image, str | Path | Image) else None
+    if found is None:
+        return None
+    said = f"{name}: a focal length of {found[0]:.0f} px, by its EXIF ({found[1]})"
+    warnings.warn(f"{said}; of a cropped picture it is another", Notice, stacklevel=4)
+    return found[0]
 
 
 def refuse_unrectified(pair: StereoInput) -> str:

@@ -40,6 +40,7 @@ from depthpose.depth.estimator.rig import (
     set_answer,
     square_camera,
 )
+from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
@@ -162,7 +163,9 @@ class FakestereoNet:
         camera: AnyCamera | None = None,
         *,
         focal_px: float | None = None,
+        fov_deg: float | None = None,
         right: Picture | None = None,
+        known_distance: tuple[float, float, float] | None = None,
         name: str | None = None,
         with_check: bool = True,
     ) -> DepthEstimate:
@@ -175,9 +178,13 @@ class FakestereoNet:
             camera: camera or rig, its file of any format that is read, a dict of what such a file
                 holds, or the 3x3 matrix K. One image needs its focal length, for the image is
                 brought to the rig that the generator imitates; of a rig, its disparity is that of
-                the baseline. A pair without camera gives disparity only.
+                the baseline. Its ``mount_height_m`` and ``tilt_deg`` set the scale of one image.
+                A pair without camera gives disparity only; one image without is asked for its EXIF.
             focal_px: the focal length alone [px], in place of a camera.
+            fov_deg: the horizontal field of view alone [degrees], in place of both.
             right: right image, the same size and rows.
+            known_distance: column, row [px] and camera z [m] of a measured point, which sets the
+                scale of one image.
             name: what to call the input in errors; the file's name by default.
             with_check: look first whether both images show one scene, rectified and in the right
                 order; where that cannot be told, the estimate has a ``warning``.
@@ -188,10 +195,14 @@ class FakestereoNet:
                 weights know.
         """
         chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
-        pair = as_input(image, chosen, choose_lens(camera, focal_px))
+        lens = choose_lens(camera, focal_px, fov_deg)
+        pair = as_input(image, chosen, lens, with_exif=right is None)
         if right is not None:
             pair = replace(pair, right=as_tensor(right, "the right image"))
-        return self.estimate_pair(pair, with_check=with_check)
+            if known_distance is not None:
+                raise InputError(f"{chosen}: a pair has metres of its own; omit known_distance")
+        found = self.estimate_pair(pair, with_check=with_check)
+        return found if known_distance is None else scale_by_distance(found, chosen, known_distance)
 
     @torch.no_grad()
     @own_arithmetic()
@@ -221,6 +232,7 @@ class FakestereoNet:
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
+        fov_deg: float | None = None,
         with_check: bool = True,
     ) -> list[DepthEstimate]:
         """Estimate depth of images, alone or as pairs; neighbours of one camera size go together.
@@ -231,13 +243,14 @@ class FakestereoNet:
             images: inputs; or pictures, or a batch of them as one array or tensor.
             camera: of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the same as its focal length alone [px].
+            fov_deg: the same as its horizontal field of view [degrees].
             with_check: of pairs, as for :meth:`estimate`.
 
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
         found: list[DepthEstimate] = []
-        inputs = as_inputs(images, choose_lens(camera, focal_px))
+        inputs = as_inputs(images, choose_lens(camera, focal_px, fov_deg))
         for sizes, group in groupby(inputs, self._sizes_alone):
             alike = list(group)
             with refused_memory(alike[0].name):
@@ -280,6 +293,7 @@ class FakestereoNet:
         skies = [m.is_sky for m in matches] if drawn.is_sky is None else drawn.is_sky
         parts = zip(images, matches, drawn.right, skies, strict=True)
         found = [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
+        found = [scale_by_mount(one, image) for one, image in zip(found, images, strict=True)]
         if drawn.confidence is None:
             return found
         known = [float(confidence.mean()) for confidence in drawn.confidence]
@@ -327,8 +341,9 @@ class FakestereoNet:
         check_image(image.left, f"{image.name}: the image")
         if image.camera is None:
             raise InputError(
-                f"{image.name}: metres from one image need its focal length. Give a camera: "
-                '{"width", "height", "K"}; a phone\'s main camera has about 0.75 widths.'
+                f"{image.name}: metres from one image need its focal length, and its EXIF has "
+                'none. Give a camera: {"width", "height", "K"}, focal_px=, or fov_deg=, the angle '
+                "from left to right; a phone's main camera has about 0.75 widths, or 67 degrees."
             )
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)

@@ -17,7 +17,7 @@ from torch import Tensor
 from depthpose.core.camera.camera_file import AnyCamera, AnyLens, choose_lens
 from depthpose.core.errors import Notice, refuse_unknown
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.estimator.inputs import Picture, as_tensor
+from depthpose.depth.estimator.inputs import Picture, as_tensor, exif_focal_px
 from depthpose.depth.estimator.net import DEFAULT, FakestereoNet
 
 _PHONE = 0.75
@@ -40,14 +40,17 @@ class DepthPipeline:
         camera: AnyCamera | None = None,
         *,
         focal_px: float | None = None,
+        fov_deg: float | None = None,
     ) -> dict[str, Any] | list[dict[str, Any]]:
         """Estimate one picture, or a list of them.
 
         Args:
             inputs: as :meth:`FakestereoNet.estimate` takes them.
-            camera: of all pictures. Without it and ``focal_px`` 0.75 widths are taken, a phone's,
-                with a notice: the metres are as wrong as that is.
+            camera: of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's EXIF is
+                taken, or else 0.75 widths, a phone's, with a notice: the metres are as wrong as
+                that is.
             focal_px: the focal length alone [px].
+            fov_deg: the horizontal field of view alone [degrees].
 
         Returns:
             For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and
@@ -56,13 +59,15 @@ class DepthPipeline:
         Raises:
             InputError: as :meth:`FakestereoNet.estimate`.
         """
-        lens = choose_lens(camera, focal_px)
+        lens = choose_lens(camera, focal_px, fov_deg)
         if isinstance(inputs, list | tuple):
             return [self._one(one, lens) for one in inputs]
         return self._one(inputs, lens)
 
     def _one(self, picture: object, lens: AnyLens | None) -> dict[str, Any]:
         image = as_tensor(picture)
+        if lens is None:
+            lens = exif_focal_px(picture, "the picture")
         if lens is None:
             lens = _PHONE * image.shape[2]
             warnings.warn(

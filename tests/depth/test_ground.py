@@ -1,0 +1,147 @@
+"""The road in a depth map, and the scale by the camera's height or one measured distance."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import Float
+from torch import Tensor
+
+from depthpose.core.camera import Camera
+from depthpose.core.errors import InputError
+from depthpose.depth.ground import fit_ground, scale_by_distance, scale_by_mount
+from depthpose.depth.types import DepthEstimate, StereoInput
+
+K = torch.tensor([[300.0, 0, 199.5], [0, 300, 99.5], [0, 0, 1]], dtype=torch.float64)
+CAMERA = Camera(width=400, height=200, K=K)
+
+
+def road(height_m: float, tilt_deg: float, roll_deg: float) -> Float[Tensor, "200 400"]:
+    """Depth of a road below a camera that looks up by the tilt; a wall beyond 30 m."""
+    v, u = torch.meshgrid(torch.arange(200.0), torch.arange(400.0), indexing="ij")
+    x, y = (u.double() - 199.5) / 300, (v.double() - 99.5) / 300
+    tilt, roll = math.tan(math.radians(tilt_deg)), math.tan(math.radians(roll_deg))
+    down = torch.tensor([-roll, 1, -tilt], dtype=torch.float64)
+    down = down / down.norm()
+    inverse = (down[0] * x + down[1] * y + down[2]) / height_m
+    return (1 / inverse.clamp(min=1 / 30)).float()
+
+
+def estimate(depth_m: Float[Tensor, "h w"]) -> DepthEstimate:
+    """Make an estimate whose sky is the uppermost 20 rows."""
+    is_sky = torch.zeros_like(depth_m, dtype=torch.bool)
+    is_sky[:20] = True
+    known = torch.where(is_sky, torch.nan, depth_m)
+    px = torch.where(is_sky, 0.01, 100 / depth_m)
+    return DepthEstimate(depth_m=known, disparity_px=px, is_sky=is_sky)
+
+
+def seen(**mount: float) -> StereoInput:
+    """Make an input of the camera with what is known of its mount."""
+    camera = replace(CAMERA, **mount)
+    return StereoInput(name="street", left=torch.zeros(3, 200, 400), right=None, camera=camera)
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.floats(0.8, 3.5), st.floats(-8, 4), st.floats(-6, 6))
+def test_height_tilt_and_roll_of_a_plane_are_found(height: float, tilt: float, roll: float) -> None:
+    found = fit_ground(road(height, tilt, roll), CAMERA)
+    assert found is not None
+    assert found.height_m == pytest.approx(height, rel=0.02)
+    assert found.tilt_deg == pytest.approx(tilt, abs=0.2)
+    assert found.roll_deg == pytest.approx(roll, abs=0.2)
+
+
+def test_things_on_the_road_and_noise_move_the_fit_little_and_are_in_its_deviation() -> None:
+    depth_m = road(1.5, -2, 1)
+    clean = fit_ground(depth_m, CAMERA)
+    noise = torch.randn(depth_m.shape, generator=torch.Generator().manual_seed(0))
+    depth_m = depth_m * (1 + 0.03 * noise)
+    depth_m[110:190, 230:300] = 6.0  # a car
+    found = fit_ground(depth_m, CAMERA)
+    assert found is not None and clean is not None  # noqa: PT018
+    assert found.height_m == pytest.approx(1.5, rel=0.03)
+    assert found.tilt_deg == pytest.approx(-2, abs=0.5)
+    assert found.height_std_m > 3 * clean.height_std_m
+
+
+@pytest.mark.parametrize(
+    "depth_m",
+    [
+        torch.full((200, 400), 5.0),
+        torch.full((200, 400), torch.nan),
+        1 + 20 * torch.rand(200, 400, generator=torch.Generator().manual_seed(1)),
+        road(1.5, 0, 0).flip(0),
+        road(1.5, 0, 0).T.contiguous()[:200, :].repeat(1, 2),
+    ],
+    ids=["a wall", "nothing", "noise", "a ceiling", "turned"],
+)
+def test_what_is_no_road_is_none(depth_m: Float[Tensor, "200 400"]) -> None:
+    assert fit_ground(depth_m, CAMERA) is None
+    with pytest.raises(InputError, match=r"no road is seen .* give --known-distance"):
+        scale_by_mount(estimate(depth_m), seen(mount_height_m=1.5))
+
+
+@pytest.mark.parametrize(
+    "mount", [{"mount_height_m": 2.4}, {"mount_height_m": 2.4, "tilt_deg": -3.0}]
+)
+def test_a_known_height_scales_depth_and_disparity_and_not_the_sky(mount: dict[str, float]) -> None:
+    given = estimate(road(1.6, -3, 0))
+    found = scale_by_mount(given, seen(**mount))
+    assert found.ground is not None
+    assert found.ground.height_m == pytest.approx(2.4, rel=1e-3)
+    truth = estimate(road(2.4, -3, 0)).depth_m
+    assert found.depth_m is not None and truth is not None  # noqa: PT018
+    near = truth < 20
+    torch.testing.assert_close(found.depth_m[near], truth[near], rtol=2e-3, atol=0)
+    torch.testing.assert_close(
+        found.disparity_px[100:], given.disparity_px[100:] / 1.5, rtol=2e-3, atol=0
+    )
+    torch.testing.assert_close(found.disparity_px[:20], given.disparity_px[:20])
+
+
+def test_a_known_tilt_corrects_a_wrong_one() -> None:
+    wrong = estimate(road(1.6, -1.5, 0))
+    by_tilt, alone = (
+        scale_by_mount(wrong, seen(**mount)).depth_m
+        for mount in ({"mount_height_m": 1.6, "tilt_deg": -3.0}, {"mount_height_m": 1.6})
+    )
+    truth = road(1.6, -3, 0)[140:]
+    assert by_tilt is not None and alone is not None  # noqa: PT018
+    errors = [float((part[140:] / truth - 1).abs().mean()) for part in (by_tilt, alone)]
+    assert errors[0] < errors[1]
+
+
+def test_a_tilt_that_puts_the_road_above_the_horizon_is_refused() -> None:
+    with pytest.raises(InputError, match=r"above the horizon of a tilt of 30 degrees"):
+        scale_by_mount(estimate(road(1.6, 0, 0)), seen(mount_height_m=1.6, tilt_deg=30.0))
+
+
+def test_a_known_distance_sets_the_scale_by_the_median_around_it() -> None:
+    depth_m = road(1.6, 0, 0)
+    depth_m[150, 200] = 1000.0  # one wrong pixel
+    found = scale_by_distance(estimate(depth_m), "a", (200.0, 150.0, 19.2))
+    assert found.depth_m is not None
+    expected = float(road(1.6, 0, 0)[150, 100]) * 19.2 / float(road(1.6, 0, 0)[150, 200])
+    assert float(found.depth_m[150, 100]) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ((200.0, 5.0, 10.0), "no depth at this pixel"),
+        ((400.0, 50.0, 10.0), "the image is 400x200, columns 0 to 399"),
+        ((-1.0, 50.0, 10.0), "columns 0 to 399"),
+        ((20.0, 150.0, 0.0), "must be a positive number"),
+        ((20.0, 150.0, math.nan), "must be a positive number"),
+        ((math.nan, 150.0, 3.0), "columns 0 to 399"),
+    ],
+)
+def test_a_known_distance_that_cannot_be_is_refused(
+    known: tuple[float, float, float], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        scale_by_distance(estimate(road(1.6, 0, 0)), "a", known)
