@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import random
 import shutil
 import subprocess
@@ -238,8 +239,18 @@ def test_a_focal_length_stands_for_a_centred_camera(home: Path, tmp_path: Path) 
     image = str(home / "images" / "1.png")
     assert predict(home, tmp_path / "a", image, "--camera", str(home / "cam.json")) == 0
     assert predict(home, tmp_path / "b", image, "--focal-px", "70") == 0
-    one, other = (read_map(tmp_path / name / "1.depth_m.npy") for name in ("a", "b"))
+    half_deg = math.degrees(math.atan(32 / 70))
+    assert predict(home, tmp_path / "c", image, "--fov", f"{2 * half_deg:.9f}") == 0
+    known = ["--focal-px", "70", "--known-distance", "30,20,5.5"]
+    assert predict(home, tmp_path / "d", image, *known) == 0
+    one, other, third, scaled = (
+        read_map(tmp_path / name / "1.depth_m.npy") for name in ("a", "b", "c", "d")
+    )
     assert torch.equal(one, other)
+    torch.testing.assert_close(one, third, rtol=1e-5, atol=0)
+    ratio = (scaled / one)[torch.isfinite(one)]
+    torch.testing.assert_close(ratio, ratio[0].expand_as(ratio), rtol=1e-4, atol=0)
+    assert float(scaled[18:23, 28:33].median()) == pytest.approx(5.5, rel=1e-4)
 
 
 def test_a_video_keeps_one_scale(home: Path, tmp_path: Path) -> None:
@@ -442,7 +453,16 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give --camera FILE, or --focal-px"),
+        ([], "0.png has none in its EXIF: give --camera FILE, --focal-px, or --fov"),
+        (["--focal-px", "70", "--fov", "90"], "--focal-px and --fov all give the focal length"),
+        (["--fov", "190"], "spans 1 to 170 degrees"),
+        (["--fov", "90", "--known-distance", "1,2"], "write X,Y,METRES, such as 640,300,12.5"),
+        (["--fov", "90", "--camera-height", "150"], "--camera-height 150: give 0.1 to 20 metres"),
+        (["--fov", "90", "--camera-tilt", "-80"], "--camera-tilt -80: give -45 to 45 degrees"),
+        (
+            ["--fov", "90", "--camera-height", "1.4", "--known-distance", "1,2,3"],
+            "both set the scale; omit one",
+        ),
         (["--focal-px", "0.5"], "not a focal length in pixels"),
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
         (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),

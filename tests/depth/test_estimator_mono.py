@@ -21,17 +21,18 @@ from depthpose.depth.config import (
     GeneratorConfig,
     MatcherConfig,
     PSMNetConfig,
+    SelectionConfig,
     SGBMConfig,
     Speed,
 )
 from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
-from depthpose.depth.estimator.rig import join_matches
+from depthpose.depth.estimator.rig import check_distribution, join_matches
 from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
-from depthpose.depth.types import Match, StereoInput
+from depthpose.depth.types import DepthEstimate, Ground, Match, StereoInput
 from depthpose.depth.weights import read_generator, write_depth_weights
 
 
@@ -474,17 +475,58 @@ def unsure(least: float) -> SelectionGenerator:
 
 def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     image, lens = torch.rand(3, 40, 60), camera(60, 40, FOCAL_PX)
-    known = FakestereoNet(None, make_synthesiser(unsure(0.6))).estimate(image, lens)
+    known = FakestereoNet(None, make_synthesiser(unsure(0.45))).estimate(image, lens)
     assert known.image_confidence == pytest.approx(0.7)
     assert known.warning == ""
-    synthesiser = make_synthesiser(unsure(0.8))
+    synthesiser = make_synthesiser(unsure(0.6))
+    # One disparity everywhere is a wall, and without a road it must be surer.
     with pytest.raises(
-        InputError, match=r"cup: out of distribution .* below 0\.80\), .* allow_ood=True"
+        InputError, match=r"cup: out of .* \(no road is seen, .* below 0\.80\), .* allow_ood=True"
     ):
         FakestereoNet(None, synthesiser).estimate(image, lens, name="cup")
     guess = FakestereoNet(None, synthesiser, allow_ood=True).estimate(image, lens, name="cup")
     assert guess.warning.startswith("out of distribution for these weights")
     torch.testing.assert_close(guess.depth_m, known.depth_m)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "tilt_deg", "is_refused"),
+    [(1.6, -2.0, False), (9.0, 0.0, True), (1.6, 20.0, True)],
+)
+def test_with_a_road_an_image_may_be_less_sure(
+    height_m: float, tilt_deg: float, is_refused: bool
+) -> None:
+    road = Ground(height_m=height_m, tilt_deg=tilt_deg, roll_deg=0.0, share=0.8, height_std_m=0.02,
+                  tilt_std_deg=0.1)  # fmt: skip
+    found = DepthEstimate(depth_m=None, disparity_px=torch.ones(2, 2), image_confidence=0.55,
+                          ground=road)  # fmt: skip
+    config = SelectionConfig(least_confidence=0.6)
+    said = check_distribution("a", found, config, allow_ood=True).warning
+    assert bool(said) == is_refused
+
+
+def test_without_a_camera_a_photograph_is_asked_for_its_exif(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 40
+    Image.fromarray(RGB).save(tmp_path / "a.jpg", exif=exif.tobytes())
+    net = FakestereoNet(None, make_synthesiser(sure_of(1)))
+    with pytest.warns(Notice, match=r"a: a focal length of \d+ px, by its EXIF \(Focal.* 40 mm\)"):
+        found = net.estimate(tmp_path / "a.jpg")
+    height, width = RGB.shape[:2]
+    focal_px = 40 / math.hypot(36, 24) * math.hypot(width, height)
+    expected = net.estimate(tmp_path / "a.jpg", focal_px=focal_px)
+    torch.testing.assert_close(found.depth_m, expected.depth_m)
+
+
+def test_a_field_of_view_is_a_focal_length() -> None:
+    net = FakestereoNet(None, make_synthesiser(sure_of(1)))
+    by_angle = net.estimate(RGB, fov_deg=90.0).depth_m
+    torch.testing.assert_close(by_angle, net.estimate(RGB, focal_px=RGB.shape[1] / 2).depth_m)
+    for lens in ({"fov_deg": 0.0}, {"fov_deg": 180.0}, {"fov_deg": math.nan}):
+        with pytest.raises(InputError, match="spans 1 to 170 degrees"):
+            net.estimate(RGB, **lens)
+    with pytest.raises(InputError, match="focal_px and fov_deg are both given"):
+        net.estimate(RGB, focal_px=100.0, fov_deg=90.0)
 
 
 def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:

@@ -72,9 +72,7 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 
 
 def import_weights(
-    kind: tyro.conf.Positional[
-        Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0", "efficientnet-lite2"]
-    ],
+    kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
     file: tyro.conf.Positional[Path],
     out: Path,
     align_corners: Literal["true", "false"] | None = None,
@@ -88,8 +86,8 @@ def import_weights(
     Args:
         kind: the network: psmnet, the stacked hourglass; fcgf, the sparse ResUNetBN2C, as
             MinkowskiEngine stores it; resnet18, an encoder trained on ImageNet, which segmentation
-            can start from (.pth of tensors or .safetensors); efficientnet-lite0 and -lite2,
-            encoders that 'depth train select' can start from.
+            can start from (.pth of tensors or .safetensors); efficientnet-lite0, an
+            encoder that 'depth train select' can start from.
         file: the published checkpoint, e.g. pretrained_model_KITTI2015.tar (do not unpack it).
         out: the .safetensors file to write.
         align_corners: psmnet: how the checkpoint was trained to upsample (not in the file):
@@ -118,7 +116,7 @@ def import_weights(
     else:
         from depthpose.depth.encoder import import_encoder
 
-        import_encoder(file, out, kind)
+        import_encoder(file, out)
     return show_weights(str(out))
 
 

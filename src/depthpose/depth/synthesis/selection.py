@@ -41,7 +41,7 @@ class SelectionGenerator(nn.Module):
     def __init__(self, config: SelectionConfig | None = None) -> None:
         super().__init__()
         self.config = config or SelectionConfig()
-        self.encoder = LiteEncoder(self.config.encoder_width, kind=self.config.encoder_kind)
+        self.encoder = LiteEncoder(self.config.encoder_width)
         widths, skips = self.config.widths, self.encoder.channels[-2::-1]
         self.top = nn.Conv2d(self.encoder.channels[-1], widths[0], 1)
         inputs = (widths[0], *widths[:-1])
