@@ -478,7 +478,7 @@ def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     known = FakestereoNet(None, make_synthesiser(unsure(0.45))).estimate(image, lens)
     assert known.image_confidence == pytest.approx(0.7)
     assert known.warning == ""
-    synthesiser = make_synthesiser(unsure(0.6))
+    synthesiser = make_synthesiser(unsure(0.7))
     # One disparity everywhere is a wall, and without a road it must be surer.
     with pytest.raises(
         InputError, match=r"cup: out of .* \(no road is seen, .* below 0\.80\), .* allow_ood=True"
@@ -498,7 +498,7 @@ def test_with_a_road_an_image_may_be_less_sure(
 ) -> None:
     road = Ground(height_m=height_m, tilt_deg=tilt_deg, roll_deg=0.0, share=0.8, height_std_m=0.02,
                   tilt_std_deg=0.1)  # fmt: skip
-    found = DepthEstimate(depth_m=None, disparity_px=torch.ones(2, 2), image_confidence=0.55,
+    found = DepthEstimate(depth_m=None, disparity_px=torch.ones(2, 2), image_confidence=0.57,
                           ground=road)  # fmt: skip
     config = SelectionConfig(least_confidence=0.6)
     said = check_distribution("a", found, config, allow_ood=True).warning

@@ -192,7 +192,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     if isinstance(camera, str | Path):
         return read_camera(Path(camera), size)
     if isinstance(camera, FieldOfView):
-        return centred_camera(size, size[0] / 2 / math.tan(math.radians(camera.degrees / 2)))
+        camera = size[0] / 2 / math.tan(math.radians(camera.degrees / 2))
     if isinstance(camera, int | float):
         return centred_camera(size, camera)
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:

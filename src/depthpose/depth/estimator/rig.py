@@ -30,7 +30,7 @@ from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 
-_ROAD_RELIEF, _NO_ROAD_EXCESS = 0.1, 0.2
+_ROAD_RELIEF, _NO_ROAD_EXCESS = 0.05, 0.1
 """By how much the least mean confidence is lower where a road is seen, and higher where none is."""
 SKY_M = 10_000.0
 """What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
