@@ -522,9 +522,9 @@ def test_a_field_of_view_is_a_focal_length() -> None:
     net = FakestereoNet(None, make_synthesiser(sure_of(1)))
     by_angle = net.estimate(RGB, fov_deg=90.0).depth_m
     torch.testing.assert_close(by_angle, net.estimate(RGB, focal_px=RGB.shape[1] / 2).depth_m)
-    for lens in ({"fov_deg": 0.0}, {"fov_deg": 180.0}, {"fov_deg": math.nan}):
+    for degrees in (0.0, 180.0, math.nan):
         with pytest.raises(InputError, match="spans 1 to 170 degrees"):
-            net.estimate(RGB, **lens)
+            net.estimate(RGB, fov_deg=degrees)
     with pytest.raises(InputError, match="focal_px and fov_deg are both given"):
         net.estimate(RGB, focal_px=100.0, fov_deg=90.0)
 
