@@ -15,23 +15,23 @@ from depthpose.core.files import Cloud, write_cloud, write_image
 MISTAKES = {
     "unit of a cloud": (
         "pose.estimate(cloud=points, object='flange', unit='millimeters')",
-        "unit is 'millimeters'; Known: 'm', 'mm'.",
+        "unit is 'millimeters'; Known: 'cm', 'm', 'mm'.",
     ),
     "unit of depth": (
-        "pose.estimate(depth=depth_m, mask=mask, camera=camera, object='flange', unit='cm')",
-        "unit is 'cm'; did you mean 'm'? Known: 'm', 'mm'.",
+        "pose.estimate(depth=depth_m, mask=mask, camera=camera, object='flange', unit='inch')",
+        "unit is 'inch'; Known: 'cm', 'm', 'mm'.",
     ),
     "a list of CAD files": (
         "Registration.load(['part.stl'], unit='mm')",
         "Registration.load takes paths one by one: load(*files, unit=...)",
     ),
     "a depth image in another format": (
-        "pose.estimate(depth='depth.tiff', mask=mask, camera=camera, object='flange')",
-        "depth.tiff: .tiff is no depth image format; use .png, .npy, .pfm",
+        "pose.estimate(depth='depth.exr', mask=mask, camera=camera, object='flange')",
+        "depth.exr: .exr is no depth image format; use .png, .tif, .tiff, .npy, .pfm",
     ),
     "unit of a mesh": (
         "read_model('part.stl', 'metres')",
-        "unit is 'metres'; Known: 'm', 'mm'.",
+        "unit is 'metres'; Known: 'cm', 'm', 'mm'.",
     ),
     "K as an array": (
         "Camera(width=64, height=48, K=np.array(K))",
