@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.sparse import KernelMap, SparseConv, Voxels, layers
+from depthpose.pose.sparse import KernelMap, SparseConv, Voxels
 
 Run = Callable[[], Tensor]
 
@@ -47,11 +47,11 @@ def surface(voxels: int) -> Tensor:
 
 def plain_conv(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
     """Convolve offset by offset under torch's autograd, which keeps every gathered row."""
-    m, out = kernel_map, features.new_zeros(kernel_map.outputs, weight.shape[2])
-    parts = zip(m.filled, m.rows_in.split(m.counts), m.rows_out.split(m.counts), strict=True)
-    for offset, read, write in parts:
+    out = features.new_zeros(kernel_map.outputs, weight.shape[2])
+    for offset, read, write in kernel_map.by_offset():
         out = out.index_add(0, write, features[read] @ weight[offset])
-    return out if m.centre is None else out + features @ weight[m.centre]
+    centre = kernel_map.centre
+    return out if centre is None else out + features @ weight[centre]
 
 
 class MinkowskiVoxels:
@@ -110,7 +110,7 @@ def engines(network: ResUNet, coordinates: Tensor) -> dict[str, Run]:
         return network(Voxels.from_points(coordinates))
 
     def plain() -> Tensor:
-        with patch.object(layers, "conv", plain_conv):
+        with patch.object(import_module("depthpose.pose.sparse.conv"), "conv", plain_conv):
             return network(Voxels.from_points(coordinates))
 
     runs: dict[str, Run] = {"ours": ours, "plain autograd": plain}

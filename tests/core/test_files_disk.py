@@ -139,7 +139,7 @@ from depthpose.core.files import (
     Cloud, write_cloud, write_depth_png, write_image, write_map, write_video
 )
 from depthpose.core.loop import Journal
-from depthpose.core.loop.state import write_state
+from depthpose.core.loop.folder import write_state
 from depthpose.report.tables import Section, write_page, write_table
 from depthpose.core.run import claim_folder
 

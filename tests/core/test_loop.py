@@ -32,7 +32,7 @@ from depthpose.core.loop import (
     train,
     write_card,
 )
-from depthpose.core.loop.host import Arithmetic
+from depthpose.core.loop.loop import Arithmetic
 
 PROGRAM = Path(__file__).with_name("loop_task.py")
 
@@ -135,7 +135,7 @@ def test_ctrl_c_twice_finishes_with_the_step_at_hand(
 
 
 def test_ctrl_c_once_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("depthpose.core.loop.host.SECOND_CTRL_C_S", 0.1)
+    monkeypatch.setattr("depthpose.core.loop.loop.SECOND_CTRL_C_S", 0.1)
 
     def press(progress: Progress) -> None:
         if progress.step == 5:

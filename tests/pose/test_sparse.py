@@ -20,7 +20,7 @@ from depthpose.pose.sparse import (
     conv,
     kernel_offsets,
 )
-from depthpose.pose.sparse.keys import CLOUD_LIMIT, pack, unpack
+from depthpose.pose.sparse.kernel_map import CLOUD_LIMIT, pack, unpack
 
 CONV = import_module("depthpose.pose.sparse.conv")
 SIDE = 8
@@ -148,14 +148,15 @@ def test_pairs_of_a_small_case_by_hand() -> None:
     offsets = kernel_offsets(3)
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
     assert met == {(left, 0, 1), (left, 1, 2), (right, 1, 0), (right, 2, 1)}
-    assert (kernel_map.centre, kernel_map.filled, kernel_map.counts) == (13, (left, right), (2, 2))
+    pairs = kernel_map.neighbours.pairs
+    assert (kernel_map.centre, pairs.filled, pairs.counts) == (13, (left, right), (2, 2))
     assert cache.coordinates(1).tolist() == [[0, -2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]
 
 
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
     by_table = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
-    monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.kernel_map.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
@@ -170,7 +171,7 @@ def test_no_look_leaves_the_table(
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
     found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
-    monkeypatch.setattr("depthpose.pose.sparse.keys.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.sparse.kernel_map.MAX_CELLS", 0)
     wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     assert torch.equal(found, wanted)
 

@@ -62,7 +62,8 @@ class RowDepthBaseline:
         if not has_truth.any():
             raise _nothing_to_learn(dataset)
         reached = weight.cumsum(1) >= weight.sum(1, keepdims=True) / 2
-        median_m = _step_m(reached.argmax(1))
+        # The depth in the middle of a step.
+        median_m = _NEAR_M * (_FAR_M / _NEAR_M) ** ((reached.argmax(1) + 0.5) / _STEPS)
         rows = np.arange(_ROWS)
         return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
 
@@ -101,17 +102,15 @@ class NearestImageBaseline:
         Raises:
             InputError: none has.
         """
-        frames = dataset.frames
         indices = [
             i
-            for i, frame in enumerate(frames)
+            for i, frame in enumerate(dataset.frames)
             if frame.calibration and known_truths(frame) and dataset.read_rig(i) is not None
         ]
         if not indices:
             raise _nothing_to_learn(dataset)
-        thumbnails = [
-            _thumbnail(read_image(frames[indices[k]].left)) for k in progress(range(len(indices)))
-        ]
+        lefts = [dataset.frames[i].left for i in indices]
+        thumbnails = [_thumbnail(read_image(lefts[k])) for k in progress(range(len(lefts)))]
         return cls(dataset, indices, torch.stack(thumbnails))
 
     def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
@@ -127,7 +126,8 @@ class NearestImageBaseline:
         assert other is not None
         inverse = fill_by_pyramid(1 / known_m)
         inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
-        return _estimate(_focal_share(rig) / _focal_share(other) / inverse, rig)
+        focal, other_focal = (float(c.K[0, 0]) / c.width for c in (rig, other))
+        return _estimate(focal / other_focal / inverse, rig)
 
 
 def fill_by_pyramid(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -158,11 +158,6 @@ def _count(known_m: Float[Tensor, "h w"], rig: StereoRig) -> Float64[np.ndarray,
     return np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
 
 
-def _step_m(step: np.ndarray) -> Float64[np.ndarray, "..."]:
-    """Depth in the middle of a step."""
-    return _NEAR_M * (_FAR_M / _NEAR_M) ** ((step + 0.5) / _STEPS)
-
-
 def _canonical_row(v: np.ndarray, camera: Camera) -> Float64[np.ndarray, " rows"]:
     slope = (v - float(camera.K[1, 2])) / float(camera.K[1, 1])
     return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
@@ -172,10 +167,6 @@ def _thumbnail(image: Float[Tensor, "3 h w"]) -> Float[Tensor, " d"]:
     cells = shrink(image, 8, 24).flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
-
-
-def _focal_share(camera: Camera) -> float:
-    return float(camera.K[0, 0]) / camera.width
 
 
 def _estimate(depth_m: Float[Tensor, "h w"], rig: StereoRig) -> DepthEstimate:

@@ -13,13 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    read_json,
-    read_map,
-    write_depth_png,
-    write_json,
-    write_map,
-)
+from depthpose.core.files import read_json, read_map, write_depth_png, write_json, write_map
 from depthpose.core.files.disk import AnyPath, write_bytes
 from depthpose.core.run import read_sources
 
@@ -30,7 +24,6 @@ NERFSTUDIO_UNIT = 0.001
 """What nerfstudio multiplies depth files of either kind by, by default."""
 TRANSFORMS, TRANSFORMS_DEPTH = "transforms.json", "transforms_depth.json"
 _DEPTH = ".depth_m.npy"
-_PNG_MOST = 65535
 
 
 def predicted_names(results: Path) -> list[str]:
@@ -89,11 +82,7 @@ def write_colmap(results: Path, out: Path, files: Mapping[str, str], scale: floa
 
 
 def nerfstudio_files(results: Path, kind: Kind) -> dict[str, str]:
-    """Say what the depth of each frame is called in a data set of nerfstudio.
-
-    Raises:
-        InputError: no predictions.
-    """
+    """Say what the depth of each frame is called in nerfstudio's data set; none is refused."""
     return {name: f"depths/{name}.{kind}" for name in predicted_names(results)}
 
 
@@ -112,18 +101,16 @@ def nerfstudio_frames(out: Path, files: Mapping[str, str]) -> dict[str, Any] | N
     is_list = isinstance(frames, list) and all(isinstance(f, dict) for f in frames)
     if not isinstance(content, dict) or not is_list:
         raise InputError(f"{path}: has no list of 'frames'; give one that ns-process-data wrote")
-    given = [{**frame, "depth_file_path": _depth_of(path, frame, files)} for frame in frames or ()]
+    given = []
+    for frame in frames or ():
+        name = Path(str(frame.get("file_path", ""))).stem
+        if name not in files:
+            raise InputError(
+                f"{path}: frame {name!r} has no prediction, and nerfstudio takes depth for all "
+                f"frames or for none; predict it too. There are {', '.join(list(files)[:3])}, ..."
+            )
+        given.append({**frame, "depth_file_path": files[name]})
     return {**content, "frames": given, "depth_unit_scale_factor": NERFSTUDIO_UNIT}
-
-
-def _depth_of(path: Path, frame: Mapping[str, Any], files: Mapping[str, str]) -> str:
-    name = Path(str(frame.get("file_path", ""))).stem
-    if name not in files:
-        raise InputError(
-            f"{path}: frame {name!r} has no prediction, and nerfstudio takes depth for all frames "
-            f"or for none; predict it too. There are {', '.join(list(files)[:3])}, ..."
-        )
-    return files[name]
 
 
 def write_nerfstudio(
@@ -141,7 +128,7 @@ def write_nerfstudio(
         depth = _depth_m(results, name) * scale
         if file.endswith(".png"):
             write_depth_png(out / file, depth, NERFSTUDIO_UNIT)
-            yield int((depth > _PNG_MOST * NERFSTUDIO_UNIT).sum())
+            yield int((depth > 65535 * NERFSTUDIO_UNIT).sum())
         else:
             write_map(out / file, depth.nan_to_num(0.0) / NERFSTUDIO_UNIT)
             yield 0

@@ -29,9 +29,7 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def discriminator_loss(
-    real: Float[Tensor, "b 1 rows columns"],
-    fake: Float[Tensor, "b 1 rows columns"],
-    mode: str,
+    real: Float[Tensor, "b 1 rows columns"], fake: Float[Tensor, "b 1 rows columns"], mode: str
 ) -> Float[Tensor, ""]:
     """Half the sum of both losses, which slows the discriminator (pix2pix)."""
     real_loss = adversarial_loss(real, mode, is_real=True)
@@ -102,11 +100,14 @@ def log_disparity_loss(
     Each image with truth counts the same, however sparse its truth is; truth outside ``range_px``
     counts as its end. NaN and the sky (0) do not count.
     """
-    is_known = truth_px > 0
     truth = truth_px.nan_to_num(1.0).clamp(*range_px).log()
-    error = torch.where(is_known, (found_log_px - truth).abs(), 0.0)
+    return _mean_of_images((found_log_px - truth).abs(), truth_px > 0)
+
+
+def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
+    """Mean over images with truth of each one's mean over its pixels with truth."""
     counts = is_known.sum((1, 2))
-    means = error.sum((1, 2)) / counts.clamp(min=1)
+    means = torch.where(is_known, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
@@ -143,7 +144,7 @@ def plane_loss(
         truth_px: disparity; 0 in the sky, NaN where unknown.
         planes: disparities, evenly spaced in their logarithm [px].
     """
-    is_known, is_sky = truth_px >= 0, truth_px == 0
+    is_sky = truth_px == 0
     logs = planes.log()
     place = (truth_px.nan_to_num(1.0).clamp(planes[0], planes[-1]).log() - logs[0]) / (
         logs[1] - logs[0]
@@ -153,10 +154,7 @@ def plane_loss(
     first = torch.where(is_sky, 0, lower.long() + 1)[:, None]
     scores = logits.float().log_softmax(1)
     near, far = scores.gather(1, first)[:, 0], scores.gather(1, first + 1)[:, 0]
-    loss = -(near * (1 - share) + far * share)
-    counts = is_known.sum((1, 2))
-    means = torch.where(is_known, loss, 0.0).sum((1, 2)) / counts.clamp(min=1)
-    return means.sum() / (counts > 0).sum().clamp(min=1)
+    return _mean_of_images(-(near * (1 - share) + far * share), truth_px >= 0)
 
 
 def photometric_error(
@@ -166,15 +164,16 @@ def photometric_error(
 
     SSIM over 3x3 pixels, as Godard et al. (CVPR 2017) use it for views of one scene.
     """
-    means = [F.avg_pool2d(F.pad(v, (1, 1, 1, 1), mode="reflect"), 3, 1) for v in (one, other)]
-    squares = [
-        F.avg_pool2d(F.pad(a * b, (1, 1, 1, 1), mode="reflect"), 3, 1)
-        for a, b in ((one, one), (other, other), (one, other))
-    ]
-    products = (means[0] ** 2, means[1] ** 2, means[0] * means[1])
-    spread, other_spread, common = (s - p for s, p in zip(squares, products, strict=True))
-    first = (2 * products[2] + _SSIM[0]) * (2 * common + _SSIM[1])
-    second = (products[0] + products[1] + _SSIM[0]) * (spread + other_spread + _SSIM[1])
+
+    def mean(values: Tensor) -> Tensor:
+        return F.avg_pool2d(F.pad(values, (1, 1, 1, 1), mode="reflect"), 3, 1)
+
+    x, y = mean(one), mean(other)
+    squares = (mean(one * one), mean(other * other), mean(one * other))
+    xx, yy, xy = x**2, y**2, x * y
+    variance_x, variance_y, covariance = (m - p for m, p in zip(squares, (xx, yy, xy), strict=True))
+    first = (2 * xy + _SSIM[0]) * (2 * covariance + _SSIM[1])
+    second = (xx + yy + _SSIM[0]) * (variance_x + variance_y + _SSIM[1])
     unlike = ((1 - first / second) / 2).clamp(0, 1).mean(1)
     return 0.85 * unlike + 0.15 * (one - other).abs().mean(1)
 

@@ -123,18 +123,18 @@ def measure(
     if predicted.numel() == 0:
         raise InputError(f"{of}: there is no pixel to compare; the truth may be empty.")
     if of == "depth":
-        _refuse_unusable(predicted, "predicted")
-        _refuse_unusable(true, "true")
+        for role, depth_m in (("predicted", predicted), ("true", true)):
+            if not bool((torch.isfinite(depth_m) & (depth_m > 0)).all()):
+                raise InputError(
+                    f"the {role} depth holds values that are not positive and finite; mask or "
+                    "clamp them first, as the protocol says."
+                )
     p, t = predicted.double(), true.double()
     return {one.name: one.function(p, t) for one in METRICS.values() if one.of == of}
 
 
 def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) -> DepthErrors:
-    """Measure predicted against true depth by the seven numbers of Eigen et al.
-
-    Raises:
-        InputError: as :func:`measure`.
-    """
+    """Measure depth by the seven numbers of Eigen et al.; refuses what :func:`measure` does."""
     found = measure("depth", predicted_m, true_m)
     return DepthErrors(**{name: found[name] for name in DepthErrors.__dataclass_fields__})
 
@@ -142,29 +142,13 @@ def depth_errors(predicted_m: Float[Tensor, " n"], true_m: Float[Tensor, " n"]) 
 def disparity_errors(
     predicted_px: Float[Tensor, " n"], true_px: Float[Tensor, " n"]
 ) -> DisparityErrors:
-    """Measure predicted against true disparity; D1 by the KITTI 2015 devkit (both strict).
-
-    Raises:
-        InputError: no pixel at all.
-    """
+    """Measure disparity, D1 by the KITTI 2015 devkit (both strict); no pixel is refused."""
     found = measure("disparity", predicted_px, true_px)
     return DisparityErrors(epe_px=found["epe_px"], d1_all=found["d1_all"])
 
 
-def _abs_rel(p: Tensor, t: Tensor) -> float:
-    return float(((p - t).abs() / t).mean())
-
-
-def _sq_rel(p: Tensor, t: Tensor) -> float:
-    return float(((p - t) ** 2 / t).mean())
-
-
 def _rmse(p: Tensor, t: Tensor) -> float:
     return float(((p - t) ** 2).mean().sqrt())
-
-
-def _rmse_log(p: Tensor, t: Tensor) -> float:
-    return _rmse(p.log(), t.log())
 
 
 def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
@@ -184,10 +168,10 @@ _within_1, _within_2, _within_3 = (partial(_share_within, factor=1.25**k) for k 
 METRICS = {
     metric.name: metric
     for metric in (
-        Metric(name="abs_rel", of="depth", function=_abs_rel),
-        Metric(name="sq_rel", of="depth", function=_sq_rel),
+        Metric(name="abs_rel", of="depth", function=lambda p, t: float(((p - t).abs() / t).mean())),
+        Metric(name="sq_rel", of="depth", function=lambda p, t: float(((p - t) ** 2 / t).mean())),
         Metric(name="rmse", of="depth", function=_rmse),
-        Metric(name="rmse_log", of="depth", function=_rmse_log),
+        Metric(name="rmse_log", of="depth", function=lambda p, t: _rmse(p.log(), t.log())),
         Metric(name="d1", of="depth", function=_within_1, better="higher"),
         Metric(name="d2", of="depth", function=_within_2, better="higher", is_printed=False),
         Metric(name="d3", of="depth", function=_within_3, better="higher", is_printed=False),
@@ -201,6 +185,14 @@ METRICS = {
 
 RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
 """The metric by which frames are ranked, and whose error is set beside the confidence."""
+
+
+def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
+    """Mask of Garg et al. (2016), its corners truncated as in the published script."""
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    top, bottom = int(0.40810811 * height), int(0.99189189 * height)
+    mask[top:bottom, int(0.03594771 * width) : int(0.96405229 * width)] = True
+    return mask
 
 
 def sparsification_area(
@@ -248,23 +240,13 @@ def error_by_decile(
     return torch.stack([tenth.mean() for tenth in tenths])
 
 
-def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
-    """Mask of Garg et al. (2016), its corners truncated as in the published script."""
-    mask = torch.zeros(height, width, dtype=torch.bool)
-    rows = slice(int(0.40810811 * height), int(0.99189189 * height))
-    columns = slice(int(0.03594771 * width), int(0.96405229 * width))
-    mask[rows, columns] = True
-    return mask
-
-
 def _remaining_error(
     error: Float[Tensor, " n"], keep_first: Float[Tensor, " n"], steps: int
 ) -> Float[Tensor, " steps"]:
     """Mean error of what is left, the pixels of low ``keep_first`` removed first."""
     descending = torch.argsort(keep_first, descending=True)
-    running = _shared_error(error, keep_first)[descending].cumsum(0) / torch.arange(
-        1, len(error) + 1
-    )
+    counts = torch.arange(1, len(error) + 1)
+    running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
     kept = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
     return running[kept.ceil().long().clamp(min=1) - 1]
 
@@ -277,25 +259,16 @@ def _shared_error(error: Float[Tensor, " n"], key: Float[Tensor, " n"]) -> Float
     return mean[group]
 
 
-def _refuse_unusable(depth_m: Float[Tensor, " n"], role: str) -> None:
-    if not bool((torch.isfinite(depth_m) & (depth_m > 0)).all()):
-        raise InputError(
-            f"the {role} depth holds values that are not positive and finite; mask "
-            "or clamp them first, as the protocol says."
-        )
-
-
 def view_errors(drawn: Float[Tensor, "3 h w"], real: Float[Tensor, "3 h w"]) -> ViewErrors:
     """Compare a drawn right view with the real one, both RGB in [0, 1]."""
     difference = drawn.double() - real.double()
     mean_square = difference.square().mean().clamp(min=1e-12)
+    gradient, real_gradient = (
+        image.diff(dim=2).abs().double().mean() + image.diff(dim=1).abs().double().mean()
+        for image in (drawn, real)
+    )
     return ViewErrors(
         right_l1=float(difference.abs().mean()),
         right_psnr_db=float(-10 * torch.log10(mean_square)),
-        right_sharpness=float(_mean_gradient(drawn) / _mean_gradient(real).clamp(min=1e-12)),
+        right_sharpness=float(gradient / real_gradient.clamp(min=1e-12)),
     )
-
-
-def _mean_gradient(image: Float[Tensor, "3 h w"]) -> Float[Tensor, ""]:
-    along = (image[:, :, 1:] - image[:, :, :-1]).abs().double().mean()
-    return along + (image[:, 1:] - image[:, :-1]).abs().double().mean()

@@ -69,18 +69,22 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
             return along.square() + across.square()
         case 2:
             return torch.maximum(along.abs(), across.abs())
-        case _:
-            return _polygon(along, across, generator)
+        case _:  # a convex polygon
+            sides = 3 + whole(generator, 4)
+            turns = torch.rand(sides, generator=generator).cumsum(0)
+            angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
+            far = 0.5 + torch.rand(sides, generator=generator)
+            level = torch.full_like(along, -torch.inf)
+            for turn, reach in zip(angles.tolist(), far.tolist(), strict=True):
+                side = (math.cos(turn) * along + math.sin(turn) * across) / reach
+                level = torch.maximum(level, side)
+            return level
 
 
 def occlude(
     depth_m: Depth, silhouette: Mask, share: float, generator: torch.Generator
 ) -> tuple[Depth, Mask]:
-    """Occlude exactly a share of the object's silhouette by something before it.
-
-    Returns:
-        The depth with the occluder in it, and what is left of the silhouette.
-    """
+    """Occlude exactly a share of a silhouette by something before it; give what is left of both."""
     count = round(share * int(silhouette.sum()))
     levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
     gap_m = uniform(generator, 0.005, 0.15)
@@ -134,11 +138,11 @@ def measure(
         return depth_m
     steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
     is_lost = _is_steep(depth_m, focal_px[0], steepest) | _gaps(depth_m, missing, generator)
-    noise_correlation_px = config.noise_correlation_px or (
-        _STEREO_CORRELATION_PX if kind == "active stereo" else None
-    )
+    correlation_px = config.noise_correlation_px
+    if kind == "active stereo":
+        correlation_px = correlation_px or _STEREO_CORRELATION_PX
     of_full = focal_px[0] / focal_px[1]
-    width_px = of_full * uniform(generator, *noise_correlation_px) if noise_correlation_px else 0.0
+    width_px = of_full * uniform(generator, *correlation_px) if correlation_px else 0.0
     white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])
@@ -163,15 +167,19 @@ def measure(
     return torch.where(is_lost, torch.nan, read_m)
 
 
-def _polygon(along: Depth, across: Depth, generator: torch.Generator) -> Depth:
-    sides = 3 + whole(generator, 4)
-    turns = torch.rand(sides, generator=generator).cumsum(0)
-    angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
-    far = 0.5 + torch.rand(sides, generator=generator)
-    level = torch.full_like(along, -torch.inf)
-    for angle, reach in zip(angles.tolist(), far.tolist(), strict=True):
-        level = torch.maximum(level, (math.cos(angle) * along + math.sin(angle) * across) / reach)
-    return level
+def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+    """Draw normal noise of deviation 1 that neighbours share: white noise under a Gaussian.
+
+    ``size`` is rows and columns; a Gaussian of deviation ``width_px`` 0 leaves the noise white.
+    """
+    reach = math.ceil(3 * width_px)
+    white = torch.randn(size[0] + 2 * reach, size[1] + 2 * reach, generator=generator)
+    if reach == 0:
+        return white
+    weights = (-0.5 * (torch.arange(-reach, reach + 1) / width_px).square()).exp()
+    weights = weights / weights.norm()
+    along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
+    return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
 
 
 def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
@@ -183,24 +191,6 @@ def _is_steep(depth_m: Depth, focal_px: float, steepest: float) -> Mask:
     is_steep[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
     is_steep[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
     return is_steep
-
-
-def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
-    """Draw normal noise of deviation 1 that neighbours share: white noise under a Gaussian.
-
-    Args:
-        size: rows and columns.
-        width_px: deviation of the Gaussian; 0 gives each pixel its own noise.
-        generator: of the chance.
-    """
-    reach = math.ceil(3 * width_px)
-    white = torch.randn(size[0] + 2 * reach, size[1] + 2 * reach, generator=generator)
-    if reach == 0:
-        return white
-    weights = (-0.5 * (torch.arange(-reach, reach + 1) / width_px).square()).exp()
-    weights = weights / weights.norm()
-    along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
-    return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
 
 
 def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
@@ -236,10 +226,7 @@ def _jittered(depth_m: Depth, generator: torch.Generator) -> Depth:
 def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
     """Read each pixel some pixels away, by the same way as its neighbours: edges wander.
 
-    Args:
-        depth_m: of the window.
-        scale: its pixels for one of the sensor's full image.
-        generator: of the chance.
+    ``scale`` is pixels of the window for one of the sensor's full image.
     """
     height, width = depth_m.shape
     ways = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]

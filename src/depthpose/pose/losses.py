@@ -36,11 +36,7 @@ leaves the length alone."""
 def point_losses(
     found: Directions, truth: Directions, mode: str = "mse"
 ) -> Float[Tensor, " points"]:
-    """Give the loss of each point's raw directions.
-
-    Raises:
-        InputError: ``mode`` is no key of ``POINT_LOSSES``.
-    """
+    """Give the loss of each point's raw directions; an unknown ``mode`` is an ``InputError``."""
     refuse_unknown("loss", mode, POINT_LOSSES)
     return POINT_LOSSES[mode](found, truth)
 
@@ -67,14 +63,10 @@ def choose_copies(
     Once for a whole instance: a choice point by point, or an average of copies, would teach votes
     that meet at the axis of symmetry.
     """
-    losses = [
-        instance_means(
-            point_losses(found, unit_directions(points_m, copy[instance]), mode),
-            instance,
-            len(copies_m),
-        )
-        for copy in copies_m.unbind(1)
-    ]
+    losses: list[Tensor] = []
+    for copy in copies_m.unbind(1):
+        of_points = point_losses(found, unit_directions(points_m, copy[instance]), mode)
+        losses.append(instance_means(of_points, instance, len(copies_m)))
     return torch.stack(losses).argmin(0)
 
 
@@ -132,10 +124,7 @@ def mask_loss(
 ) -> Float[Tensor, ""]:
     """Cross entropy of each pixel; one of an object weighs ``object_weight`` times the background.
 
-    Args:
-        logits: class 0 is the background.
-        labels: the true class of each pixel.
-        object_weight: objects cover a few percent of an image; at 1 the background dominates.
+    Class 0 is the background; it dominates at a weight of 1, for objects cover a few percent.
     """
     weight = logits.new_full((logits.shape[1],), object_weight)
     weight[0] = 1.0
@@ -147,8 +136,7 @@ def model_point_loss(
 ) -> Float[Tensor, " b"]:
     """ADD [m] of each pose against the nearest symmetric copy of its truth.
 
-    The mean distance of model points, differentiable in the found pose. The copy is chosen once for
-    each instance.
+    The mean distance of model points, differentiable in the found pose.
 
     Args:
         found: ``camera_from_model``, a batch.

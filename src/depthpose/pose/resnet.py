@@ -24,8 +24,6 @@ Widths = tuple[int, int, int, int]
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet's colours in [0, 1]: what published weights expect to be taken off."""
 
-_HEAD = ("fc.weight", "fc.bias")
-
 
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions beside a shortcut; the first may halve the size."""
@@ -84,18 +82,16 @@ def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h 
 
 
 def resnet18_from_published(state: Mapping[str, Tensor]) -> ResNet18:
-    """Make the encoder, in eval mode, from the state dict of a classifier on ImageNet.
+    """Make the encoder, in eval mode, from torchvision's state dict of a classifier on ImageNet.
 
-    The classifier's own layer (``fc``) is left out; everything else must agree.
-
-    Args:
-        state: names as torchvision publishes them, with or without ``module.``.
+    The classifier's own layer (``fc``) is left out, and so is ``module.``; all else must agree.
 
     Raises:
         InputError: a name is missing, unknown or holds another shape; nothing is half loaded.
     """
     given = {name.removeprefix("module."): value for name, value in state.items()}
-    given = {name: value for name, value in given.items() if name not in _HEAD}
+    for name in ("fc.weight", "fc.bias"):
+        given.pop(name, None)
     network = ResNet18()
     # The count of batches steers nothing at inference, and old files do not hold it.
     spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
@@ -118,11 +114,11 @@ def import_resnet18(file: Path, out: Path) -> None:
         network = resnet18_from_published(state)
     except InputError as error:
         raise InputError(f"{file}: not the published weights of a ResNet-18: {error}") from error
-    facts = {
+    said = {
         "trained_on": "ImageNet, as its publisher says",
         "licence": "as published by its authors",
     }
-    save_imported(out, KIND, network, file, facts)
+    save_imported(out, KIND, network, file, said)
 
 
 def read_encoder_state(path: Path) -> Mapping[str, Tensor]:

@@ -1,45 +1,23 @@
 """The one training loop: a task in, trained weights and a run folder out."""
 
-from depthpose.core.loop.config import AdamConfig, LoopConfig, make_adam, refuse_long_warmup
-from depthpose.core.loop.journal import (
-    Journal,
-    card_text,
-    held_out_text,
-    read_metrics,
-    run_files,
-    write_card,
-)
-from depthpose.core.loop.loop import Interrupted, Progress, train
-from depthpose.core.loop.run import Run, releases_folder
-from depthpose.core.loop.task import (
-    Samples,
-    Task,
-    Update,
-    ValidationResult,
-    sample_generator,
-    shuffled_index,
-)
-
-__all__ = [
-    "AdamConfig",
-    "Interrupted",
-    "Journal",
-    "LoopConfig",
-    "Progress",
-    "Run",
-    "Samples",
-    "Task",
-    "Update",
-    "ValidationResult",
-    "card_text",
-    "held_out_text",
-    "make_adam",
-    "read_metrics",
-    "refuse_long_warmup",
-    "releases_folder",
-    "run_files",
-    "sample_generator",
-    "shuffled_index",
-    "train",
-    "write_card",
-]
+from depthpose.core.loop.folder import Journal as Journal
+from depthpose.core.loop.folder import card_text as card_text
+from depthpose.core.loop.folder import held_out_text as held_out_text
+from depthpose.core.loop.folder import read_metrics as read_metrics
+from depthpose.core.loop.folder import run_files as run_files
+from depthpose.core.loop.folder import write_card as write_card
+from depthpose.core.loop.loop import Interrupted as Interrupted
+from depthpose.core.loop.loop import Progress as Progress
+from depthpose.core.loop.loop import Run as Run
+from depthpose.core.loop.loop import releases_folder as releases_folder
+from depthpose.core.loop.loop import train as train
+from depthpose.core.loop.task import AdamConfig as AdamConfig
+from depthpose.core.loop.task import LoopConfig as LoopConfig
+from depthpose.core.loop.task import Samples as Samples
+from depthpose.core.loop.task import Task as Task
+from depthpose.core.loop.task import Update as Update
+from depthpose.core.loop.task import ValidationResult as ValidationResult
+from depthpose.core.loop.task import make_adam as make_adam
+from depthpose.core.loop.task import refuse_long_warmup as refuse_long_warmup
+from depthpose.core.loop.task import sample_generator as sample_generator
+from depthpose.core.loop.task import shuffled_index as shuffled_index

@@ -1,4 +1,4 @@
-"""The loop itself, on Hugging Face accelerate.
+"""The loop itself, on Hugging Face accelerate, and the claim of a folder for one training.
 
 Accelerate brings devices and processes, torch the precision. Gradients are averaged here, after the
 backward pass: that way a step may run any network any number of times (a discriminator is given a
@@ -6,28 +6,39 @@ real and a fake pair), and N processes equal one that accumulates N micro-batche
 """
 
 import math
+import os
+import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import timedelta
+from functools import wraps
+from itertools import count
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from depthpose.core.errors import InputError
-from depthpose.core.loop.config import LoopConfig
-from depthpose.core.loop.host import (
-    Arithmetic,
-    StopRequest,
-    graceful_stop,
-    leave_process_group,
-    make_accelerator,
-)
-from depthpose.core.loop.journal import Journal
-from depthpose.core.loop.state import Parts, restore_last, saved_states
-from depthpose.core.loop.task import Samples, Task, Update, mixed_seed
+from depthpose.core.config import config_to_dict, write_config
+from depthpose.core.devices import usable_precision
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.lock import held_folders, release_folders
+from depthpose.core.loop.folder import STATE, Journal, Parts, restore_last, run_files, saved_states
+from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
+from depthpose.core.run import claim_folder, find_rank
+
+SECOND_CTRL_C_S = 3.0
+"""Between the first Ctrl-C, which stops, and the second, which finishes."""
+
+_TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
+_FREE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
+"""Settings of the loop that change no weight: a resumed run may have others."""
+
+_Config = TypeVar("_Config")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -47,6 +58,79 @@ class Progress:
     step: int
     steps: int
     numbers: dict[str, float]
+
+
+_OnStep = Callable[[Progress], None] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Folder of a training, and callbacks.
+
+    Attributes:
+        folder: the run folder; the weights lie in it, named after what was trained, and their card
+            beside them.
+        resume: go on from its last state.
+        finish: make weights of its last state, without another step.
+        on_step: called after each optimiser step.
+        on_message: called with each message for the user.
+    """
+
+    folder: Path
+    resume: bool = False
+    finish: bool = False
+    on_step: Callable[[Progress], None] | None = None
+    on_message: Callable[[str], None] | None = None
+
+    def claim(
+        self,
+        config: Any,  # noqa: ANN401
+        weights: Sequence[str],
+        more: Mapping[str, Any] | None = None,
+        without: Sequence[str] = (),
+    ) -> None:
+        """Make the folder this config's own, and write the config into it.
+
+        Args:
+            config: of any training; it has ``loop``.
+            weights: names of the weights that such a training leaves.
+            more: what decides the weights beside the config, such as checksums of files.
+            without: settings of the config from which no weight follows.
+
+        Raises:
+            InputError: the folder is another config's.
+        """
+        settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
+        decisive = {k: v for k, v in settings["loop"].items() if k not in _FREE}
+        settings["loop"] = decisive | {"processes": find_rank().world}
+        kept = {k: v for k, v in settings.items() if k not in without}
+        files = [file for name in weights for file in run_files(name)]
+        remedy = "choose another, or delete this one"
+        for path in (self.folder / f"{name}.safetensors" for name in weights):
+            if path.is_file():
+                option = "--start" if hasattr(config, "start") else "--generator"
+                remedy += f"; to train on from its weights, give a new --out and {option} {path}"
+        claim_folder(self.folder, kept, files, remedy)
+        write_config(self.folder / "config.yaml", config)
+
+    def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
+        """Train in the folder, as :func:`depthpose.core.loop.train`; give the seconds it took."""
+        return train(task, samples, config, self.folder, resume=self.resume, finish=self.finish,
+                     on_step=self.on_step)  # fmt: skip
+
+
+def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
+    """Let other commands into the folder of a training when its weights are written."""
+
+    @wraps(stage)
+    def run_stage(config: _Config, run: Run) -> Path:
+        before = held_folders()
+        try:
+            return stage(config, run)
+        finally:
+            release_folders(but=before)
+
+    return run_stage
 
 
 def train(
@@ -84,69 +168,82 @@ def train(
     """
     if not len(samples):
         raise InputError("there is no sample to train on; the dataset is empty.")
-    run = _Run(task, samples, config, folder)
-    run.start(resume=resume or finish)
-    if finish and not run.step:
+    training = _Training(task, samples, config, folder, resume=resume or finish)
+    if finish and not training.step:
         raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
-    run.steps = run.step if finish else run.steps
-    with graceful_stop() as request:
-        run.take_steps(on_step, request)
-    return run.seconds
+    training.steps = training.step if finish else training.steps
+    with StopRequest() as request:
+        training.take_steps(on_step, request)
+    return training.seconds
 
 
-class _Run:
-    def __init__(self, task: Task, samples: Samples, config: LoopConfig, folder: Path) -> None:
+class _Training:
+    def __init__(
+        self, task: Task, samples: Samples, config: LoopConfig, folder: Path, *, resume: bool
+    ) -> None:
+        """Bring everything to the device and, where asked, to the state of an earlier run."""
         self.task, self.samples, self.config = task, samples, config
-        self.accelerator = make_accelerator(config)
+        self.accelerator = _make_accelerator(config)
         self.arithmetic = Arithmetic(config, self.accelerator.device)
-        self.scaler = self.arithmetic.scaler
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
-        self.step = 0
-        self._began = time.monotonic()
+        self.step, self.began = 0, time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}
-        self.average: dict[str, dict[str, Tensor]] = {}
-
-    def start(self, *, resume: bool) -> None:
-        """Bring everything to the device and, where asked, to the state of an earlier run."""
-        folder = self.journal.folder
         saved = saved_states(folder)
         if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
-        for module in self.task.modules.values():
+        for module in task.modules.values():
             module.to(self.accelerator.device)
-        self.optimizers = {name: adam for name, (adam, _) in self.task.optimizers.items()}
-        if not saved:
-            self._agree_on_weights()
-        if self.config.ema_decay is not None:
-            self.average = {name: _copied(m) for name, m in self.task.modules.items()}
+        if not saved and self.world > 1:  # every process begins with rank 0's weights
+            from accelerate.utils import broadcast
+
+            for module in task.modules.values():
+                for tensor in module.state_dict().values():
+                    tensor.copy_(broadcast(tensor))
+        has_average = config.ema_decay is not None
+        self.parts = Parts(
+            modules=task.modules,
+            optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
+            scaler=self.arithmetic.scaler,
+            average={name: _copied(m) for name, m in task.modules.items() if has_average},
+        )
         if saved:
-            path, self.step, seconds = restore_last(folder, self._parts())
-            self._began -= seconds
-            self.journal.keep_resumed_state(path)
+            path, self.step, seconds = restore_last(folder, self.parts)
+            self.began -= seconds
+            self.journal.has_good_last = path.name == STATE
         self.journal.open(self.step)
 
     @property
     def seconds(self) -> float:
         """What it took until now, with the runs before this one."""
-        return time.monotonic() - self._began
+        return time.monotonic() - self.began
 
-    def take_steps(self, on_step: Callable[[Progress], None] | None, request: StopRequest) -> None:
+    def take_steps(self, on_step: _OnStep, request: "StopRequest") -> None:
         """Take the remaining steps; if asked to finish, the current step is the last."""
         batches = self._batches()
         while self.step < self.steps:
-            micro_batches = [next(batches) for _ in range(self.config.accumulate)]
-            self._take_step(micro_batches)
+            self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
             stop = self._any_process(request.to_stop())
             if stop and self._any_process(request.to_finish()):
                 self.steps = self.step
-            numbers = self._log()
+            numbers: dict[str, float] = {}
+            if self._is_due(self.config.log_every_steps):
+                numbers = {name: total / terms for name, (total, terms) in self.sums.items()}
+                self.sums = {}
+                self.journal.log(self.step, numbers)
             if self._is_due(self.config.validate_every_steps):
-                self._validate()
+                if self.accelerator.is_main_process:
+                    average = self.parts.average
+                    own = {name: _copied(m) for name, m in self.task.modules.items() if average}
+                    self._load(average)
+                    self.journal.show(self.step, self.task.validate())
+                    self._load(own)
+                self.accelerator.wait_for_everyone()
             if stop or self._is_due(self.config.save_every_steps):
-                self.save()
+                state = {"step": self.step, "seconds": self.seconds, **self.parts.state()}
+                self.journal.save(state)
             if on_step is not None and self.accelerator.is_main_process:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
             if stop and self.step < self.steps:
@@ -157,124 +254,101 @@ class _Run:
                     "--finish makes weights of it"
                 )
         self.accelerator.wait_for_everyone()  # none leaves while another still needs it
-        self._load(self.average)  # what is exported
+        self._load(self.parts.average)  # what is exported
         self.journal.close()
 
-    def save(self) -> None:
-        """Write the state, all or nothing."""
-        now = {"step": self.step, "seconds": self.seconds}
-        self.journal.save({**now, **self._parts().state()})
+    def _batches(self) -> Iterator[Any]:
+        """Load this process's micro-batches, from the first that is still to do.
 
-    def _parts(self) -> Parts:
-        return Parts(
-            modules=self.task.modules,
-            optimizers=self.optimizers,
-            scaler=self.scaler,
-            average=self.average,
+        Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N
+        processes see in a step what one process sees that accumulates N times as much.
+        """
+        from accelerate.utils import send_to_device
+
+        rank, size = self.accelerator.process_index, self.config.batch_size
+        places = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
+        starts = ((place * self.world + rank) * size for place in places)
+        loader = DataLoader(
+            self.samples,  # pyright: ignore[reportArgumentType]
+            batch_sampler=(list(range(start, start + size)) for start in starts),
+            num_workers=self.config.workers,
+            collate_fn=getattr(self.samples, "collate", None),
+            pin_memory=self.accelerator.device.type == "cuda",
+            worker_init_fn=_leave_process_group,
         )
+        return (send_to_device(batch, self.accelerator.device) for batch in loader)
 
     def _take_step(self, micro_batches: list[Any]) -> None:
         """Run the first update of all micro-batches, then the second, and so on."""
         iterators = [iter(self.task.step(batch)) for batch in micro_batches]
-        number = 0
-        while True:
-            updates = list(self._backward_all(iterators, number))
-            if not updates:
+        for number in count():
+            owner = None
+            for place, iterator in enumerate(iterators):
+                # Dropout follows the micro-batch, not the process that happens to hold it.
+                micro = place * self.world + self.accelerator.process_index
+                torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
+                with self.arithmetic.autocast():
+                    update = next(iterator, None)
+                if update is None:
+                    continue
+                name, loss = update.optimizer, update.loss.detach()
+                # fp16 overflows now and then, and its scaler skips such steps by itself.
+                if self.config.precision != "fp16" and not math.isfinite(float(loss)):
+                    raise InputError(
+                        f"the {name}'s loss is {float(loss)} at step {self.step}. Start anew in "
+                        "another folder with a lower learning_rate, with clip_norm, or in "
+                        "precision fp32; 'start' can take weights from before."
+                    )
+                share = self.parts.scaler.scale(update.loss / len(iterators))
+                share.backward(inputs=_parameters(self.parts.optimizers[name]))
+                for fact, value in {"loss": loss, **update.facts}.items():
+                    total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
+                    self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
+                owner = owner or name
+            if owner is None:
                 break
-            self._move(updates[0])
-            number += 1
+            self._move(owner)
         if self.config.ema_decay is not None:
             self._update_average(self.config.ema_decay)
 
-    def _backward_all(self, iterators: list[Iterator[Update]], number: int) -> Iterator[str]:
-        for place, iterator in enumerate(iterators):
-            # Dropout follows the micro-batch, not the process that happens to hold it.
-            micro = place * self.world + self.accelerator.process_index
-            torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-            with self.arithmetic.autocast():
-                update = next(iterator, None)
-            if update is None:
-                continue
-            self._refuse_bad_loss(update.optimizer, float(update.loss.detach()))
-            parameters = _parameters(self.optimizers[update.optimizer])
-            self.scaler.scale(update.loss / len(iterators)).backward(inputs=parameters)
-            self._remember({"loss": update.loss.detach(), **update.facts}, update.optimizer)
-            yield update.optimizer
-
     def _move(self, name: str) -> None:
         """Average the gradients over processes and step the optimiser."""
-        optimizer = self.optimizers[name]
-        _, adam = self.task.optimizers[name]
+        optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
         parameters = _parameters(optimizer)
         if self.world > 1:
-            self._average_gradients(parameters)
+            grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+            flat = torch.cat([grad.flatten() for grad in grads])
+            mean: Tensor = self.accelerator.reduce(flat, "mean")
+            parts = mean.split([grad.numel() for grad in grads])
+            for parameter, part in zip(parameters, parts, strict=True):
+                parameter.grad = part.view_as(parameter)
+        scaler = self.parts.scaler
         if self.config.clip_norm is not None:
-            self.scaler.unscale_(optimizer)
+            scaler.unscale_(optimizer)
             torch.nn.utils.clip_grad_norm_(parameters, self.config.clip_norm)
-        self.scaler.step(optimizer)
-        self.scaler.update()
+        scaler.step(optimizer)
+        scaler.update()
         optimizer.zero_grad()
 
-    def _average_gradients(self, parameters: list[Tensor]) -> None:
-        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([grad.flatten() for grad in grads])
-        mean: Tensor = self.accelerator.reduce(flat, "mean")
-        parts = mean.split([grad.numel() for grad in grads])
-        for parameter, part in zip(parameters, parts, strict=True):
-            parameter.grad = part.view_as(parameter)
+    @torch.no_grad()
+    def _update_average(self, most: float) -> None:
+        decay = min(most, (1 + self.step) / (10 + self.step))
+        for name, module in self.task.modules.items():
+            for key, tensor in module.state_dict().items():
+                held = self.parts.average[name][key]
+                if tensor.is_floating_point():
+                    held.lerp_(tensor, 1 - decay)
+                else:
+                    held.copy_(tensor)
 
-    def _batches(self) -> Iterator[Any]:
-        first = self.step * self.config.accumulate
-        loader = DataLoader(
-            self.samples,  # pyright: ignore[reportArgumentType]
-            batch_sampler=_SampleIndices(self, first),
-            num_workers=self.config.workers,
-            collate_fn=getattr(self.samples, "collate", None),
-            pin_memory=self.accelerator.device.type == "cuda",
-            worker_init_fn=leave_process_group,
-        )
-        from accelerate.utils import send_to_device
-
-        return (send_to_device(batch, self.accelerator.device) for batch in loader)
-
-    def _validate(self) -> None:
-        if self.accelerator.is_main_process:
-            own = {name: _copied(m) for name, m in self.task.modules.items() if self.average}
-            self._load(self.average)
-            self.journal.show(self.step, self.task.validate())
-            self._load(own)
-        self.accelerator.wait_for_everyone()
-
-    def _load(self, states: dict[str, dict[str, Tensor]]) -> None:
+    def _load(self, states: Mapping[str, dict[str, Tensor]]) -> None:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 
     def _is_due(self, every: int) -> bool:
         return self.step % every == 0 or self.step == self.steps
-
-    def _remember(self, facts: dict[str, Tensor], owner: str) -> None:
-        for name, value in facts.items():
-            total, count = self.sums.get(f"{owner}/{name}", (0.0, 0))
-            self.sums[f"{owner}/{name}"] = (total + float(value), count + 1)
-
-    def _log(self) -> dict[str, float]:
-        if not self._is_due(self.config.log_every_steps):
-            return {}
-        numbers = {name: total / count for name, (total, count) in self.sums.items()}
-        self.sums = {}
-        self.journal.log(self.step, numbers)
-        return numbers
-
-    def _refuse_bad_loss(self, owner: str, loss: float) -> None:
-        # fp16 overflows now and then, and its scaler skips such steps by itself.
-        if self.config.precision != "fp16" and not math.isfinite(loss):
-            raise InputError(
-                f"the {owner}'s loss is {loss} at step {self.step}. Start anew in another folder "
-                "with a lower learning_rate, with clip_norm, or in precision fp32; 'start' can "
-                "take weights from before."
-            )
 
     def _any_process(self, is_asked: bool) -> bool:
         if self.world == 1:
@@ -282,46 +356,82 @@ class _Run:
         flag = torch.tensor([float(is_asked)], device=self.accelerator.device)
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
 
-    def _agree_on_weights(self) -> None:
-        """Every process begins with rank 0's weights, whatever seed built its own."""
-        if self.world > 1:
-            from accelerate.utils import broadcast
 
-            for module in self.task.modules.values():
-                for tensor in module.state_dict().values():
-                    tensor.copy_(broadcast(tensor))
+def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
+    """Set up accelerate without precision: it keeps that of a process's first training."""
+    try:
+        from accelerate import Accelerator
+        from accelerate.utils import InitProcessGroupKwargs
+    except ImportError as error:
+        raise MissingExtraError("accelerate", "train", "training") from error
+    # The other processes wait while rank 0 validates.
+    patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
+    on_cpu = config.device == "cpu"
+    try:
+        return Accelerator(mixed_precision="no", cpu=on_cpu, kwargs_handlers=[patience])
+    except ValueError as error:
+        raise InputError(
+            f"device {config.device!r} cannot be used in this process, which has trained on "
+            f"another; start this training in a process of its own ({error})"
+        ) from error
 
-    @torch.no_grad()
-    def _update_average(self, most: float) -> None:
-        decay = min(most, (1 + self.step) / (10 + self.step))
-        for name, module in self.task.modules.items():
-            for key, tensor in module.state_dict().items():
-                held = self.average[name][key]
-                if tensor.is_floating_point():
-                    held.lerp_(tensor, 1 - decay)
-                else:
-                    held.copy_(tensor)
+
+class Arithmetic:
+    """Autocast, and the scaling of the loss that fp16 needs; bf16 is fp32 where it is unknown."""
+
+    def __init__(self, config: LoopConfig, device: torch.device) -> None:
+        if config.precision == "fp16" and device.type == "cpu":
+            said = "precision 'fp16' cannot be used here: it needs a GPU."
+            raise InputError(f"{said} Take bf16, which a CPU has too.")
+        self._device = device.type
+        self._type = _TYPES[usable_precision(config.precision, device)]
+        self.scaler = torch.amp.GradScaler(self._device, enabled=self._type is torch.float16)
+
+    def autocast(self) -> torch.autocast:
+        """Give the context of a forward pass."""
+        return torch.autocast(self._device, self._type, enabled=self._type is not None)
 
 
-class _SampleIndices:
-    """Sample indices of this process's micro-batches, from the first that is still to do.
+class StopRequest:
+    """Lets SIGTERM and Ctrl-C end the training after the step, with its state saved."""
 
-    Micro-batch m of a step belongs to place ``m // world`` of process ``m % world``: N processes
-    see in a step what one process sees that accumulates N times as much.
-    """
+    def __enter__(self) -> "StopRequest":
+        self._asked: list[tuple[int, float]] = []
+        self._handlers = {}
+        with suppress(ValueError):  # not the main thread: whoever runs us handles signals
+            numbers = (signal.SIGTERM, signal.SIGINT)
+            self._handlers = {number: signal.signal(number, self._remember) for number in numbers}
+        return self
 
-    def __init__(self, run: _Run, first: int) -> None:
-        self.size = run.config.batch_size
-        self.world, self.rank = run.world, run.accelerator.process_index
-        self.places = range(first, run.steps * run.config.accumulate)
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
 
-    def __iter__(self) -> Iterator[list[int]]:
-        for place in self.places:
-            start = (place * self.world + self.rank) * self.size
-            yield list(range(start, start + self.size))
+    def _remember(self, number: int, _: FrameType | None) -> None:
+        if not self._asked and number == signal.SIGINT:
+            message = (
+                "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
+                "now: the weights of the steps so far are written.\n"
+            )
+            os.write(2, message.encode())  # print may be at work itself
+        self._asked.append((number, time.monotonic()))
 
-    def __len__(self) -> int:
-        return len(self.places)
+    def to_stop(self) -> bool:
+        """Whether to stop after the step, with the state saved."""
+        return bool(self._asked)
+
+    def to_finish(self) -> bool:
+        """Whether to take the steps so far for all: Ctrl-C twice. Waits for the second one."""
+        presses = [at for number, at in self._asked if number == signal.SIGINT]
+        while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
+            time.sleep(0.05)
+            presses = [at for number, at in self._asked if number == signal.SIGINT]
+        return len(presses) > 1
+
+
+def _leave_process_group(_: int) -> None:
+    """Take a worker out of the job's process group: a killed worker would end the loop unsaved."""
+    os.setsid()
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:

@@ -1,7 +1,4 @@
-"""The depth image regressed by a 2D network: the first baseline of table 3.1.
-
-With the square that a view is cut to, and the frame in which the regressed pose is given.
-"""
+"""The depth image regressed by a 2D network: the first baseline of table 3.1."""
 
 from typing import NamedTuple
 
@@ -61,32 +58,20 @@ def cut_depth(
     mean_m = depth_m[is_seen].mean()
     relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
     relief = torch.where(is_seen, relief, EMPTY)
+    # Resized by nearest neighbour: depth is not mixed over edges.
+    steps = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5
+    column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
+    height, width = relief.shape
+    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
+    image = relief[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
     K = view.K.to(depth_m)
     ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
     return DepthCrop(
-        image=_window(relief, middle_px, side_px, config.crop_px)[None],
+        image=torch.where(is_inside, image, EMPTY)[None],
         R=turn_axis_to(ray).to(ray),
         middle_m=ray * mean_m,
         side_m=side_px * mean_m / K[0, 0],
     )
-
-
-def camera_from_crop(crop: DepthCrop, R: Float[Tensor, "b 3 3"], offset: Tensor) -> Rigid:
-    """Carry a pose from the crop's frame, offsets in its widths, to that of the camera."""
-    shift = crop.side_m[:, None] * offset
-    return Rigid(crop.R @ R, crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1))
-
-
-def _window(
-    values: Float[Tensor, "h w"], middle_px: Float[Tensor, "2"], side_px: float, size: int
-) -> Float[Tensor, "{size} {size}"]:
-    """Resize a square by nearest neighbour: depth is not mixed over edges."""
-    steps = (torch.arange(size) + 0.5) / size - 0.5
-    column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
-    height, width = values.shape
-    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
-    found = values[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
-    return torch.where(is_inside, found, EMPTY)
 
 
 _NUMBERS = 9
@@ -119,7 +104,9 @@ class DepthImageNet(nn.Module):
 
 def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     """Turn what the network says of crops into poses ``camera_from_model``."""
-    return camera_from_crop(crop, rotation_from_6d(outputs[:, :6]), outputs[:, 6:])
+    shift = crop.side_m[:, None] * outputs[:, 6:]
+    t_m = crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1)
+    return Rigid(crop.R @ rotation_from_6d(outputs[:, :6]), t_m)
 
 
 def rotation_from_6d(numbers: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:

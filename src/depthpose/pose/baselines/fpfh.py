@@ -27,10 +27,6 @@ _LEAST = 3
 class FpfhRegistration:
     """Poses of one object: its model is prepared once.
 
-    Args:
-        model: the object.
-        config: lengths and counts.
-
     Raises:
         MissingExtraError: Open3D is not installed.
     """
@@ -51,10 +47,18 @@ class FpfhRegistration:
             return PoseEstimate(
                 name=given.name, object=given.object, status="too few points", reason=reason
             )
+        o3d = self._open3d
         source, features = self._prepare(self._cloud(given.points_m))
-        found = self._ransac(source, features)
+        o3d.utility.random.seed(self.config.seed)
+        # It prints a line for each cloud of which few features are mutually nearest.
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            found = self._ransac(source, features)
         if len(found.correspondence_set):
-            found = self._icp(source, found.transformation)
+            r = o3d.pipelines.registration
+            found = r.registration_icp(
+                source, self._target, _ICP * self._voxel_m, found.transformation,
+                r.TransformationEstimationPointToPlane(),
+            )  # fmt: skip
         seconds = {"registration": time.perf_counter() - began}
         if not len(found.correspondence_set):
             reason = "RANSAC found no pose that any correspondence of features agrees with"
@@ -62,11 +66,13 @@ class FpfhRegistration:
                 name=given.name, object=given.object, status="votes do not meet",
                 reason=reason, seconds=seconds,
             )  # fmt: skip
+        T = torch.from_numpy(np.array(found.transformation))
+        pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
         return PoseEstimate(
             name=given.name,
             object=given.object,
             status="ok",
-            camera_from_model=_inverse_of(found.transformation, given.points_m),
+            camera_from_model=Rigid(pose.R.to(given.points_m), pose.t_m.to(given.points_m)),
             inlier_share=float(found.fitness),
             residual_m=float(found.inlier_rmse),
             seconds=seconds,
@@ -95,13 +101,6 @@ class FpfhRegistration:
         return cloud, features
 
     def _ransac(self, source: Any, features: Any) -> Any:  # noqa: ANN401
-        o3d = self._open3d
-        o3d.utility.random.seed(self.config.seed)
-        # It prints a line for each cloud of which few features are mutually nearest.
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            return self._search(source, features)
-
-    def _search(self, source: Any, features: Any) -> Any:  # noqa: ANN401
         r = self._open3d.pipelines.registration
         limit_m = _CORRESPONDENCE * self._voxel_m
         return r.registration_ransac_based_on_feature_matching(
@@ -114,20 +113,9 @@ class FpfhRegistration:
             r.RANSACConvergenceCriteria(self.config.iterations, 0.999),
         )  # fmt: skip
 
-    def _icp(self, source: Any, model_from_camera: np.ndarray) -> Any:  # noqa: ANN401
-        r = self._open3d.pipelines.registration
-        return r.registration_icp(
-            source, self._target, _ICP * self._voxel_m, model_from_camera,
-            r.TransformationEstimationPointToPlane(),
-        )  # fmt: skip
-
 
 class FpfhEstimator:
     """Registration of several objects from their masked depth, called as the networks are.
-
-    Args:
-        models: the objects; an input says by name which of them it shows.
-        config: lengths and counts.
 
     Raises:
         MissingExtraError: Open3D is not installed.
@@ -138,16 +126,10 @@ class FpfhEstimator:
 
     def estimate_many(self, inputs: Sequence[ViewInput]) -> list[PoseEstimate]:
         """Pose one after the other."""
-        return [self._estimate(given) for given in inputs]
-
-    def _estimate(self, given: ViewInput) -> PoseEstimate:
-        peer = self._peers[given.object]
-        points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
-        cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
-        return peer.estimate(cloud)
-
-
-def _inverse_of(model_from_camera: np.ndarray, like: Tensor) -> Rigid:
-    T = torch.from_numpy(np.array(model_from_camera))
-    pose = Rigid(T[:3, :3], T[:3, 3]).inverse()
-    return Rigid(pose.R.to(like), pose.t_m.to(like))
+        estimates = []
+        for given in inputs:
+            peer = self._peers[given.object]
+            points_m = cloud_from_depth(given.depth_m, given.mask, given.K, peer.model.diameter_m)
+            cloud = CloudInput(name=given.name, points_m=points_m.float(), object=given.object)
+            estimates.append(peer.estimate(cloud))
+        return estimates

@@ -31,7 +31,7 @@ def ransac_one_by_one(
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
-                tried = nearest_point(points_m[pair], n[pair])
+                tried = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
             except np.linalg.LinAlgError:
                 continue
             way = tried - points_m
@@ -39,23 +39,15 @@ def ransac_one_by_one(
             count = np.count_nonzero(inliers)
             if count > best:
                 best, chosen = count, inliers
-        found.append(_refit(points_m, n, chosen))
+        try:
+            refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
+        except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
+            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
+        found.append(refitted)
     return np.stack(found)
 
 
-def nearest_point(
-    points_m: Float64[np.ndarray, "n 3"], n: Float64[np.ndarray, "n 3"]
-) -> Float64[np.ndarray, "3"]:
-    """Least squares of one keypoint's lines; parallel ones raise ``LinAlgError``."""
+def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the point nearest to the lines through ``points_m`` along ``n``; singular if parallel."""
     A = len(points_m) * np.eye(3) - n.T @ n
-    b = points_m.sum(0) - n.T @ (n * points_m).sum(1)
-    return np.linalg.solve(A, b)
-
-
-def _refit(points_m: np.ndarray, n: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    try:
-        return nearest_point(points_m[chosen], n[chosen])
-    except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
-        A = len(n) * np.eye(3) - n.T @ n
-        b = points_m.sum(0) - n.T @ (n * points_m).sum(1)
-        return np.linalg.lstsq(A, b, rcond=None)[0]
+    return A, points_m.sum(0) - n.T @ (n * points_m).sum(1)

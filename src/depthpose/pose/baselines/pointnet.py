@@ -99,8 +99,7 @@ def _layers(widths: Sequence[int]) -> nn.Sequential:
 def _turned(x: Tensor, turn: Tensor, cloud: Tensor) -> Float[Tensor, "points c"]:
     """Multiply the rows of each cloud by its matrix."""
     sizes = torch.bincount(cloud, minlength=len(turn)).tolist()
-    parts = [part @ matrix for part, matrix in zip(x.split(sizes), turn, strict=True)]
-    return torch.cat(parts)
+    return torch.cat([part @ T for part, T in zip(x.split(sizes), turn, strict=True)])
 
 
 def _largest(x: Tensor, cloud: Tensor, count: int) -> Float[Tensor, "clouds c"]:

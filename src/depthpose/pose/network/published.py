@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from depthpose.core.checkpoint import (
@@ -87,24 +86,34 @@ def resunet_from_published(state: Mapping[str, Tensor], *, classes: int | None =
     """
     given = {name.removeprefix("module."): value for name, value in state.items()}
     network = ResUNet(_config_of(given, classes))
-    translated = {_our_name(name): _our_shape(value) for name, value in given.items()}
     wanted = network.state_dict()
     # The count of batches steers nothing at inference, and old files do not hold it.
-    spare = {name: t for name, t in wanted.items() if name.endswith("num_batches_tracked")}
-    faults = _differences({**spare, **translated}, wanted)
+    ours = {name: t for name, t in wanted.items() if name.endswith("num_batches_tracked")}
+    ours.update((_our_name(name), _our_shape(value)) for name, value in given.items())
+    faults = [f"{name} is missing" for name in wanted if name not in ours]
+    faults += [f"{name} is unknown" for name in ours if name not in wanted]
+    faults += [
+        f"{name} is {tuple(ours[name].shape)}, not {tuple(tensor.shape)}"
+        for name, tensor in wanted.items()
+        if name in ours and ours[name].shape != tensor.shape
+    ]
     if faults:
         raise InputError(
             f"these are not the weights of FCGF's ResUNetBN2C: {'; '.join(faults[:4])}"
             f"{f' and {len(faults) - 4} more' if faults[4:] else ''}. Give the value that the "
             "file holds under 'state_dict'; other networks of MinkowskiEngine do not fit."
         )
-    network.load_state_dict({**spare, **translated})
+    network.load_state_dict(ours)
     return network.eval()
 
 
 def _config_of(given: Mapping[str, Tensor], classes: int | None) -> ResUNetConfig:
     needed = [f"{name}.kernel" for name in (*_CONVS, "final")]
-    lost = [name for name in needed if not _is_kernel(given.get(name))]
+    lost = [
+        name
+        for name in needed
+        if not (isinstance(kernel := given.get(name), Tensor) and kernel.ndim in (2, 3))
+    ]
     if lost:
         raise InputError(
             f"these are not the weights of FCGF's ResUNetBN2C: {', '.join(lost[:3])} "
@@ -113,9 +122,14 @@ def _config_of(given: Mapping[str, Tensor], classes: int | None) -> ResUNetConfi
         )
     widths = [given[f"{name}.kernel"].shape[-1] for name in _CONVS]
     first, outputs = given["conv1.kernel"], given["final.kernel"].shape[-1]
+    if classes is not None and (classes < 1 or outputs % (3 * classes)):
+        raise InputError(
+            f"{outputs} outputs are not 3 directions of each keypoint of {classes} classes; leave "
+            "the number of classes out where the outputs are descriptors."
+        )
     return ResUNetConfig(
         classes=classes or 1,
-        keypoints=_keypoints(outputs, classes),
+        keypoints=outputs // (3 * classes) if classes else 1,
         descriptor=outputs if classes is None else None,
         norm="batch" if any(name.startswith("norm1.") for name in given) else "none",
         with_bias="conv1.bias" in given,
@@ -126,22 +140,12 @@ def _config_of(given: Mapping[str, Tensor], classes: int | None) -> ResUNetConfi
     )
 
 
-def _keypoints(outputs: int, classes: int | None) -> int:
-    if classes is None:
-        return 1
-    if classes < 1 or outputs % (3 * classes):
-        raise InputError(
-            f"{outputs} outputs are not 3 directions of each keypoint of {classes} classes; leave "
-            "the number of classes out where the outputs are descriptors."
-        )
-    return outputs // (3 * classes)
-
-
 def _our_name(published: str) -> str:
     """Translate one published name; an unknown one comes back as it is and is refused later."""
     places = {"1": "first", "2": "second"}
     rules = (
-        (r"^(conv1_tr|final)\.(kernel|bias)$", lambda m: f"{_plain(m[1])}.{_PARTS[m[2]]}"),
+        (r"^conv1_tr\.(kernel|bias)$", lambda m: f"mix.{_PARTS[m[1]]}"),
+        (r"^final\.(kernel|bias)$", lambda m: f"final.{_PARTS[m[1]]}"),
         (r"^conv([1-4])\.(kernel|bias)$", lambda m: f"down.{int(m[1]) - 1}.conv.{_PARTS[m[2]]}"),
         (r"^conv([2-4])_tr\.(kernel|bias)$", lambda m: f"up.{4 - int(m[1])}.conv.{_PARTS[m[2]]}"),
         (r"^norm([1-4])\.(?:bn\.)?(\w+)$", lambda m: f"down.{int(m[1]) - 1}.norm.{m[2]}"),
@@ -156,26 +160,8 @@ def _our_name(published: str) -> str:
     return published
 
 
-def _plain(name: str) -> str:
-    return "mix" if name == "conv1_tr" else name
-
-
 def _our_shape(value: Tensor) -> Tensor:
     """MinkowskiEngine keeps 1x1 kernels as (in, out) and biases as (1, out)."""
     if value.ndim == 2:
         return value[0] if value.shape[0] == 1 else value[None]
     return value
-
-
-def _differences(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> list[str]:
-    faults = [f"{name} is missing" for name in wanted if name not in given]
-    faults += [f"{name} is unknown" for name in given if name not in wanted]
-    return faults + [
-        f"{name} is {tuple(given[name].shape)}, not {tuple(tensor.shape)}"
-        for name, tensor in wanted.items()
-        if name in given and given[name].shape != tensor.shape
-    ]
-
-
-def _is_kernel(value: object) -> bool:
-    return isinstance(value, torch.Tensor) and value.ndim in (2, 3)

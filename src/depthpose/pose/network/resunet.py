@@ -1,5 +1,9 @@
-"""The sparse ResUNet of FCGF (ResUNetBN2C), with or without norms: figure 3-3 of the thesis."""
+"""The sparse ResUNet of FCGF (ResUNetBN2C): figure 3-3 of the thesis.
 
+With batch norm, without, or with batch norm folded into the convolution before it.
+"""
+
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -88,14 +92,21 @@ MOMENTUM = 0.05
 class ConvNorm(nn.Module):
     """A convolution and, if there is one, its norm."""
 
-    def __init__(self, conv: SparseConv, config: ResUNetConfig) -> None:
+    def __init__(
+        self,
+        config: ResUNetConfig,
+        inputs: int,
+        outputs: int,
+        kernel: int = 3,
+        stride: int = 1,
+        kind: type[SparseConv] = SparseConv,
+    ) -> None:
         super().__init__()
-        self.conv = conv
-        width = conv.weight.shape[2]
-        self.norm = RowNorm(width, momentum=MOMENTUM) if config.norm == "batch" else None
+        self.conv = kind(inputs, outputs, kernel, stride, has_bias=config.with_bias)
+        self.norm = RowNorm(outputs, momentum=MOMENTUM) if config.norm == "batch" else None
         if self.norm is not None:
             with torch.no_grad():
-                conv.weight.mul_(NORMED_SCALE)
+                self.conv.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Voxels:
         """Convolve and normalise."""
@@ -108,8 +119,8 @@ class Block(nn.Module):
 
     def __init__(self, width: int, config: ResUNetConfig) -> None:
         super().__init__()
-        self.first = _same(width, width, 3, config)
-        self.second = _same(width, width, 3, config)
+        self.first = ConvNorm(config, width, width)
+        self.second = ConvNorm(config, width, width)
         if config.norm == "none":
             with torch.no_grad():
                 self.second.conv.weight.mul_(BRANCH_SCALE)
@@ -131,11 +142,13 @@ class ResUNet(nn.Module):
         super().__init__()
         self.config = config = config or ResUNetConfig()
         e, d = config.encoder, config.decoder
-        self.down = nn.ModuleList([_same(config.inputs, e[0], config.first_kernel, config)])
-        self.down.extend(_down(e[i - 1], e[i], config) for i in (1, 2, 3))
+        self.down = nn.ModuleList([ConvNorm(config, config.inputs, e[0], config.first_kernel)])
+        self.down.extend(ConvNorm(config, e[i - 1], e[i], 3, 2) for i in (1, 2, 3))
         self.down_blocks = nn.ModuleList(Block(width, config) for width in e)
         into = {3: e[3], 2: e[2] + d[3], 1: e[1] + d[2]}
-        self.up = nn.ModuleList(_up(into[i], d[i], config) for i in (3, 2, 1))
+        self.up = nn.ModuleList(
+            ConvNorm(config, into[i], d[i], 3, 2, SparseConvTranspose) for i in (3, 2, 1)
+        )
         self.up_blocks = nn.ModuleList(Block(d[i], config) for i in (3, 2, 1))
         # No norm and no neighbours: the skip of the finest level is mixed point by point.
         self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
@@ -198,25 +211,77 @@ class ResUNet(nn.Module):
             seen.append(voxels)
         voxels = seen.pop()
         for up, block in zip(self.up, self.up_blocks, strict=True):
-            voxels = _beside(block(up(voxels)), seen.pop())
+            voxels = block(up(voxels))
+            voxels = voxels.with_features(torch.cat([voxels.features, seen.pop().features], 1))
         return _relu(self.mix(voxels))
-
-
-def _same(inputs: int, outputs: int, kernel: int, config: ResUNetConfig) -> ConvNorm:
-    return ConvNorm(SparseConv(inputs, outputs, kernel, has_bias=config.with_bias), config)
-
-
-def _down(inputs: int, outputs: int, config: ResUNetConfig) -> ConvNorm:
-    return ConvNorm(SparseConv(inputs, outputs, 3, 2, has_bias=config.with_bias), config)
-
-
-def _up(inputs: int, outputs: int, config: ResUNetConfig) -> ConvNorm:
-    return ConvNorm(SparseConvTranspose(inputs, outputs, 3, 2, has_bias=config.with_bias), config)
 
 
 def _relu(voxels: Voxels) -> Voxels:
     return voxels.with_features(F.relu(voxels.features))
 
 
-def _beside(left: Voxels, right: Voxels) -> Voxels:
-    return left.with_features(torch.cat([left.features, right.features], 1))
+@torch.no_grad()
+def fold_norms(network: ResUNet) -> ResUNet:
+    """Give a norm-free network, in eval mode, that answers what ``network.eval()`` answers.
+
+    In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, and a
+    convolution before it absorbs them: ``weight * scale``, ``shift + (bias - mean) * scale``.
+    """
+    if network.config.norm == "none":
+        return network
+    config = dataclasses.replace(network.config, norm="none", with_bias=True)
+    folded = ResUNet(config).to(next(network.parameters()))
+    theirs = _conv_norms(folded)
+    others = {k: v for k, v in network.state_dict().items() if k.startswith(("final.", "mix."))}
+    folded.load_state_dict(others, strict=False)
+    for name, source in _conv_norms(network).items():
+        norm, into = source.norm, theirs[name].conv
+        assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
+        assert into.bias is not None
+        scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
+        bias = 0.0 if source.conv.bias is None else source.conv.bias
+        into.weight.copy_(source.conv.weight * scale)
+        into.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
+    return folded.eval()
+
+
+def _conv_norms(network: ResUNet) -> dict[str, ConvNorm]:
+    return {name: m for name, m in network.named_modules() if isinstance(m, ConvNorm)}
+
+
+@torch.no_grad()
+def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
+    """Give a network with batch norm the weights of one without, so that it can learn on.
+
+    The statistics that folding took are lost; those of ``voxels`` replace them. On these the
+    network answers in training and in eval mode what ``folded`` does.
+
+    Args:
+        folded: without norms.
+        network: of the same widths, with batch norm; if it has other classes, its last layer stays.
+        voxels: clouds like those to come.
+    """
+    outputs: dict[ConvNorm, Tensor] = {}
+
+    def remember(module: ConvNorm, _inputs: object, out: Voxels) -> None:
+        outputs[module] = out.features
+
+    sources, targets = _conv_norms(folded), _conv_norms(network)
+    hooks = [source.register_forward_hook(remember) for source in sources.values()]
+    folded.eval()(voxels)
+    for hook in hooks:
+        hook.remove()
+    for name, source in sources.items():
+        conv, norm, bias = targets[name].conv, targets[name].norm, source.conv.bias
+        assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
+        assert bias is not None
+        variance, mean = torch.var_mean(outputs[source], 0, correction=0)
+        conv.weight.copy_(source.conv.weight)
+        norm.running_mean.copy_(mean - bias + (0.0 if conv.bias is None else conv.bias))
+        norm.running_var.copy_(variance)
+        norm.weight.copy_((variance + norm.eps).sqrt())
+        norm.bias.copy_(mean)
+    parts = ("mix.", "final.") if folded.config.outputs == network.config.outputs else ("mix.",)
+    known = network.state_dict()
+    others = {k: v for k, v in folded.state_dict().items() if k.startswith(parts) and k in known}
+    network.load_state_dict(others, strict=False)

@@ -1,21 +1,23 @@
-"""The sparse convolution, ``conv(features, weight, kernel_map)``, and its matrix products.
+"""The sparse convolution, ``conv(features, weight, kernel_map)``, and as a module on voxels.
 
 Every way of computing it is gather, multiply, add up; the ways differ in how much is gathered at
-once. Without gradients small ones go through a compiled loop, where numba is installed.
-
-Products go in blocks of rows through the faster of torch's two CPU libraries.
+once. Without gradients small ones go through a compiled loop, where numba is installed. Products
+go in blocks of rows through the faster of torch's two CPU libraries.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+import torch.nn.functional as F
+from jaxtyping import Float, Int, Int64
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from depthpose.core.errors import InputError
 from depthpose.pose.compiled import serves
-from depthpose.pose.sparse.kernel_map import KernelMap
+from depthpose.pose.sparse.kernel_map import CoordinateCache, KernelMap, pack, unpack
 
 BLOCK_PRODUCTS = 1 << 23
 """Multiplications in a block: fewer cost more calls, more fall out of the cache (measured)."""
@@ -54,16 +56,12 @@ def add_product(out: Tensor, x: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _has_onednn(x: Tensor) -> bool:
-    is_usable = x.device.type == "cpu" and x.dtype == torch.float32
-    return is_usable and _has_private_product()
+    return x.device.type == "cpu" and x.dtype == torch.float32 and _has_private_product()
 
 
 @cache
 def _has_private_product() -> bool:
-    """Whether this torch multiplies strided float32 through oneDNN, by an operator private to it.
-
-    Without it every product goes through ``torch.mm``: the same numbers, more slowly.
-    """
+    """Whether this torch multiplies through oneDNN, by an operator private to it."""
     if not torch.backends.mkldnn.is_available():
         return False
     rows, kernel = torch.ones(2, 3, dtype=torch.float32), torch.ones(3, 4, dtype=torch.float32)
@@ -108,18 +106,13 @@ def conv(
     if torch.is_autocast_enabled(device):
         narrower = torch.get_autocast_dtype(device)
         features, weight = features.to(narrower), weight.to(narrower)
-    if _is_compiled(features, weight, kernel_map):
+    is_plain = features.dtype == weight.dtype == torch.float32
+    near = kernel_map.neighbours
+    if is_plain and serves(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
         from depthpose.pose.compiled.convolve import convolved
 
-        m = kernel_map
-        return convolved(
-            features, weight, m.neighbours.table, m.neighbours.fine_rows, m.is_transposed
-        )
+        return convolved(features, weight, near.table, near.fine_rows, kernel_map.is_transposed)
     return _Convolution.apply(features, weight, kernel_map)
-
-
-Gradients = tuple[Tensor | None, Tensor | None]
-"""Of the features and of the weight."""
 
 
 class _Convolution(torch.autograd.Function):
@@ -137,117 +130,82 @@ class _Convolution(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         gradient: Tensor,
     ) -> tuple[Tensor | None, Tensor | None, None]:
-        features, weight = ctx.saved_tensors
+        x, weight = ctx.saved_tensors
+        m: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
-        wanted = ctx.needs_input_grad[:2]
-        if _is_narrow(features, ctx.kernel_map):
-            way = _gradients_by_table
-        else:
-            is_gridded = _is_gridded(features, weight, ctx.kernel_map)
-            way = _gradients_by_grid if is_gridded else _gradients_by_offset
-        return *way(gradient, features, weight, ctx.kernel_map, wanted), None
+        wants_x, wants_weight, _ = ctx.needs_input_grad
+        if _is_narrow(x, m):
+            # The first layer's input is no parameter's child: its gradient is seldom wanted.
+            for_x = _convolve(gradient, weight.mT, m.transposed) if wants_x else None
+            of_table = (_table(x, m) @ gradient).view(weight.shape) if wants_weight else None
+            return for_x, of_table, None
+        way = _gradients_by_grid if _is_gridded(x, weight, m) else _gradients_by_offset
+        for_x, for_weight = way(gradient, x, weight, m, wants_x, wants_weight)
+        if m.centre is not None and for_x is not None:
+            add_product(for_x, gradient, weight[m.centre].T)
+        if m.centre is not None and for_weight is not None:
+            torch.mm(x.T, gradient, out=for_weight[m.centre])
+        return for_x, for_weight, None
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     if _is_narrow(x, m):
         return _table(x, m).T @ weight.flatten(0, 1)
-    out = _by_grid(x, weight, m) if _is_gridded(x, weight, m) else _by_offset(x, weight, m)
+    if _is_gridded(x, weight, m):  # all offsets in one operation each, padded to the fullest
+        out = m.sum_by_output(torch.bmm(_read(x, m), weight).flatten(0, 1))
+    else:  # an offset at a time: its pairs write each row once at most
+        out, kernels = x.new_zeros(m.outputs, weight.shape[2]), weight.unbind()
+        for offset, read, write in m.by_offset():
+            _add_rows(out, write, x, read, kernels[offset])
     return out if m.centre is None else add_product(out, x, weight[m.centre])
 
 
-def _by_grid(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    """Gather, multiply and add up all offsets in one operation each, padded to the fullest."""
-    products = torch.bmm(_read(x, m.grid_in, m), weight)
-    return m.sum_by_output(products.flatten(0, 1))
-
-
-def _by_offset(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    """Gather and add up an offset at a time: its pairs write each row once at most."""
-    out = x.new_zeros(m.outputs, weight.shape[2])
-    # Lists of views, each from one call: slicing one by one costs as much as small products.
-    kernels = weight.unbind()
-    reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
-    for offset, read, write in zip(m.filled, reads, writes, strict=True):
-        _add_rows(out, write, (x, read), kernels[offset])
-    return out
-
-
-def _add_rows(out: Tensor, write: Tensor, source: tuple[Tensor, Tensor], kernel: Tensor) -> None:
+def _add_rows(out: Tensor, write: Tensor, x: Tensor, read: Tensor, kernel: Tensor) -> None:
     """Add ``x[read] @ kernel`` to the rows ``write`` of ``out``, block by block."""
-    x, read = source
     block = block_rows(x, kernel)
     for reads, writes in zip(read.split(block), write.split(block), strict=True):
         out.index_add_(0, writes, multiply(x.index_select(0, reads), kernel, block))
 
 
-def _gradients_by_table(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
-) -> Gradients:
-    # The first layer's input is no parameter's child: its gradient is seldom wanted and not cheap.
-    for_x = _convolve(gradient, weight.mT, m.transposed) if wanted[0] else None
-    return for_x, (_table(x, m) @ gradient).view(weight.shape) if wanted[1] else None
-
-
 def _gradients_by_grid(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
-) -> Gradients:
-    pulls = _read(gradient, m.grid_out, m)
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wants_x: bool, wants_weight: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    pulls = _read(gradient, m.transposed)
     for_x = for_weight = None
-    if wanted[0]:
+    if wants_x:
         for_x = m.transposed.sum_by_output(torch.bmm(pulls, weight.mT).flatten(0, 1))
-    if wanted[1]:
-        for_weight = torch.bmm(_read(x, m.grid_in, m).mT, pulls)
-    return _with_centre(gradient, x, weight, m, (for_x, for_weight))
+    if wants_weight:
+        for_weight = torch.bmm(_read(x, m).mT, pulls)
+    return for_x, for_weight
 
 
 def _gradients_by_offset(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wanted: tuple[bool, ...]
-) -> Gradients:
-    for_x = torch.zeros_like(x) if wanted[0] else None
-    for_weight = torch.empty_like(weight) if wanted[1] else None
+    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, wants_x: bool, wants_weight: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    for_x = torch.zeros_like(x) if wants_x else None
+    for_weight = torch.zeros_like(weight) if wants_weight else None
     kernels, pulled = weight.mT.unbind(), () if for_weight is None else for_weight.unbind()
-    if for_weight is not None:
-        for offset in set(range(m.volume)).difference(m.filled):
-            pulled[offset].zero_()
-    reads, writes = m.rows_in.split(m.counts), m.rows_out.split(m.counts)
-    for offset, read, write in zip(m.filled, reads, writes, strict=True):
+    for offset, read, write in m.by_offset():
         if for_weight is not None:
             pulls = gradient.index_select(0, write)
             torch.mm(x.index_select(0, read).T, pulls, out=pulled[offset])
         if for_x is not None:
-            _add_rows(for_x, read, (gradient, write), kernels[offset])
-    return _with_centre(gradient, x, weight, m, (for_x, for_weight))
+            _add_rows(for_x, read, gradient, write, kernels[offset])
+    return for_x, for_weight
 
 
-def _with_centre(
-    gradient: Tensor, x: Tensor, weight: Tensor, m: KernelMap, so_far: Gradients
-) -> Gradients:
-    """Add the part of the offset at which each voxel is its own neighbour."""
-    for_x, for_weight = so_far
-    if m.centre is not None and for_x is not None:
-        add_product(for_x, gradient, weight[m.centre].T)
-    if m.centre is not None and for_weight is not None:
-        torch.mm(x.T, gradient, out=for_weight[m.centre])
-    return so_far
-
-
-def _read(x: Tensor, slots: Tensor, m: KernelMap) -> Tensor:
+def _read(x: Tensor, m: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
-    padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
-    return padded.index_select(0, slots).view(m.volume, m.most, x.shape[1])
+    padded = F.pad(x, (0, 0, 0, 1))
+    return padded.index_select(0, m.grid_in).view(m.volume, m.most, x.shape[1])
 
 
 def _table(x: Tensor, m: KernelMap) -> Tensor:
     """Lay out what each output voxel reads: (volume * channels, outputs), 0 where it is empty."""
-    padded = torch.nn.functional.pad(x, (0, 0, 0, 1))
+    padded = F.pad(x, (0, 0, 0, 1))
     rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(m.volume * x.shape[1], m.outputs)
-
-
-def _is_compiled(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
-    is_plain = x.dtype == weight.dtype == torch.float32
-    return is_plain and serves(x, weight) and m.neighbours.table.numel() <= COMPILED_ELEMENTS
 
 
 def _is_narrow(x: Tensor, m: KernelMap) -> bool:
@@ -262,3 +220,134 @@ def _is_gridded(x: Tensor, weight: Tensor, m: KernelMap) -> bool:
         is_fixed = torch.are_deterministic_algorithms_enabled()
         return is_fixed or m.volume * m.most * max(weight.shape[1:]) <= GRID_ELEMENTS
     return m.most * weight[0].numel() <= GRID_PRODUCTS
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Voxels:
+    """Features of the voxels of one level, of one or several clouds.
+
+    Rows are in the order of the level's sorted keys, so the order in which points were given
+    changes no bit of any result; :meth:`at_points` answers in the order given.
+
+    Attributes:
+        features: one row a voxel.
+        cache: coordinates of all levels, and the kernel maps among them.
+        level: coordinates here are multiples of ``2**level``.
+        row_of_point: row at level 0 of each point given.
+    """
+
+    features: Float[Tensor, "n c"]
+    cache: CoordinateCache
+    level: int = 0
+    row_of_point: Int64[Tensor, " points"]
+
+    @classmethod
+    def from_points(
+        cls,
+        coordinates: Int[Tensor, "points 4"],
+        features: Float[Tensor, "points c"] | None = None,
+    ) -> "Voxels":
+        """Make voxels from rows of (cloud, x, y, z).
+
+        Args:
+            coordinates: integers; clouds are numbered from 0, x, y, z may be negative.
+            features: of each point; None: the number 1.
+
+        Raises:
+            InputError: coordinates out of range, or two points in one voxel.
+        """
+        if features is None:
+            features = torch.ones(len(coordinates), 1, device=coordinates.device)
+        given = pack(coordinates)
+        keys, row_of_point, counts = torch.unique(given, return_inverse=True, return_counts=True)
+        repeated = counts > 1
+        if bool(repeated.any()):
+            cloud, *xyz = unpack(keys[repeated][:1])[0].tolist()
+            raise InputError(
+                f"{int((counts - 1).sum())} points share a voxel with another, the first at {xyz} "
+                f"of cloud {cloud}; keep one point a voxel."
+            )
+        features = features[torch.argsort(given)]
+        return cls(features=features, cache=CoordinateCache(keys), row_of_point=row_of_point)
+
+    @property
+    def coordinates(self) -> Int64[Tensor, "n 4"]:
+        """(cloud, x, y, z) of each row, in voxels of level 0."""
+        return self.cache.coordinates(self.level)
+
+    def with_features(self, features: Float[Tensor, "m c2"], level: int | None = None) -> "Voxels":
+        """Give other features of the same level, or of another one of the same voxels."""
+        level = self.level if level is None else level
+        assert len(features) == len(self.cache.keys(level)), "features and voxels differ in number"
+        return Voxels(
+            features=features, cache=self.cache, level=level, row_of_point=self.row_of_point
+        )
+
+    def at_points(self) -> Float[Tensor, "points c"]:
+        """Features of the voxel of each point, in the order in which points were given."""
+        assert self.level == 0, f"points lie in voxels of level 0, these are of level {self.level}"
+        return self.features[self.row_of_point]
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over rows (voxels, points, clouds), which takes a single one.
+
+    One row has no variance; torch refuses it in training. Its running statistics serve instead.
+    """
+
+    def forward(self, input: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
+        """Normalise each channel over all rows."""
+        if len(input) > 1:
+            return super().forward(input)
+        statistics = (self.running_mean, self.running_var)
+        return F.batch_norm(input, *statistics, self.weight, self.bias, eps=self.eps)
+
+
+class SparseConv(nn.Module):
+    """Convolution on voxels; with a stride it writes the coarser level.
+
+    ``weight`` is (kernel^3, inputs, outputs), its rows in the order of ``kernel_offsets``.
+    """
+
+    is_transposed = False
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, *, has_bias: bool = False
+    ) -> None:
+        super().__init__()
+        self.kernel, self.stride = kernel, stride
+        self.weight = nn.Parameter(torch.empty(kernel**3, inputs, outputs))
+        self.bias = nn.Parameter(torch.zeros(outputs)) if has_bias else None
+        nn.init.normal_(self.weight, std=(2 / self.fan_in) ** 0.5)
+
+    @property
+    def fan_in(self) -> float:
+        """Numbers that one output is summed from, on a surface.
+
+        Voxels of a surface fill about 1.5 k^2 of a kernel's k^3 cells (counted: 13 to 14 of 27).
+        Where it is transposed, each coarse voxel feeds about 4 fine ones.
+        """
+        taps = 1.5 * self.kernel**2 if self.kernel > 1 else 1.0
+        if self.is_transposed:
+            taps = max(1.0, taps / self.stride**2)
+        return taps * self.weight.shape[1]
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        """Convolve."""
+        level = voxels.level
+        if self.kernel == 1 and self.stride == 1:
+            features = voxels.features @ self.weight[0]
+        else:
+            kernel_map = voxels.cache.kernel_map(
+                level, self.kernel, self.stride, is_transposed=self.is_transposed
+            )
+            features = conv(voxels.features, self.weight, kernel_map)
+            levels = self.stride.bit_length() - 1
+            level += -levels if self.is_transposed else levels
+        return voxels.with_features(features if self.bias is None else features + self.bias, level)
+
+
+class SparseConvTranspose(SparseConv):
+    """Transposed convolution: back onto the stored voxels of the finer level."""
+
+    is_transposed = True

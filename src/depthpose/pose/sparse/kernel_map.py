@@ -1,24 +1,173 @@
-"""Which input voxel is the neighbour of which output voxel at which offset of a kernel.
+"""Voxels as integers, and which input voxel is the neighbour of which output voxel.
+
+A key packs (cloud, x, y, z) so that sorting and searching are one-dimensional: 12 bits of the
+cloud's number and 17 bits of each coordinate, z lowest. Adding packed offsets to a key moves the
+voxel; coordinates keep off the ends of their field by more than any kernel reaches, so that a move
+never carries into the next field. Rows are found by keys through a table of a box, by binary
+search, or by a compiled walk along both lists.
 
 All levels and kernel maps of one set of voxels are made once (:class:`CoordinateCache`).
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Int32, Int64
+from jaxtyping import Int, Int32, Int64
 from torch import Tensor
 
-from depthpose.pose.sparse.keys import (
-    MARGIN,
-    REACH,
-    Keys,
-    VoxelIndex,
-    coarsen,
-    reach_beyond,
-    unpack,
-)
+from depthpose.core.errors import InputError
+from depthpose.pose.compiled import serves
+
+FIELD_BITS = 17
+HALF = 1 << (FIELD_BITS - 1)
+REACH = 1 << 12
+"""Farthest that a kernel may look, in voxels of the finest level."""
+
+COORDINATE_LIMIT = HALF - REACH
+"""Coordinates lie in [-COORDINATE_LIMIT, COORDINATE_LIMIT)."""
+
+CLOUD_LIMIT = 1 << (63 - 3 * FIELD_BITS)
+"""Clouds that one batch can hold."""
+
+Keys = Int64[Tensor, " _"]
+
+
+def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
+    """Pack rows of (cloud, x, y, z) into keys.
+
+    Raises:
+        InputError: a coordinate or the number of clouds does not fit.
+    """
+    if len(coordinates):
+        lowest, highest = coordinates.amin(0).tolist(), coordinates.amax(0).tolist()
+        if lowest[0] < 0 or highest[0] >= CLOUD_LIMIT:
+            raise InputError(
+                f"cloud numbers run from {lowest[0]} to {highest[0]}, but a batch holds clouds "
+                f"0 .. {CLOUD_LIMIT - 1}; split the batch."
+            )
+        low, high = min(lowest[1:]), max(highest[1:])
+        if low < -COORDINATE_LIMIT or high >= COORDINATE_LIMIT:
+            raise InputError(
+                f"voxel coordinates run from {low} to {high}, but must lie in "
+                f"[{-COORDINATE_LIMIT}, {COORDINATE_LIMIT}); centre each cloud on its mean, drop "
+                "far points, or take larger voxels."
+            )
+    cloud, x, y, z = coordinates.long().unbind(1)
+    return (((cloud << FIELD_BITS | x + HALF) << FIELD_BITS | y + HALF) << FIELD_BITS) | z + HALF
+
+
+def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
+    """Give back what :func:`pack` packed."""
+    low = (1 << FIELD_BITS) - 1
+    x, y, z = ((keys >> shift * FIELD_BITS & low) - HALF for shift in (2, 1, 0))
+    return torch.stack([keys >> 3 * FIELD_BITS, x, y, z], 1)
+
+
+def packed_move(x: int, y: int, z: int) -> int:
+    """Pack an offset: adding it to a key moves the voxel."""
+    return (x << 2 * FIELD_BITS) + (y << FIELD_BITS) + z
+
+
+def coarsen(keys: Keys, stride: int) -> Keys:
+    """Give the sorted keys of ``floor(c / stride) * stride``, each once; stride a power of two.
+
+    A field holds c + HALF, which is not negative: clearing its low bits is a floor division for
+    negative coordinates too.
+    """
+    field = packed_move(stride - 1, stride - 1, stride - 1)
+    return torch.unique(keys & ~field)
+
+
+def batch_coordinates(clouds: Sequence[Int[Tensor, "_ 3"]]) -> Int[Tensor, "n 4"]:
+    """Put the voxel coordinates of several clouds under each other, each with its number."""
+    if not clouds:
+        raise InputError("a batch needs a cloud at least, got none; an empty cloud is one too")
+    numbered = [torch.nn.functional.pad(xyz, (1, 0), value=i) for i, xyz in enumerate(clouds)]
+    return torch.cat(numbered)
+
+
+Moves = tuple[tuple[int, int, int], ...]
+
+MARGIN = 4
+"""Cells about the box: as far as a kernel may look beyond it (:func:`reach_beyond`). With fewer a
+look past one row's end would find the next row."""
+
+MAX_CELLS = 1 << 24
+CELLS_PER_VOXEL = 512
+"""A box with more cells than these is mostly air: binary search is then the cheaper."""
+
+
+def reach_beyond(kernel: int, stride: int) -> int:
+    """Cells that a kernel looks beyond the box of the finer level's voxels.
+
+    A coarser voxel lies up to ``stride - 1`` cells below the lowest finer one in it. An odd kernel
+    looks both ways from it, an even one forward alone.
+    """
+    return kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
+
+
+class VoxelIndex:
+    """Finds rows of one level's voxels, the same in each of three ways.
+
+    A compiled walk along the sorted keys where it serves; a table of the cells of the clouds'
+    common box where that is small enough, some five times faster than binary search; or that.
+    """
+
+    def __init__(self, keys: Keys, step: int) -> None:
+        """Index the sorted keys of a level whose voxels lie ``step`` apart."""
+        self._keys, self._step = keys, step
+        self._low = self._strides = keys.new_zeros(4)
+        self._table: Tensor | None = None
+        self._is_compiled = serves(keys)
+        if len(keys) and not self._is_compiled:
+            self._lay_out()
+
+    def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
+        """Give the row of each voxel ``standing + move * step``.
+
+        Where there is none, one past the last row: a row of zeros put there answers for it.
+        """
+        if not len(self._keys):
+            return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
+        packed = [packed_move(*move) * self._step for move in moves]
+        if self._is_compiled:
+            from depthpose.pose.compiled.convolve import rows_of
+
+            return torch.from_numpy(rows_of(self._keys.numpy(), standing.numpy(), packed))
+        if self._table is None:
+            wanted = standing + torch.tensor(packed, device=standing.device)[:, None]
+            rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
+            return torch.where(self._keys[rows] == wanted, rows, len(self._keys)).int()
+        cells = self._cells(standing)
+        offsets = (torch.tensor(moves, device=cells.device) * self._strides[1:]).sum(-1)
+        wanted = offsets[:, None] + cells
+        return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
+
+    def _lay_out(self) -> None:
+        coordinates = self._cell_coordinates(self._keys)
+        low, high = coordinates.amin(0), coordinates.amax(0)
+        sides = (high - low + 1).tolist()
+        sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
+        cells = sides[0] * sides[1] * sides[2] * sides[3]
+        if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + MAX_CELLS // 256):
+            return
+        low[1:] -= MARGIN
+        strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
+        device = low.device
+        self._low, self._strides = low, torch.tensor(strides, device=device)
+        self._table = torch.full((cells,), len(coordinates), dtype=torch.int32, device=device)
+        rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
+        self._table[self._cells(self._keys)] = rows
+
+    def _cell_coordinates(self, keys: Keys) -> Int64[Tensor, "n 4"]:
+        coordinates = unpack(keys)
+        coordinates[:, 1:] >>= self._step.bit_length() - 1
+        return coordinates
+
+    def _cells(self, keys: Keys) -> Int64[Tensor, " _"]:
+        return ((self._cell_coordinates(keys) - self._low) * self._strides).sum(1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,9 +177,10 @@ class PairList:
     Attributes:
         fine: row of each pair in the finer level: where the kernel reads.
         coarse: row of each pair in the coarser level: where the kernel is centred.
-        slot: place of each pair in a grid of (volume, most), where ``most`` is the largest count.
+        slot: place of each pair in a grid of (volume, most).
         filled: offsets that have pairs; the others are skipped.
         counts: how many pairs each of them has.
+        most: the largest of these counts.
     """
 
     fine: Int64[Tensor, " pairs"]
@@ -38,11 +188,7 @@ class PairList:
     slot: Int64[Tensor, " pairs"]
     filled: tuple[int, ...]
     counts: tuple[int, ...]
-
-    @property
-    def most(self) -> int:
-        """Pairs of the fullest offset."""
-        return max(self.counts, default=0)
+    most: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,12 +218,13 @@ class NeighbourTable:
         offset, coarse = is_pair.nonzero(as_tuple=True)
         fine = self.table.flatten().index_select(0, offset * self.table.shape[1] + coarse)
         # The pairs of an offset fill its line of the grid from the left.
-        shifts = torch.arange(len(counts), device=counts.device) * max(numbers, default=0)
+        most = max(numbers, default=0)
+        shifts = torch.arange(len(counts), device=counts.device) * most
         lines = (shifts - counts.cumsum(0) + counts).index_select(0, offset)
         return PairList(
             fine=fine.long(), coarse=coarse, filled=filled,
             slot=lines + torch.arange(len(fine), device=fine.device),
-            counts=tuple(numbers[offset] for offset in filled),
+            counts=tuple(numbers[offset] for offset in filled), most=most,
         )  # fmt: skip
 
     @cached_property
@@ -93,17 +240,21 @@ class NeighbourTable:
     @cached_property
     def by_fine(self) -> tuple[Tensor, Tensor]:
         """Slots grouped by fine row: their order, and where in it each row begins."""
-        return _grouped(self.pairs.fine, self.pairs.slot, self.fine_rows)
+        return self._grouped(self.pairs.fine, self.fine_rows)
 
     @cached_property
     def by_coarse(self) -> tuple[Tensor, Tensor]:
         """Slots grouped by coarse row."""
-        return _grouped(self.pairs.coarse, self.pairs.slot, self.table.shape[1])
+        return self._grouped(self.pairs.coarse, self.table.shape[1])
 
     def _grid(self, rows: Tensor, nobody: int) -> Tensor:
         grid = rows.new_full((len(self.table) * self.pairs.most,), nobody)
         grid[self.pairs.slot] = rows
         return grid
+
+    def _grouped(self, rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        counts = torch.bincount(rows, minlength=count)
+        return self.pairs.slot[torch.argsort(rows, stable=True)], counts.cumsum(0) - counts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,28 +290,6 @@ class KernelMap:
         return self.neighbours.pairs.most
 
     @property
-    def filled(self) -> tuple[int, ...]:
-        """Offsets that have pairs."""
-        return self.neighbours.pairs.filled
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Number of pairs of each of these offsets."""
-        return self.neighbours.pairs.counts
-
-    @property
-    def rows_in(self) -> Int64[Tensor, " pairs"]:
-        """Row that each pair reads."""
-        pairs = self.neighbours.pairs
-        return pairs.coarse if self.is_transposed else pairs.fine
-
-    @property
-    def rows_out(self) -> Int64[Tensor, " pairs"]:
-        """Row that each pair adds to."""
-        pairs = self.neighbours.pairs
-        return pairs.fine if self.is_transposed else pairs.coarse
-
-    @property
     def outputs(self) -> int:
         """Number of voxels written."""
         return self.neighbours.fine_rows if self.is_transposed else self.neighbours.table.shape[1]
@@ -170,10 +299,13 @@ class KernelMap:
         """Row that each slot of (volume, most) reads; one past the last where it is empty."""
         return self.neighbours.coarse_grid if self.is_transposed else self.neighbours.fine_grid
 
-    @property
-    def grid_out(self) -> Int64[Tensor, " slots"]:
-        """Row that each slot adds to; one past the last where it is empty."""
-        return self.neighbours.fine_grid if self.is_transposed else self.neighbours.coarse_grid
+    def by_offset(self) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Give each filled offset with the rows that its pairs read, and those they add to."""
+        pairs = self.neighbours.pairs
+        # Lists of views, each from one call: slicing one by one costs as much as small products.
+        fine, coarse = pairs.fine.split(pairs.counts), pairs.coarse.split(pairs.counts)
+        rows_in, rows_out = (coarse, fine) if self.is_transposed else (fine, coarse)
+        return zip(pairs.filled, rows_in, rows_out, strict=True)
 
     def sum_by_output(self, products: Tensor) -> Tensor:
         """Add up the slots of each output voxel, always in the same order.
@@ -190,12 +322,6 @@ def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
     first = -(kernel // 2) if kernel % 2 else 0
     steps = range(first, first + kernel)
     return tuple((x, y, z) for z in steps for y in steps for x in steps)
-
-
-def _grouped(rows: Tensor, slot: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Give the slots in the order of their row, and where in that order each row begins."""
-    counts = torch.bincount(rows, minlength=count)
-    return slot[torch.argsort(rows, stable=True)], counts.cumsum(0) - counts
 
 
 class CoordinateCache:
@@ -241,13 +367,12 @@ class CoordinateCache:
         assert fine >= 0, f"level {level} has no level {levels} finer"
         key = (fine, kernel, levels)
         if key not in self._neighbours:
-            self._neighbours[key] = self._find_neighbours(*key)
+            assert kernel * 2**fine <= REACH, f"kernel {kernel} at level {fine} reaches too far"
+            if fine not in self._indices:
+                self._indices[fine] = VoxelIndex(self.keys(fine), 2**fine)
+            table = self._indices[fine].find(self.keys(fine + levels), kernel_offsets(kernel))
+            centre = None if levels else kernel**3 // 2
+            self._neighbours[key] = NeighbourTable(
+                table=table, fine_rows=len(self.keys(fine)), centre=centre
+            )
         return KernelMap(neighbours=self._neighbours[key], is_transposed=is_transposed)
-
-    def _find_neighbours(self, fine: int, kernel: int, levels: int) -> NeighbourTable:
-        assert kernel * 2**fine <= REACH, f"kernel {kernel} at level {fine} reaches too far"
-        if fine not in self._indices:
-            self._indices[fine] = VoxelIndex(self.keys(fine), 2**fine)
-        table = self._indices[fine].find(self.keys(fine + levels), kernel_offsets(kernel))
-        centre = None if levels else kernel**3 // 2
-        return NeighbourTable(table=table, fine_rows=len(self.keys(fine)), centre=centre)

@@ -1,0 +1,326 @@
+"""The run folder: metrics, pictures, TensorBoard, the states to resume from, and the card.
+
+::
+
+    config.yaml        every setting (written by the caller)
+    run.json           settings, versions, machine, commit
+    metrics.jsonl      one line each log step
+    pictures/          what validation drew
+    tensorboard/       the same for TensorBoard
+    state.pt           the last state: what ``resume`` reads
+    state.before.pt    the one before it, read where the last is damaged
+"""
+
+import json
+import os
+import shlex
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import torch
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import misfits, read_torch_file
+from depthpose.core.errors import InputError, MissingExtraError, Notice
+from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
+from depthpose.core.files.disk import refused_as, refused_write
+from depthpose.core.files.text import refuse_heavy
+from depthpose.core.loop.task import ValidationResult
+from depthpose.core.run import environment
+
+STATE, BEFORE = "state.pt", "state.before.pt"
+_NEEDED = ("step", "modules", "optimizers", "scaler", "average")
+_METRICS = "metrics.jsonl"
+_PICTURES = "pictures"
+_HELD_OUT = "held_out/"
+"""Begins the names of numbers that validation found."""
+
+
+def run_files(weights: str) -> list[str]:
+    """Name what a training leaves in its folder, with weights of this name."""
+    own = ["config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE]
+    return [*own, *(f"{weights}.{ending}" for ending in ("safetensors", "md", "json"))]
+
+
+class Journal:
+    """Writes one run; only the main process of a training has one that writes."""
+
+    def __init__(self, folder: Path, *, is_writer: bool) -> None:
+        self.folder = folder
+        self.has_good_last = True  # else the state before it is kept when the next is saved
+        self._is_writer = is_writer
+        self._board: Any = None
+
+    def open(self, step: int) -> None:
+        """Begin at ``step``: remove what a killed run left: later lines and partial files."""
+        if not self._is_writer:
+            return
+        for folder in (self.folder, self.folder / _PICTURES):
+            remove_parts(folder)
+        kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
+        with atomic_write(self.folder / _METRICS) as part:
+            part.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        try:
+            from torch.utils.tensorboard.writer import SummaryWriter
+        except ImportError as error:
+            raise MissingExtraError("tensorboard", "train", "training") from error
+        with refused_write(self.folder):
+            self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
+
+    def log(self, step: int, numbers: Mapping[str, float]) -> None:
+        """Append one line of metrics."""
+        if not self._is_writer:
+            return
+        with refused_write(self.folder / _METRICS):
+            with (self.folder / _METRICS).open("a") as file:
+                file.write(json.dumps({"step": step, **numbers}) + "\n")
+            for name, value in numbers.items():
+                self._board.add_scalar(name, value, step)
+
+    def show(self, step: int, result: ValidationResult) -> None:
+        """Write what validation found."""
+        if not self._is_writer:
+            return
+        if result.numbers:
+            self.log(step, result.numbers)
+        for name, picture in result.pictures.items():
+            write_image(self.folder / _PICTURES / f"{step:07d}_{name}.png", picture)
+            with refused_write(self.folder):
+                self._board.add_image(name, picture, step)
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Write the last state, all or nothing; the one until now becomes the one before."""
+        if self._is_writer:
+            write_state(self.folder, state, keeps_last=self.has_good_last)
+            self.has_good_last = True
+
+    def close(self) -> None:
+        """Flush what TensorBoard holds back."""
+        if self._board is not None:
+            with refused_write(self.folder):
+                self._board.close()
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Read the metrics of a run; a last line that a kill cut short is left out.
+
+    Raises:
+        InputError: another line is damaged: no step and numbers by name.
+    """
+    path = folder / _METRICS
+    if not path.is_file():
+        return []
+    rows: list[dict[str, Any]] = []
+    text = read_text(path)
+    refuse_heavy(path, text.encode(), {b"{": 250, b",": 60})  # bytes of memory
+    for number, line in enumerate(StringIO(text), 1):
+        row = None
+        with suppress(ValueError, RecursionError):
+            row = json.loads(line)
+        if (
+            isinstance(row, dict)
+            and isinstance(row.get("step"), int)
+            and all(map(_is_number, row.values()))
+        ):
+            rows.append(row)
+        elif line.endswith("\n"):
+            raise InputError(
+                f"{path}: line {number} is no step with numbers. Delete that line, or the file: it "
+                "holds curves alone, and no training goes on from it."
+            )
+    return rows
+
+
+def _is_number(value: object) -> bool:
+    # A whole number of 2**63 and beyond is no count, and none that is shown.
+    return isinstance(value, float) or (type(value) is int and abs(value) < 2**63)
+
+
+def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
+    """Say what weights of this name are, a line a fact, and in Markdown what was measured."""
+    lines = [f"- **{key.replace('_', ' ').capitalize()}**: {value}" for key, value in facts.items()]
+    return "\n".join([f"# {name}", "", *lines, *(["", measured.strip()] if measured else []), ""])
+
+
+def write_card(
+    weights: Path, words: str, seconds: float, facts: Mapping[str, str], measured: str
+) -> None:
+    """Write ``W.md`` beside the weights: what they are, the command, its time, what was measured.
+
+    Args:
+        weights: the file, in the folder of its run.
+        words: of the command that trains such, as ``depth train view``.
+        seconds: what the training took.
+        facts: of the weights.
+        measured: Markdown; :func:`held_out_text` where validation measured.
+    """
+    folder, here = weights.parent, environment()
+    where = ", ".join(here[name] for name in ("machine", "gpu") if name in here)
+    took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
+    made = {
+        "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
+        "time": f"{_saved_step(folder)} steps in {took} on {where}; {here['date']}",
+    }
+    with atomic_write(weights.with_suffix(".md")) as part:
+        part.write_text(card_text(weights.stem, {**facts, **made}, measured))
+
+
+def held_out_text(folder: Path, sentence: str) -> str:
+    """Show what a run's last validation found; ``sentence``: of what, and what the numbers mean."""
+    lines: list[str] = []
+    for row in read_metrics(folder):
+        measured = {k: value for k, value in row.items() if k.startswith(_HELD_OUT)}
+        if measured:
+            lines = [f"| {k.removeprefix(_HELD_OUT)} | {v:.4g} |" for k, v in measured.items()]
+    if not lines:
+        return "Nothing was held out, so nothing was measured."
+    return "\n".join([sentence, "", "| held out | |", "| --- | --- |", *lines])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parts:
+    """What a state is of: everything of a training that its steps change, by name.
+
+    The scaler's state is empty but in fp16; ``average`` holds moving averages of the weights.
+    """
+
+    modules: Mapping[str, nn.Module]
+    optimizers: Mapping[str, Any]
+    scaler: torch.amp.GradScaler
+    average: Mapping[str, dict[str, Tensor]]
+
+    def state(self) -> dict[str, Any]:
+        """Give what is written."""
+        return {
+            "modules": {name: module.state_dict() for name, module in self.modules.items()},
+            "optimizers": {name: adam.state_dict() for name, adam in self.optimizers.items()},
+            "scaler": self.scaler.state_dict(),
+            "average": dict(self.average),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take everything from a state that fits."""
+        for name, module in self.modules.items():
+            module.load_state_dict(state["modules"][name])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        if self.scaler.is_enabled() and state["scaler"]:
+            self.scaler.load_state_dict(state["scaler"])
+        for name, held in self.average.items():
+            for key, tensor in state["average"][name].items():
+                held[key].copy_(tensor)
+
+    def misfits(self, state: Mapping[str, Any]) -> list[str]:
+        """Say what a state has missing, more, or in another shape."""
+        problems: list[str] = []
+        for name, module in self.modules.items():
+            faults = misfits(module.state_dict(), state["modules"][name])
+            problems += [f"{name}: {fault}" for fault in faults]
+        for name, held in self.average.items():
+            faults = misfits(held, state["average"][name])
+            problems += [f"average of {name}: {fault}" for fault in faults]
+        for name, optimizer in self.optimizers.items():
+            saved = state["optimizers"][name]
+            counts, saved_counts = (
+                [len(group["params"]) for group in groups]
+                for groups in (optimizer.param_groups, saved["param_groups"])
+            )
+            if counts != saved_counts:
+                problems.append(
+                    f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of "
+                    f"{counts}"
+                )
+                continue
+            shapes = [p.shape for group in optimizer.param_groups for p in group["params"]]
+            problems += [
+                f"optimiser of {name}: {key} of parameter {k} is {tuple(value.shape)}, not "
+                f"{tuple(shapes[k])}"
+                for k, values in saved["state"].items()
+                for key, value in values.items()
+                if isinstance(value, Tensor) and value.ndim and value.shape != shapes[k]
+            ]
+        return problems
+
+
+def saved_states(folder: Path) -> list[Path]:
+    """List the states that a folder holds, the last one first."""
+    return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
+
+
+def write_state(folder: Path, state: Mapping[str, Any], *, keeps_last: bool) -> None:
+    """Write the last state, all or nothing; the one until now is kept as the one before."""
+    packed = BytesIO()  # on a full disk torch.save would say anything but that
+    torch.save(dict(state), packed)
+    last, before = folder / STATE, folder / BEFORE
+    with atomic_write(last) as part:
+        part.write_bytes(packed.getbuffer())
+        if keeps_last and last.is_file():
+            before.unlink(missing_ok=True)
+            try:
+                os.link(last, before)  # a second name: there is a last state at any moment
+            except OSError:  # a disk without links
+                with suppress(OSError):
+                    last.replace(before)
+
+
+def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
+    """Go on from the last state, or, where it is damaged, with a notice from the one before it.
+
+    Gives the state that was taken, its step, and the seconds of training until then.
+    """
+    damages: list[str] = []
+    for path in saved_states(folder):
+        try:
+            step, seconds = _restore(path, parts)
+        except InputError as error:
+            damages.append(str(error))
+            continue
+        if path.name != STATE:
+            reason = "; ".join(damages) or f"{folder}: there is no {STATE}"
+            notice = f"{reason}; the training goes on from {path.name}, step {step}"
+            warnings.warn(notice, Notice, stacklevel=2)
+        return path, step, seconds
+    raise InputError(
+        f"{'; '.join(damages)}; no state is left to go on from. Take another folder, whose "
+        "training may 'start' from weights, or delete these states to begin anew"
+    )
+
+
+def _restore(path: Path, parts: Parts) -> tuple[int, float]:
+    state = _read_state(path)
+    with refused_as(path, "state of this training", "it is damaged, or of another training"):
+        if problems := parts.misfits(state):
+            raise InputError(
+                f"{path}: {len(problems)} tensors do not fit this network: "
+                f"{', '.join(problems[:3])}; it is the state of another one"
+            )
+        parts.restore(state)
+        return state["step"], float(state.get("seconds", 0.0))  # older states do not know it
+
+
+def _saved_step(folder: Path) -> int:
+    """Give the step of the last state that is whole; 0 where there is none."""
+    for path in saved_states(folder):
+        with suppress(InputError):
+            return _read_state(path)["step"]
+    return 0
+
+
+def _read_state(path: Path) -> Mapping[str, Any]:
+    with refused_as(path, "state of a training", "it is damaged"), ZipFile(path) as archive:
+        if (part := archive.testzip()) is not None:  # torch reads over flipped bits
+            raise ValueError(f"{part} is not as it was written")
+    state = read_torch_file(path)
+    if missing := [name for name in _NEEDED if name not in state]:
+        raise InputError(f"{path}: has no {missing}, so it is no state of a training")
+    step = state["step"]
+    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+        raise InputError(f"{path}: its step is {step!r}, where a whole number belongs")
+    return state

@@ -1,0 +1,311 @@
+"""FCN: an image to the masks of known objects (Long, Shelhamer and Darrell, CVPR 2015).
+
+The network with its settings, its weights on disk, which hold the names of its objects, what makes
+masks of its answer, and their intersection over union over many images.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, Int64
+from scipy import ndimage
+from torch import Tensor, nn
+
+from depthpose.core.arrays import Image, check_image
+from depthpose.core.checkpoint import (
+    Checkpoint,
+    build_network,
+    find_weights,
+    half_state,
+    read_checkpoint,
+    save_checkpoint,
+    warn_of_terms,
+)
+from depthpose.core.config import config_from_dict, config_to_dict
+from depthpose.core.config_values import check_settings
+from depthpose.core.devices import usable_device
+from depthpose.core.errors import InputError
+from depthpose.pose.resnet import ResNet18, normalise_colors
+
+KIND = "segmentation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationConfig:
+    """The network, how an image is brought to it, and what becomes of its answer."""
+
+    stride: Literal[8, 16, 32] = 8
+    """FCN-8s, 16s or 32s: stride in pixels of the finest features that are used."""
+
+    widths: tuple[int, int, int, int] = (64, 128, 256, 512)
+    """Channels of the encoder's stages; published weights have these."""
+
+    long_side_px: int = 640
+    """Images are brought to this long side before the network, up or down, and the answer is
+    brought back."""
+
+    with_one_instance: bool = True
+    """An image shows each object once: the largest connected part is kept, the others are errors.
+    Else each connected part is an instance."""
+
+    min_share: float = 0.0005
+    """Parts below this share of the image's pixels are no object (150 pixels of 640x480)."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        check_settings(self, widths="[1, inf)", long_side_px="[32, inf)", min_share="[0, 1)")
+
+
+class FCN(nn.Module):
+    """An image to the logits of background and objects at each of its pixels.
+
+    Each level scores classes by a 1x1 convolution; the coarse scores are enlarged twice by a
+    learned convolution that begins bilinear, and added to the next finer ones, which begin at zero
+    (section 4.1 of the paper). The last enlargement, to pixels, is bilinear and fixed.
+    """
+
+    def __init__(self, objects: int, config: SegmentationConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or SegmentationConfig()
+        self.classes = classes = objects + 1
+        self.encoder = ResNet18(widths=config.widths)
+        levels = {8: 3, 16: 2, 32: 1}[config.stride]
+        coarsest_first = config.widths[:0:-1][:levels]
+        self.scores = nn.ModuleList(nn.Conv2d(width, classes, 1) for width in coarsest_first)
+        self.enlarge = nn.ModuleList(
+            nn.ConvTranspose2d(classes, classes, 4, 2, 1, bias=False) for _ in range(levels - 1)
+        )
+        with torch.no_grad():
+            for parameter in self.scores[1:].parameters():
+                parameter.zero_()
+            # An enlargement begins as the bilinear one, each class by itself.
+            ramp, each = torch.tensor([0.25, 0.75, 0.75, 0.25]), torch.arange(classes)
+            for weight in self.enlarge.parameters():
+                weight.zero_()
+                weight[each, each] = ramp[:, None] * ramp
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b classes h w"]:
+        """Give logits, background first; both sides of the image are multiples of 32.
+
+        Colours have ImageNet's mean and spread taken off
+        (``pose.resnet.normalise_colors``).
+        """
+        features = self.encoder(image)[::-1]
+        found = self.scores[0](features[0])
+        for enlarge, score, finer in zip(
+            self.enlarge, self.scores[1:], features[1 : len(self.scores)], strict=True
+        ):
+            found = enlarge(found) + score(finer)
+        size = (image.shape[-2], image.shape[-1])
+        return F.interpolate(found, size, mode="bilinear", align_corners=False)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SegmentationWeights:
+    """What a weights file of this kind holds.
+
+    Attributes:
+        network: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``.
+        objects: names, in the order of the classes.
+        numbers: BOP's ``obj_id`` of each.
+        facts: the card in short: ``trained_on``, ``licence`` and the like.
+    """
+
+    network: FCN
+    objects: tuple[str, ...]
+    numbers: tuple[int, ...]
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        assert len(self.objects) == len(self.numbers) == self.network.classes - 1
+
+
+def write_segmentation(
+    path: Path, weights: SegmentationWeights, *, with_half: bool = False
+) -> None:
+    """Write a network with its config and objects to one ``.safetensors`` file.
+
+    ``with_half`` stores 16-bit floats: half the size.
+    """
+    network = weights.network
+    config = {
+        "network": config_to_dict(network.config),
+        "objects": list(weights.objects),
+        "numbers": list(weights.numbers),
+    }
+    state = half_state(network) if with_half else network.state_dict()
+    save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=weights.facts))
+
+
+def read_segmentation(path: Path) -> SegmentationWeights:
+    """Read what :func:`write_segmentation` wrote.
+
+    Raises:
+        InputError: no such weights, or weights that do not fit their own config.
+    """
+    checkpoint = read_checkpoint(path, KIND)
+    config = config_from_dict(checkpoint.config, _FileConfig, source=str(path))
+    if len(config.objects) != len(config.numbers) or not config.objects:
+        raise InputError(
+            f"{path}: its config names {len(config.objects)} objects and {len(config.numbers)} "
+            "numbers; each object has both. Export it again."
+        )
+    network = build_network(lambda: FCN(len(config.objects), config.network), checkpoint, str(path))
+    return SegmentationWeights(network=network.eval(), objects=config.objects,
+                               numbers=config.numbers, facts=checkpoint.facts)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _FileConfig:
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)
+    objects: tuple[str, ...] = ()
+    numbers: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Segmentation:
+    """What one image shows.
+
+    Attributes:
+        masks: of the instances of each object that was found, the surest first; an object that was
+            not found has no entry.
+        scores: mean probability of the object over each of those masks, 0..1.
+    """
+
+    masks: Mapping[str, Bool[Tensor, "n h w"]]
+    scores: Mapping[str, Float[Tensor, " n"]]
+
+    def best(self, object: str) -> Bool[Tensor, "h w"] | None:
+        """Give the surest mask of an object; None where it was not found."""
+        found = self.masks.get(object)
+        return None if found is None else found[0]
+
+
+class Segmenter:
+    """Finds known objects in an image: sizes, colours and connected parts are its concern.
+
+    ::
+
+        masks = Segmenter.load("segmentation.safetensors").segment(image).masks
+    """
+
+    def __init__(self, weights: SegmentationWeights, device: torch.device | str = "cpu") -> None:
+        self.weights = weights
+        self.device = usable_device(device)
+        self._network = weights.network.eval().to(self.device)
+
+    @classmethod
+    def load(cls, name: str | Path, device: torch.device | str = "cpu") -> "Segmenter":
+        """Load weights by path, or by the name of weights that came with the package.
+
+        Raises:
+            InputError: there is no such file, or it holds something else.
+        """
+        weights = read_segmentation(find_weights(name))
+        warn_of_terms(weights.facts)
+        return cls(weights, device)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of what it knows."""
+        return self.weights.objects
+
+    def segment(self, image: Image) -> Segmentation:
+        """Find the objects of an image of any size, a tensor of RGB in [0, 1] (not OpenCV's BGR).
+
+        Raises:
+            InputError: it is no such image.
+        """
+        check_image(image, "the image")
+        probability = class_probabilities(self._network, image)
+        label = probability.argmax(0)
+        config = self._network.config
+        masks: dict[str, Tensor] = {}
+        scores: dict[str, Tensor] = {}
+        for number, name in enumerate(self.objects, 1):
+            parts = connected_parts(label == number, config)
+            if len(parts):
+                score = torch.stack([probability[number][part].mean() for part in parts])
+                order = score.argsort(descending=True)
+                masks[name], scores[name] = parts[order], score[order]
+        return Segmentation(masks=masks, scores=scores)
+
+
+@torch.no_grad()
+def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
+    """Give the probability of background and objects at each pixel of an image of any size.
+
+    The image is brought to the network's long side, both sides padded at the bottom and right to
+    multiples of 32 by its last rows and columns; the logits are cut and brought back.
+    """
+    device = next(network.parameters()).device
+    height, width = image.shape[-2:]
+    scale = network.config.long_side_px / max(height, width)
+    size = tuple(max(1, math.floor(side * scale + 0.5)) for side in (height, width))
+    small = resize_image(image.to(device), (size[0], size[1]))
+    bottom, right = (-side % 32 for side in size)
+    padded = F.pad(normalise_colors(small)[None], (0, right, 0, bottom), mode="replicate")
+    logits = network(padded)[..., : size[0], : size[1]]
+    logits = F.interpolate(logits, (height, width), mode="bilinear", align_corners=False)
+    return logits[0].float().softmax(0).cpu()
+
+
+def resize_image(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 rows columns"]:
+    """Resize an image to (rows, columns), averaging where it shrinks."""
+    if tuple(image.shape[-2:]) == size:
+        return image
+    return F.interpolate(image[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+
+def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:
+    """Split a mask into parts whose pixels touch; those that are large enough.
+
+    With one instance an image, the largest alone.
+    """
+    label, pixels = label_parts(mask)
+    least = max(1, math.ceil(config.min_share * mask.numel()))
+    large = (pixels >= least).nonzero()[:, 0]
+    if config.with_one_instance and len(large):
+        large = pixels.argmax()[None]
+    return label == large[:, None, None]
+
+
+def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[Tensor, " n"]]:
+    """Number the parts of a mask whose pixels touch, at corners too.
+
+    Returns:
+        The number of each pixel's part, 0 beside the mask; and by number how many pixels a part
+        has, 0 for number 0.
+    """
+    numbered = np.empty(mask.shape, np.int32)
+    ndimage.label(mask.cpu().numpy(), structure=[[1] * 3] * 3, output=numbered)
+    label = torch.from_numpy(numbered).long()
+    pixels = torch.bincount(label.flatten(), minlength=1)
+    pixels[0] = 0
+    return label, pixels
+
+
+class Overlap:
+    """Counts pixels of each class (background, objects) found, true and both, over all images."""
+
+    def __init__(self, classes: int) -> None:
+        self.both = torch.zeros(classes, dtype=torch.int64)
+        self.either = torch.zeros(classes, dtype=torch.int64)
+
+    def add(self, found: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"]) -> None:
+        """Count one image, or a batch."""
+        classes = len(self.both)
+        pairs = (truth * classes + found).flatten().cpu()
+        table = torch.bincount(pairs, minlength=classes**2).view(classes, classes)
+        self.both += table.diagonal()
+        self.either += table.sum(0) + table.sum(1) - table.diagonal()
+
+    def iou(self) -> Float[Tensor, " classes"]:
+        """Intersection over union of each class; NaN for one that is neither found nor true."""
+        return torch.where(self.either > 0, self.both / self.either, torch.nan)
