@@ -68,7 +68,12 @@ def test_a_mask_grows_and_shrinks_by_pixels() -> None:
 
 
 def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SensorConfig:
-    return SensorConfig(kinds=(kind,), noise=(noise, noise), missing=(missing, missing))  # pyright: ignore[reportArgumentType]
+    return SensorConfig(
+        kinds=(kind,),  # pyright: ignore[reportArgumentType]
+        noise=(noise, noise),
+        missing=(missing, missing),
+        offset_m=(0.0, 0.0),
+    )
 
 
 def test_structured_light_reads_whole_steps_of_disparity() -> None:
