@@ -15,7 +15,7 @@ from tests.synthetic_street import make_street
 from depthpose.cli import main
 from depthpose.cli.depth.evaluating import signed
 from depthpose.cli.depth.methods import Method
-from depthpose.cli.thesis.depth_tables import TableSpec, reproduce_table, write_figure
+from depthpose.cli.thesis.depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image
@@ -77,13 +77,11 @@ def reproduce(table: str, street: Path, out: Path, *more: str) -> int:
     return main([*given, *CAMERA_Z, *more])
 
 
-def order_of(table: str, street: Path, caps_m: tuple[float, ...] = (80.0, 50.0)) -> TableSpec:
-    return TableSpec(
-        table=find_table(table),
-        dataset=open_dataset(street),
-        protocol="eigen-raw-camera",
-        caps_m=caps_m,
-        pictures=1,
+def write_table(number: str, street: Path, methods: list[tuple[str, Method]], out: Path) -> int:
+    caps_m, pictures = (80.0, 50.0), 1
+    data = open_dataset(street)
+    return reproduce_table(
+        find_table(number), data, methods, out, "eigen-raw-camera", caps_m, pictures
     )
 
 
@@ -182,9 +180,9 @@ def test_baselines_know_the_street_they_were_fitted_to(
 
 
 def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path) -> None:
-    order = order_of("2.3", street)
-    chosen = list(zip(order.table.own, (mono("apart", 20.0), mono("tuned", 10.0)), strict=True))
-    assert reproduce_table(order, chosen, tmp_path) == 0
+    methods = (mono("apart", 20.0), mono("tuned", 10.0))
+    chosen = list(zip(find_table("2.3").own, methods, strict=True))
+    assert write_table("2.3", street, chosen, tmp_path) == 0
     rows = [row for row in rows_of(tmp_path) if row["cap_m"] == 80]
     names = [(row["source"], row["method"], row["weights"]) for row in rows]
     assert names == [
@@ -203,7 +201,7 @@ def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path
 
 def test_a_method_of_one_image_is_never_shown_the_right_view(street: Path, tmp_path: Path) -> None:
     method = mono("w", 15.0)
-    reproduce_table(order_of("2.1", street), [("thesis, Ours", method)], tmp_path)
+    write_table("2.1", street, [("thesis, Ours", method)], tmp_path)
     assert isinstance(method.net, FlatMono)
     assert method.net.seen == ["left"] * 4 + ["both"]  # the last one is figure 2-1's upper bound
 

@@ -4,7 +4,8 @@ import torch
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.thesis.depth_figures import Panel, arrange, draw_figure_2_1, draw_figure_2_5
+from depthpose.report.tables import Drawing
+from depthpose.thesis.depth_figures import arrange, draw_figure_2_1, draw_figure_2_5
 
 H, W = 20, 60
 
@@ -75,7 +76,7 @@ def test_what_figure_2_1_cannot_show_is_said(
 def test_panels_stand_where_they_belong() -> None:
     red, green = torch.zeros(3, 10, 20), torch.zeros(3, 12, 20)
     red[0], green[1] = 1.0, 1.0
-    columns = [[Panel(caption="", image=red)] * 2, [Panel(caption="", image=green)]]
+    columns = [[Drawing(caption="", image=red)] * 2, [Drawing(caption="", image=green)]]
     grid = arrange(columns, width_px=20)
     assert grid.shape == (3, 12 + 8 + 10 + 8 + 18, 48)
     assert grid[:, 5, 5].tolist() == grid[:, 25, 5].tolist() == [1, 0, 0]
@@ -84,7 +85,7 @@ def test_panels_stand_where_they_belong() -> None:
 
 
 def test_the_bar_runs_from_near_to_far() -> None:
-    grid = arrange([[Panel(caption="", image=torch.ones(3, 4, 40))]], width_px=40)
+    grid = arrange([[Drawing(caption="", image=torch.ones(3, 4, 40))]], width_px=40)
     ends = draw_depth(torch.tensor([[3.0, 80.0]]))
     assert torch.allclose(grid[:, -1, 0], ends[:, 0, 0], atol=1e-3)
     assert torch.allclose(grid[:, -1, -1], ends[:, 0, 1], atol=1e-3)

@@ -18,10 +18,12 @@ from depthpose.thesis.pose_tables import (
     LINEMOD,
     LINEMOD_DIAMETERS_M,
     ROWS,
+    VotingCase,
+    cases_of,
+    compare_voting,
     join_by_object,
     linemod_number,
 )
-from depthpose.thesis.voting import VotingCase, cases_of, compare_voting
 
 
 def test_printed_means_are_those_of_the_printed_numbers() -> None:

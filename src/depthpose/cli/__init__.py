@@ -100,7 +100,7 @@ COMMANDS = {
     "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
     "reproduce": (
-        "thesis.reproduce:reproduce",
+        "thesis.commands:reproduce",
         "a table of chapter 2: published rows, ours, difference",
     ),
     "reproduce all": (
@@ -108,18 +108,18 @@ COMMANDS = {
         "all tables of a chapter, trainings included, from KITTI or LineMOD on disk",
     ),
     "reproduce 3.1": (
-        "thesis.reproduce_pose:table_3_1",
+        "thesis.commands:table_3_1",
         "the method beside its baselines, by object",
     ),
     "reproduce 3.2": (
-        "thesis.reproduce_pose:table_3_2",
+        "thesis.commands:table_3_2",
         "LineMOD: published rows, ours, difference",
     ),
-    "reproduce 3.3": ("thesis.reproduce_pose:table_3_3", "RANSAC against least squares"),
-    "figure": ("thesis.reproduce:figure", "a figure of chapter 2 from your frames and weights"),
-    "figure 3-2": ("thesis.figures:figure_3_2", "features of points in one colour scale (t-SNE)"),
-    "figure 3-4": ("thesis.figures:figure_3_4", "true and predicted directions to a keypoint"),
-    "figure 3-5": ("thesis.figures:figure_3_5", "boxes of true and estimated poses"),
+    "reproduce 3.3": ("thesis.commands:table_3_3", "RANSAC against least squares"),
+    "figure": ("thesis.commands:figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": ("thesis.commands:figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": ("thesis.commands:figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("thesis.commands:figure_3_5", "boxes of true and estimated poses"),
 }
 _REMOVED_OPTIONS = {
     ("export", "--format"): "ONNX is the one format; omit --format",

@@ -27,21 +27,14 @@ def choose_answers(is_ok: Sequence[bool], most: int = MOST_VIEWS) -> list[int]:
 
 
 def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int]]:
-    """Choose the worst, the median and the best, in this order; give each place once.
-
-    Args:
-        errors: finite.
-        most: that many of the three at most.
-    """
-    if not errors:
-        return []
+    """Choose the worst, the median and the best of finite errors; at most so many, each once."""
     order = sorted(range(len(errors)), key=errors.__getitem__)
-    places = {"worst": order[-1], "median": order[(len(order) - 1) // 2], "best": order[0]}
-    if len(order) == 1:
-        return [("only", order[0])][:most]
+    if len(order) <= 1:
+        return [("only", place) for place in order][:most]
+    places = [("worst", order[-1]), ("median", order[(len(order) - 1) // 2]), ("best", order[0])]
     if len(order) == 2:
-        del places["median"]
-    return list(places.items())[:most]
+        del places[1]
+    return places[:most]
 
 
 def share_views(sets: int) -> list[int]:

@@ -36,12 +36,9 @@ _TRUE_POINTS = 20_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthError:
-    """How far an estimate is from the truth, pixel by pixel; NaN where nothing is compared.
+    """How far an estimate is from the truth: pixels of disparity, or depth as a share of the truth.
 
-    Attributes:
-        error: pixels of disparity, or depth as a share of the truth.
-        is_disparity: which of the two.
-        true_depth_m: the truth, to be shown too; None: it is not.
+    NaN where nothing is compared. ``true_depth_m`` is shown too, where it is given.
     """
 
     error: Float[Tensor, "h w"]
@@ -51,14 +48,7 @@ class DepthError:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthShown:
-    """An estimate as a page shows it.
-
-    Attributes:
-        pair: what was seen.
-        estimate: what was made of it.
-        range_m: metres of the brightest and the darkest colour.
-        error: where the truth is known.
-    """
+    """An estimate as a page shows it, its colours from bright to dark over ``range_m``."""
 
     pair: StereoInput
     estimate: DepthEstimate
@@ -70,25 +60,38 @@ def depth_section(
     title: str, shown: DepthShown, text: str = "", *, with_image: bool = True
 ) -> Section:
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D."""
-    seen = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
-    own = [_map_drawing(shown), *_error_drawings(shown), *_other_drawings(shown.estimate)]
-    return Section(
-        title=title,
-        text=text,
-        facts=depth_facts(shown.pair, shown.estimate),
-        pictures=[*seen, *own],
-        scenes=_scenes(title, shown),
-    )
+    estimate = shown.estimate
+    pictures = [Drawing(image=shown.pair.left, caption="image")] if with_image else []
+    if estimate.depth_m is None:
+        disparity = Drawing(
+            image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
+            caption=f"estimated disparity, large (near) bright; {grey_caption(estimate)}",
+            scale=rising_scale("disparity [px]", 96.0, has_more=True),
+        )
+        pictures.append(disparity)
+    else:
+        depth = Drawing(
+            image=draw_depth(estimate.depth_m, *shown.range_m),
+            caption=f"estimated depth, near bright and far dark; {grey_caption(estimate)}",
+            scale=depth_scale(*shown.range_m),
+        )
+        pictures.append(depth)
+    pictures += _error_drawings(shown)
+    if estimate.confidence is not None:
+        confidence = Drawing(
+            image=draw_share(1 - estimate.confidence),
+            caption="confidence: bright is sure, dark a guess",
+            scale=rising_scale("confidence", 1.0),
+        )
+        pictures.append(confidence)
+    if estimate.right is not None:
+        pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
+    facts, scenes = depth_facts(shown.pair, estimate), _scenes(title, shown)
+    return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
 def depth_facts(pair: StereoInput, found: DepthEstimate, focal: str = "") -> list[tuple[str, str]]:
-    """Say the sizes and the metres of an estimate.
-
-    Args:
-        pair: what was seen.
-        found: what was made of it.
-        focal: words behind the focal length.
-    """
+    """Say the sizes and the metres of an estimate; ``focal``: words behind the focal length."""
     camera, depth_m = pair.camera, found.depth_m
     height, width = pair.left.shape[1:]
     facts = [("size", f"{width} x {height} px")]
@@ -128,63 +131,34 @@ def depth_scene(
     )
 
 
-def _map_drawing(shown: DepthShown) -> Drawing:
-    found = shown.estimate
-    if found.depth_m is None:
-        return Drawing(
-            image=draw_disparity(found.disparity_px, is_sky=found.is_sky),
-            caption=f"estimated disparity, large (near) bright; {grey_caption(found)}",
-            scale=rising_scale("disparity [px]", 96.0, has_more=True),
-        )
-    return Drawing(
-        image=draw_depth(found.depth_m, *shown.range_m),
-        caption=f"estimated depth, near bright and far dark; {grey_caption(found)}",
-        scale=depth_scale(*shown.range_m),
-    )
-
-
-def _other_drawings(found: DepthEstimate) -> list[Drawing]:
-    drawings: list[Drawing] = []
-    if found.confidence is not None:
-        drawings.append(
-            Drawing(
-                image=draw_share(1 - found.confidence),
-                caption="confidence: bright is sure, dark a guess",
-                scale=rising_scale("confidence", 1.0),
-            )
-        )
-    if found.right is not None:
-        drawings.append(Drawing(image=found.right, caption="right view as drawn"))
-    return drawings
-
-
 def _error_drawings(shown: DepthShown) -> list[Drawing]:
     """Draw the truth where it is to be shown, and the error."""
     if shown.error is None:
         return []
-    error, left, true_m = shown.error, shown.pair.left, shown.error.true_depth_m
-    is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE
+    error, left, true_m = shown.error.error, shown.pair.left, shown.error.true_depth_m
+    is_sparse = float(error.isfinite().double().mean()) < _SPARSE
     where = "over the dimmed image" if is_sparse else "grey: not compared"
-    top = WORST_PX if error.is_disparity else WORST_SHARE
-    what = "disparity error" if error.is_disparity else "depth error as a share of the truth"
-    bar = ("disparity error [px]", top) if error.is_disparity else ("depth error [%]", 100 * top)
-    image = (
-        draw_error_points(left, error.error, top, _RADIUS_PX)
-        if is_sparse
-        else draw_share(1 - error.error / top)
-    )
+    if shown.error.is_disparity:
+        top, what = WORST_PX, "disparity error"
+        scale = rising_scale("disparity error [px]", top, has_more=True)
+    else:
+        top, what = WORST_SHARE, "depth error as a share of the truth"
+        scale = rising_scale("depth error [%]", 100 * top, has_more=True)
+    if is_sparse:
+        image = draw_error_points(left, error, top, _RADIUS_PX)
+    else:
+        image = draw_share(1 - error / top)
     caption = f"{what}: dark is right, bright is wrong; {where}"
-    drawing = Drawing(image=image, caption=caption, scale=rising_scale(*bar, has_more=True))
+    drawing = Drawing(image=image, caption=caption, scale=scale)
     if true_m is None:
         return [drawing]
     near_m, far_m = shown.range_m
-    truth = (
-        draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
-        if is_sparse
-        else draw_depth(true_m, near_m, far_m)
-    )
-    bar = depth_scale(near_m, far_m)
-    return [Drawing(image=truth, caption=f"true depth; {where}", scale=bar), drawing]
+    if is_sparse:
+        image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
+    else:
+        image = draw_depth(true_m, near_m, far_m)
+    scale = depth_scale(near_m, far_m)
+    return [Drawing(image=image, caption=f"true depth; {where}", scale=scale), drawing]
 
 
 def _scenes(title: str, shown: DepthShown) -> list[Scene]:

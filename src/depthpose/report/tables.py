@@ -13,7 +13,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
 from depthpose.core.draw import Scale, shrink_to_pixels
-from depthpose.core.files import atomic_write, encode_image, image_size, read_image, write_json
+from depthpose.core.files import encode_image, image_size, read_image, write_json
+from depthpose.core.files.disk import write_bytes
 from depthpose.report.scene import Scene, page_file
 
 Row = Mapping[str, Any]
@@ -72,16 +73,9 @@ class Drawing:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page, in this order.
+    """A part of a page, in this order: its heading, a paragraph, names and values, pictures.
 
-    Attributes:
-        title: its heading.
-        text: a paragraph.
-        facts: names and values.
-        pictures: beside each other.
-        rows: a table that sorts.
-        tables: small tables by what they show, rows of equal length.
-        scenes: 3D views.
+    Then a table that sorts, small tables by what they show (rows of equal length), and 3D views.
     """
 
     title: str
@@ -96,30 +90,26 @@ class Section:
 def table_files(*names: str) -> list[str]:
     """Name the files that :func:`write_table` writes."""
     return [
-        f"{stem}.{ending}"
+        file
         for name in names
-        for stem, ending in ((name, "json"), (name, "csv"), (_markdown_name(name), "md"))
+        for file in (f"{name}.json", f"{name}.csv", f"{'table' if name == 'rows' else name}.md")
     ]
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
     """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
-    write_json(folder / f"{name}.json", [dict(row) for row in rows])
-    with atomic_write(folder / f"{name}.csv") as temporary:
-        temporary.write_text(csv_table(rows), encoding="utf-8", errors="backslashreplace")
-    with atomic_write(folder / f"{_markdown_name(name)}.md") as temporary:
-        temporary.write_text(markdown_table(rows), encoding="utf-8", errors="backslashreplace")
+    as_json, as_csv, as_markdown = table_files(name)
+    write_json(folder / as_json, [dict(row) for row in rows])
+    _write_text(folder / as_csv, csv_table(rows))
+    _write_text(folder / as_markdown, markdown_table(rows))
 
 
-def _markdown_name(name: str) -> str:
-    return "table" if name == "rows" else name
+def _write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
-    """Format rows as a Markdown table, columns in order of their first appearance.
-
-    No rows are the word none.
-    """
+    """Format rows as a Markdown table, columns by first appearance; no rows are the word none."""
     if not rows:
         return "none\n"
     names = column_names(rows)
@@ -129,11 +119,9 @@ def markdown_table(rows: Sequence[Row]) -> str:
 
 
 def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
-    """Format rows for a terminal, in columns of their own width; columns without a value go.
+    """Format rows for a terminal, in columns of their own width: all, or those of some names.
 
-    Args:
-        rows: to be shown.
-        names: of the columns, where not all are wanted; one that no row has is left out.
+    Columns without a value are left out.
     """
     wanted = [
         n for n in names or column_names(rows) if any(row.get(n) not in (None, "") for row in rows)
@@ -164,8 +152,7 @@ def write_markdown(
         parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
         parts += [markdown_table(section.rows)] if section.rows else []
     parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8", errors="backslashreplace")
+    _write_text(path, "\n".join(parts))
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
@@ -189,11 +176,7 @@ def write_page(
 ) -> None:
     """Write one HTML file that shows the sections and needs no network and no other file.
 
-    Args:
-        path: the page.
-        title: its heading.
-        sections: shown in order.
-        environment: what the numbers were measured with (see ``core.run.environment``).
+    ``environment``: what the numbers were measured with (see ``core.run.environment``).
     """
     pages = Environment(
         loader=PackageLoader("depthpose.report", "."),
@@ -206,5 +189,4 @@ def write_page(
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )
-    with atomic_write(path) as temporary:
-        temporary.write_text(html, encoding="utf-8", errors="backslashreplace")
+    _write_text(path, html)

@@ -1,16 +1,17 @@
 """Figures 2-1 and 2-5 of the thesis: the same scene seen, synthesised, estimated and measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.draw import Scale, depth_scale, draw_depth, draw_points
+from depthpose.core.draw import depth_scale, draw_depth, draw_points
 from depthpose.core.errors import InputError
 from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.report.tables import Drawing
 
 _NEAR_M, _FAR_M = 3.0, 80.0
 _GAP_PX = 8
@@ -22,40 +23,20 @@ DEPTH_SCALE = (
 """What the colours mean; the bar below a grid runs from near to far."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Panel:
-    """One picture of a figure.
-
-    Attributes:
-        caption: what it shows.
-        image: the picture, at the size of the frame.
-        scale: what its colours mean, where they are metres.
-    """
-
-    caption: str
-    image: Float[Tensor, "3 h w"]
-    scale: Scale | None = None
-
-
 def draw_figure_2_5(
     pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, estimate: DepthEstimate
-) -> list[Panel]:
+) -> list[Drawing]:
     """Make a column of figure 2-5: left, real right, predicted depth, predicted right, LiDAR.
 
     The predicted right view is left out where a real one was matched, and each of the real right
-    view and the LiDAR where the frame has none.
-
-    Args:
-        pair: the frame.
-        lidar_m: one scan drawn into the left image, NaN where no point falls.
-        estimate: what is shown of it.
+    view and the LiDAR (one scan drawn into the left image, NaN elsewhere) where there is none.
     """
-    panels = [Panel(caption="left image", image=pair.left)]
+    panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:
-        panels.append(Panel(caption="real right image", image=pair.right))
+        panels.append(Drawing(caption="real right image", image=pair.right))
     panels.append(_depth("predicted depth", pair, estimate))
     if estimate.right is not None:
-        panels.append(Panel(caption="predicted right image", image=estimate.right))
+        panels.append(Drawing(caption="predicted right image", image=estimate.right))
     return panels + _lidar(pair, lidar_m)
 
 
@@ -64,7 +45,7 @@ def draw_figure_2_1(
     lidar_m: Float[Tensor, "h w"] | None,
     mono: DepthEstimate,
     stereo: DepthEstimate,
-) -> list[Panel]:
+) -> list[Drawing]:
     """Make the six panels of figure 2-1, in its order.
 
     Args:
@@ -80,23 +61,17 @@ def draw_figure_2_1(
         lacking = "the frame has no right view" if pair.right is None else "no view was synthesised"
         raise InputError(f"{pair.name}: figure 2-1 compares two right views, but {lacking}.")
     return [
-        Panel(caption="(a) left image", image=pair.left),
-        Panel(caption="(b) real right image", image=pair.right),
-        Panel(caption="(c) synthesised right image", image=mono.right),
+        Drawing(caption="(a) left image", image=pair.left),
+        Drawing(caption="(b) real right image", image=pair.right),
+        Drawing(caption="(c) synthesised right image", image=mono.right),
         _depth("(d) depth from left and synthesised right", pair, mono),
         _depth("(e) depth from left and real right", pair, stereo),
         *(replace(panel, caption=f"(f) {panel.caption}") for panel in _lidar(pair, lidar_m)),
-    ]  # fmt: skip
+    ]
 
 
-def arrange(
-    columns: Sequence[Sequence[Panel]], width_px: int = 621
-) -> Float[Tensor, "3 height width"]:
-    """Lay panels out side by side on white, each column from top to bottom, over the depth scale.
-
-    Args:
-        columns: panels of each column.
-        width_px: width of a column; panels keep their proportions.
+def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[Tensor, "3 h w"]:
+    """Lay panels out on white in columns ``width_px`` wide, over the depth scale.
 
     Raises:
         InputError: there is no panel.
@@ -119,19 +94,19 @@ def arrange(
     return canvas
 
 
-def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Panel:
+def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
     image = draw_depth(estimate.depth_m, _NEAR_M, _FAR_M)
-    return Panel(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
+    return Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
 
 
-def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Panel]:
+def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Drawing]:
     if lidar_m is None:
         return []
     # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.
     image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=2)
-    return [Panel(caption="LiDAR", image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
+    return [Drawing(caption="LiDAR", image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
 
 
 def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:

@@ -1,10 +1,13 @@
-"""Figures 3-2 (features as colours on the posed cloud) and 3-4 (directions to a keypoint)."""
+"""Figures 3-2 (features as colours on the posed cloud) and 3-4 (directions to a keypoint).
+
+Features become colours by exact t-SNE onto a line (van der Maaten, Hinton 2008).
+"""
 
 import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -34,11 +37,6 @@ def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     return torch.lerp(anchors[below], anchors[below + 1], (position - below)[:, None])
 
 
-def blank(height: int, width: int) -> Float[Tensor, "3 h w"]:
-    """Give an empty white picture."""
-    return torch.ones(3, height, width)
-
-
 def arrange_grid(
     pictures: Sequence[Float[Tensor, "3 _ _"]], columns: int
 ) -> Float[Tensor, "3 h w"]:
@@ -53,7 +51,7 @@ def arrange_grid(
     width = max(picture.shape[2] for picture in pictures)
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
-    grid = blank(rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX)
+    grid = torch.ones(3, rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX)
     for k, picture in enumerate(pictures):
         top, left = (k // columns) * (height + _GAP_PX), (k % columns) * (width + _GAP_PX)
         grid[:, top : top + picture.shape[1], left : left + picture.shape[2]] = picture
@@ -66,13 +64,9 @@ def draw_discs(
     colors: Float[Tensor, "n 3"],
     radius_px: float,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw points as discs.
+    """Draw points as discs on a copy of a picture, colours as RGB in [0, 1].
 
-    Args:
-        image: what they are drawn on; it is not changed.
-        places: (u, v) in pixels, and the distance: near ones cover far ones.
-        colors: RGB in [0, 1].
-        radius_px: of each disc.
+    ``places`` are (u, v) in pixels and the distance: near ones cover far ones.
     """
     height, width = image.shape[1:]
     reach = int(radius_px) + 1
@@ -102,11 +96,9 @@ _TURN_RAD, _TILT_RAD = math.radians(35), math.radians(20)
 def seen_points(
     net: GeoPoseNet, given: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
-    """Give the points that the network sees of an input, and its features of them.
+    """Give the points that the network sees, in the camera frame, and its features of them.
 
-    Returns:
-        Points in the camera frame, and the features before the last layer; None where the input
-        cannot be posed.
+    The features are those before the last layer; None where the input cannot be posed.
 
     Raises:
         InputError: the weights are of another kind.
@@ -119,7 +111,7 @@ def seen_points(
     if isinstance(prepared, Refusal):
         return None
     grid = prepared.voxels
-    rows = torch.cat([torch.zeros_like(grid.coordinates[:, :1]), grid.coordinates], 1)
+    rows = torch.nn.functional.pad(grid.coordinates, (1, 0))
     voxels = Voxels.from_points(rows, grid.features)
     return prepared.points_m, network.point_features(voxels).float()
 
@@ -130,31 +122,14 @@ def draw_features(
     model: ObjectModel,
     size_px: int = 400,
 ) -> Float[Tensor, "3 size size"]:
-    """Draw a cloud in the frame of its model, which is black.
+    """Draw a cloud in the frame of its model, which is black, each point's share as its colour.
 
     Looked at along parallel lines from the side that the cloud was seen from, so that the model
     does not occlude it; the model's z axis is up.
-
-    Args:
-        points_m: in the model frame.
-        share: 0..1 for each point: its colour in the Spectral scale.
-        model: the object.
-        size_px: side of the picture.
     """
     surface_m = sample_surface(model, _SURFACE)[0].double()
     middle_m = (surface_m.amin(0) + surface_m.amax(0)) / 2
-    view = _view_of(points_m.double() - middle_m)
-    scale = size_px / (_MARGIN * model.diameter_m)
-    image = blank(size_px, size_px)
-    black = torch.zeros(len(surface_m), 3)
-    image = draw_discs(image, _places(surface_m - middle_m, view, scale, size_px), black, 1.0)
-    places = _places(points_m.double() - middle_m, view, scale, size_px)
-    return draw_discs(image, places, spectral(share), max(2.0, size_px / 110))
-
-
-def _view_of(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
-    """Rows: right, down and forward of a view from the side where the points lie."""
-    out = points.mean(0)
+    out = (points_m.double() - middle_m).mean(0)  # the side that the cloud was seen from
     azimuth = math.atan2(float(out[1]), float(out[0])) + _TURN_RAD
     level = math.hypot(float(out[0]), float(out[1]))
     tilt = math.atan2(float(out[2]), level) * 0.5 + _TILT_RAD
@@ -162,14 +137,16 @@ def _view_of(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
         math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt),
     ], dtype=torch.float64)  # fmt: skip
     right = torch.tensor([-math.sin(azimuth), math.cos(azimuth), 0.0], dtype=torch.float64)
-    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+    view_from_model = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    scale = size_px / (_MARGIN * model.diameter_m)
+    centre_px = torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
 
+    def places(of_m: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        return (of_m - middle_m) @ view_from_model.T * scale + centre_px
 
-def _places(
-    points: Float[Tensor, "n 3"], view: Float[Tensor, "3 3"], scale: float, size_px: int
-) -> Float[Tensor, "n 3"]:
-    seen = points @ view.T * scale
-    return seen + torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
+    image, black = torch.ones(3, size_px, size_px), torch.zeros(len(surface_m), 3)
+    image = draw_discs(image, places(surface_m), black, 1.0)
+    return draw_discs(image, places(points_m.double()), spectral(share), max(2.0, size_px / 110))
 
 
 _ARROWS = 220
@@ -187,15 +164,9 @@ def draw_field(
 ) -> Float[Tensor, "3 size size"]:
     """Draw directions of some points; a yellow star at the true keypoint, a red cross at the voted.
 
-    An arrow is as long as its direction lies in the plane: one that points away from the viewer is
-    short. The part that is shown holds the cloud and both keypoints.
-
-    Args:
-        points_m: in the camera frame.
-        directions: of unit length, one a point.
-        true_m: the keypoint, in the camera frame.
-        voted_m: the voted keypoints.
-        size_px: side of the picture.
+    All are in the camera frame, directions of unit length. An arrow is as long as its direction
+    lies in the plane: one that points away from the viewer is short. The part that is shown holds
+    the cloud and both keypoints.
     """
     marks = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
     plane = points_m.double()[:, :2]
@@ -209,21 +180,21 @@ def draw_field(
 
     chosen = take_evenly(torch.arange(len(plane)), _ARROWS)
     starts = place(plane[chosen])
-    image = _draw_arrows(blank(size_px, size_px), starts, directions.double()[chosen, :2])
-    image = _draw_star(image, place(marks[:1])[0])
-    return image if voted_m is None else _draw_cross(image, place(marks[1:])[0])
-
-
-def _draw_arrows(
-    image: Float[Tensor, "3 h w"], starts: Float[Tensor, "m 2"], ways: Float[Tensor, "m 2"]
-) -> Float[Tensor, "3 h w"]:
-    shafts = _ARROW_PX * ways
-    tips = starts + shafts
+    shafts = _ARROW_PX * directions.double()[chosen, :2]
+    tips, across = starts + shafts, torch.stack([-shafts[:, 1], shafts[:, 0]], 1)
     lines = [torch.stack([starts, tips], 1)]
     for side in (-1.0, 1.0):
-        across = side * torch.stack([-shafts[:, 1], shafts[:, 0]], 1)
-        lines.append(torch.stack([tips, tips - _HEAD * shafts + 0.5 * _HEAD * across], 1))
-    return draw_lines(image, torch.cat(lines), _INK, width_px=1)
+        barbs = tips - _HEAD * shafts + 0.5 * _HEAD * side * across
+        lines.append(torch.stack([tips, barbs], 1))
+    image = draw_lines(torch.ones(3, size_px, size_px), torch.cat(lines), _INK, width_px=1)
+    image = _draw_star(image, place(marks[:1])[0])
+    if voted_m is None:
+        return image
+    at = place(marks[1:])
+    arms = torch.tensor([[[-9.0, -9], [9, 9]], [[-9, 9], [9, -9]]], dtype=torch.float64)
+    image = draw_lines(image, at + arms * 1.2, (1.0, 1.0, 1.0), width_px=6)
+    image = draw_lines(image, at + arms, _RED, width_px=4)
+    return draw_discs(image, torch.cat([at, torch.zeros(1, 1)], 1), torch.tensor([_RED]), 2.0)
 
 
 def _draw_star(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[Tensor, "3 h w"]:
@@ -238,10 +209,81 @@ def _draw_star(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[T
     return draw_lines(image, torch.stack([tips, tips.roll(-1, 0)], 1), (0.0, 0.0, 0.0), width_px=1)
 
 
-def _draw_cross(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[Tensor, "3 h w"]:
-    arms = torch.tensor([[[-9.0, -9], [9, 9]], [[-9, 9], [9, -9]]], dtype=torch.float64)
-    white = draw_lines(image, at + arms * 1.2, (1.0, 1.0, 1.0), width_px=6)
-    return draw_discs(
-        draw_lines(white, at + arms, _RED, width_px=4),
-        torch.tensor([[float(at[0]), float(at[1]), 0.0]]), torch.tensor([_RED]), 2.0,
-    )  # fmt: skip
+_STEPS = 300
+_EXAGGERATED = 100
+"""At first near ones attract each other twelve times as much, so that groups form early."""
+_EXAGGERATION = 12.0
+_SEARCH = 40
+
+
+def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Float64[Tensor, " n"]:
+    """Map features to numbers from 0 to 1, so that alike features get near numbers.
+
+    Begins along the principal component, and so always gives the same answer; gradient descent
+    with momentum and gains. Time and memory grow with the square of ``n``: thousands, not more.
+
+    Args:
+        features: of any scale.
+        perplexity: how many neighbours a point has, about.
+
+    Raises:
+        InputError: there are fewer points than three neighbourhoods.
+    """
+    if not 1 <= perplexity < math.inf:
+        raise InputError(f"t-SNE with a perplexity of {perplexity:g}: take 5 to 50, at least 1")
+    if len(features) < 3 * perplexity:
+        raise InputError(
+            f"t-SNE of {len(features)} points with a perplexity of {perplexity:g}: give three "
+            "times as many points, or a smaller perplexity"
+        )
+    P = joint_probabilities(features, perplexity)
+    centred = features.double() - features.double().mean(0)
+    y = centred @ torch.linalg.svd(centred, full_matrices=False)[2][0]
+    y = 1e-4 * y / y.std().clamp(min=1e-12)
+    speed, gain = torch.zeros_like(y), torch.ones_like(y)
+    # A larger one than the curvature at the start allows tears groups apart, and on a line they
+    # never come together again.
+    rate = len(y) / (4 * _EXAGGERATION)
+    for step in range(_STEPS):
+        is_early = step < _EXAGGERATED
+        gradient = kl_gradient(P * (_EXAGGERATION if is_early else 1.0), y)
+        agrees = gradient.sign() != speed.sign()
+        gain = torch.where(agrees, gain + 0.2, gain * 0.8).clamp(min=0.01)
+        speed = (0.5 if is_early else 0.8) * speed - rate * gain * gradient
+        y = y + speed
+    low, high = y.amin(), y.amax()
+    return (y - low) / (high - low).clamp(min=1e-12)
+
+
+def joint_probabilities(
+    features: Float[Tensor, "n c"], perplexity: float
+) -> Float64[Tensor, "n n"]:
+    """Say how near each pair is: Gaussian neighbourhoods of equal perplexity, made symmetric."""
+    x = features.double()
+    squares = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").square()
+    squares.fill_diagonal_(torch.inf)
+    near = squares.amin(1, keepdim=True)
+    shifted = squares - near  # the nearest counts 1, so nothing vanishes
+    low, high = torch.full_like(near, 1e-12), torch.full_like(near, 1e12)
+    for _ in range(_SEARCH):
+        precision = (low * high).sqrt()
+        is_wide = _entropy(shifted, precision) > math.log(perplexity)
+        low, high = torch.where(is_wide, precision, low), torch.where(is_wide, high, precision)
+    rows = torch.exp(-shifted * high)
+    rows = rows / rows.sum(1, keepdim=True)
+    return (rows + rows.T) / (2 * len(x))
+
+
+def kl_gradient(P: Float64[Tensor, "n n"], y: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+    """Gradient of the divergence of P from the Student neighbourhoods of y."""
+    gap = y[:, None] - y
+    near = 1 / (1 + gap.square())
+    near.fill_diagonal_(0)
+    return 4 * ((P - near / near.sum()) * near * gap).sum(1)
+
+
+def _entropy(shifted: Tensor, precision: Tensor) -> Float64[Tensor, "n 1"]:
+    rows = torch.exp(-shifted * precision)
+    total = rows.sum(1, keepdim=True)
+    mean = torch.where(rows > 0, shifted * rows, 0).sum(1, keepdim=True) / total
+    return total.log() + precision * mean

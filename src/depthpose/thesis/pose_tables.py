@@ -1,12 +1,31 @@
-"""Tables 3.1 and 3.2: published LineMOD rows (ADD(-S) below 10 % of the diameter), and ours."""
+"""Tables 3.1 and 3.2: published LineMOD rows (ADD(-S) below 10 % of the diameter), and ours.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+Table 3.3: ways to find keypoints from the same directions, their success and time.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from depthpose.core.errors import InputError
-from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
-from depthpose.pose.types import ObjectModel
+from depthpose.core.rigid import Rigid
+from depthpose.pose.baselines.one_by_one import ransac_one_by_one
+from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
+from depthpose.pose.config import VotingConfig
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.evaluate import ObjectRow
+from depthpose.pose.metrics import add_share, is_within_diameter
+from depthpose.pose.network import ResUNet
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.voting import fit_pose, meet_lines, vote_ransac
 
 TITLES = {
     "3.1": "Table 3.1: comparison with baselines on LineMOD, ADD(-S)",
@@ -41,77 +60,59 @@ PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 """Trained, as ours, as one network of all objects: the rows that differences are taken from."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PublishedRow:
-    """One printed row.
+    """One printed row: percent of the objects of :data:`LINEMOD`, in its order, and their mean.
 
-    Attributes:
-        method: who.
-        input: what the method uses.
-        by_object: percent by BOP's number; empty where only the mean is printed.
-        mean: percent, as printed.
-        diameters: whose table a success is a tenth of.
-        note: what else it takes to compare it.
-        source: where it is printed.
+    ``printed`` is empty where only the mean is; ``note`` says what else it takes to compare it,
+    ``source`` where it is printed.
     """
 
     method: str
     input: str
-    by_object: dict[int, float]
+    printed: str
     mean: float
-    diameters: str
     note: str
     source: str
+
+    @property
+    def by_object(self) -> dict[int, float]:
+        """Percent by BOP's number."""
+        numbers = map(float, self.printed.split())
+        return dict(zip(LINEMOD, numbers, strict=True)) if self.printed else {}
 
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
 _FFB6D = "table in the README of ethnhe/FFB6D"
 _EACH = "one network an object, some 20,000 synthetic images of each"
-
-
-def _row(
-    method: str, input: str, printed: str, mean: float, note: str, source: str
-) -> PublishedRow:
-    """Read the thirteen numbers in the order of the objects."""
-    numbers = dict(zip(LINEMOD, map(float, printed.split()), strict=True)) if printed else {}
-    diameters = "pvnet" if method == "PVNet" else "bop"
-    return PublishedRow(
-        method=method,
-        input=input,
-        by_object=numbers,
-        mean=mean,
-        diameters=diameters,
-        note=note,
-        source=source,
-    )
-
+_Row = PublishedRow
 
 ROWS = (
-    _row("PVNet", "RGB",
+    _Row("PVNet", "RGB",
          "43.6 99.9 86.9 95.5 79.3 96.4 52.6 99.2 95.7 82.0 98.9 99.3 92.4", 86.3, _EACH, _TABLES),
-    _row("CDPN", "RGB",
+    _Row("CDPN", "RGB",
          "64.4 97.8 91.7 95.9 83.8 96.2 66.8 99.7 99.6 85.8 97.9 97.9 90.8", 89.9, "", _TABLES),
-    _row("DPOD", "RGB", "", 95.2, "only the mean is read", _FFB6D),
-    _row("Implicit + ICP", "RGB-D",
+    _Row("DPOD", "RGB", "", 95.2, "only the mean is read", _FFB6D),
+    _Row("Implicit + ICP", "RGB-D",
          "20.6 64.3 63.2 76.1 72.0 41.6 32.4 98.6 96.4 49.9 63.1 91.7 71.0", 64.7, "",
          _TABLES),
-    _row("SSD-6D + ICP", "RGB-D",
+    _Row("SSD-6D + ICP", "RGB-D",
          "65 80 78 86 70 73 66 100 100 49 78 73 79", 79.0,
          "without decimals; the mean of these numbers is 76.7",
          _TABLES),
-    _row("PointFusion", "RGB-D",
+    _Row("PointFusion", "RGB-D",
          "70.4 80.7 60.8 61.1 79.1 47.3 63.0 99.9 99.3 71.8 83.2 62.3 78.8", 73.7, "",
          _TABLES),
-    _row("DenseFusion, per pixel", "RGB-D",
+    _Row("DenseFusion, per pixel", "RGB-D",
          "79.5 84.2 76.5 86.6 88.8 77.7 76.3 99.9 99.4 79.0 92.1 92.3 88.0", 86.2,
          "lost detections leave its denominator", _TABLES),
-    _row("DenseFusion, iterative", "RGB-D",
+    _Row("DenseFusion, iterative", "RGB-D",
          "92.3 93.2 94.4 93.1 96.5 87.0 92.3 99.8 100.0 92.1 97.0 95.3 92.8", 94.3,
          "lost detections leave its denominator", _TABLES),
-    _row("G2L-Net", "RGB-D", "", 98.7, "only the mean is read", _FFB6D),
-    _row("PVN3D", "RGB-D",
+    _Row("G2L-Net", "RGB-D", "", 98.7, "only the mean is read", _FFB6D),
+    _Row("PVN3D", "RGB-D",
          "97.3 99.7 99.6 99.5 99.8 99.3 98.2 99.8 100.0 99.9 99.7 99.8 99.5", 99.4, _EACH, _TABLES),
-    _row("FFB6D", "RGB-D", "", 99.7, _EACH, _FFB6D),
+    _Row("FFB6D", "RGB-D", "", 99.7, _EACH, _FFB6D),
 )  # fmt: skip
 """Every figure as printed. Not like for like: see the notes, and the diameters."""
 
@@ -120,23 +121,9 @@ ROWS = (
 class ComparedRow:
     """A method, or the difference of two, in percent; None: there is no such number.
 
-    Attributes:
-        source: ``published``, ``ours`` or ``difference`` (ours minus the other).
-        method: who.
-        masks: that it was given.
-        input: what the method uses.
-        by_object: percent by column.
-        mean: over the objects.
-        refused: percent of instances.
-        wrong: percent of instances.
-        auc: to 10 cm, in percent.
-        instances: how many.
-        diameters: whose table a success is a tenth of.
-        note: what else it takes to compare it.
-        printed_in: where it is printed.
-        origin: whose predictions are measured.
-        conditions: of the evaluation.
-        ms: mean milliseconds of each stage.
+    ``source``: a difference is ours minus the other; ``auc``: to 10 cm; ``diameters``: whose table
+    a success is a tenth of; ``others``: further columns, such as weights, frames and mean
+    milliseconds of each stage.
     """
 
     source: Literal["published", "ours", "difference"]
@@ -152,36 +139,17 @@ class ComparedRow:
     diameters: str | None = None
     note: str | None = None
     printed_in: str | None = None
-    origin: Origin | None = None
-    conditions: Conditions | None = None
-    ms: Mapping[str, float | None] = field(default_factory=dict)
+    others: Mapping[str, Any] = field(default_factory=dict)
 
     def columns(self) -> dict[str, Any]:
         """Give the columns of a table, in its order."""
-        found: dict[str, Any] = {
-            "source": self.source,
-            "method": self.method,
-            "masks": self.masks,
-            "input": self.input,
-            **self.by_object,
-            "mean": self.mean,
-            "refused": self.refused,
-            "wrong": self.wrong,
-            "auc": self.auc,
-            "instances": self.instances,
-            "diameters": self.diameters,
-            "note": self.note,
-            "printed in": self.printed_in,
-        }
-        found = {name: v for name, v in found.items() if v is not None or name == "mean"}
-        if self.origin is not None and self.conditions is not None:
-            found |= {
-                "weights": self.origin.weights,
-                "weights_sha256": self.origin.weights_sha256,
-                "frames": self.conditions.frames,
-                "frames_sha256": self.conditions.frames_sha256,
-            }
-        return found | {f"ms_{stage}": value for stage, value in self.ms.items()}
+        table: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                table |= value
+            elif value is not None or name == "mean":
+                table[name.replace("_", " ")] = value
+        return table
 
 
 def linemod_number(model: ObjectModel) -> int:
@@ -221,84 +189,228 @@ def join_by_object(
         The mean of ours is over the objects that were measured; a difference of means is given only
         where both are over the same objects.
     """
-    columns = [_column(name, number, with_published) for name, number in numbers.items()]
-    ours = [_own(group, numbers, with_published) for group in _grouped(rows)]
-    if not with_published:
-        return [*ours, *(_difference(ours[0], other, columns) for other in ours[1:])]
-    printed = [_published(row) for row in ROWS]
-    peers = [row for row in printed if row.method in PEERS]
-    differences = [_difference(row, peer, columns) for row in ours for peer in peers]
-    return [*printed, *ours, *differences]
-
-
-def _column(name: str, number: int, with_published: bool) -> str:
-    return LINEMOD.get(number, name) if with_published else name
-
-
-def _grouped(rows: Sequence[ObjectRow]) -> list[list[ObjectRow]]:
+    columns = {n: LINEMOD.get(k, n) if with_published else n for n, k in numbers.items()}
     groups: dict[tuple[str, str], list[ObjectRow]] = {}
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
-    return list(groups.values())
+    ours = [_own(group, columns) for group in groups.values()]
+    if not with_published:
+        return [*ours, *(_difference(ours[0], other) for other in ours[1:])]
+    printed = [
+        ComparedRow(
+            source="published",
+            method=row.method,
+            masks="",
+            input=row.input,
+            by_object={LINEMOD[number]: percent for number, percent in row.by_object.items()},
+            mean=row.mean,
+            diameters="pvnet" if row.method == "PVNet" else "bop",
+            note=row.note,
+            printed_in=row.source,
+        )
+        for row in ROWS
+    ]
+    peers = [row for row in printed if row.method in PEERS]
+    return [*printed, *ours, *(_difference(row, peer) for row in ours for peer in peers)]
 
 
-def _own(
-    rows: Sequence[ObjectRow], numbers: Mapping[str, int], with_published: bool
-) -> ComparedRow:
+def _own(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> ComparedRow:
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
-    assert mean.origin is not None
-    assert mean.conditions is not None
+    origin, conditions = mean.origin, mean.conditions
+    assert origin is not None
+    assert conditions is not None
     return ComparedRow(
         source="ours",
-        method=mean.origin.method,
-        masks=mean.origin.masks,
+        method=origin.method,
+        masks=origin.masks,
         input="depth",
-        by_object={
-            _column(name, number, with_published): 100 * by_name[name].success
-            for name, number in numbers.items()
-        },
+        by_object={column: 100 * by_name[name].success for name, column in columns.items()},
         mean=100 * mean.success,
         refused=100 * mean.refused,
         wrong=100 * mean.wrong,
         auc=100 * (mean.scores["auc"] or 0.0),
         instances=mean.instances,
-        diameters=mean.conditions.diameters,
-        origin=mean.origin,
-        conditions=mean.conditions,
-        ms=mean.ms,
+        diameters=conditions.diameters,
+        others={
+            "weights": origin.weights,
+            "weights_sha256": origin.weights_sha256,
+            "frames": conditions.frames,
+            "frames_sha256": conditions.frames_sha256,
+            **{f"ms_{stage}": value for stage, value in mean.ms.items()},
+        },
     )
 
 
-def _published(row: PublishedRow) -> ComparedRow:
-    return ComparedRow(
-        source="published",
-        method=row.method,
-        masks="",
-        input=row.input,
-        by_object={LINEMOD[number]: percent for number, percent in row.by_object.items()},
-        mean=row.mean,
-        diameters=row.diameters,
-        note=row.note,
-        printed_in=row.source,
-    )
-
-
-def _difference(ours: ComparedRow, other: ComparedRow, columns: Sequence[str]) -> ComparedRow:
-    is_same = other.source == "ours" or set(other.by_object) == set(columns)
+def _difference(ours: ComparedRow, other: ComparedRow) -> ComparedRow:
+    shared = [name for name in ours.by_object if name in other.by_object]
+    is_same = other.source == "ours" or set(other.by_object) == set(ours.by_object)
     is_comparable = is_same and ours.mean is not None and other.mean is not None
     differ = ours.diameters != other.diameters
     return ComparedRow(
         source="difference",
         method=f"{ours.method} - {other.method}",
         masks=ours.masks,
-        by_object={
-            column: ours.by_object[column] - other.by_object[column]
-            for column in columns
-            if column in other.by_object
-        },
+        by_object={name: ours.by_object[name] - other.by_object[name] for name in shared},
         mean=(ours.mean or 0.0) - (other.mean or 0.0) if is_comparable else None,
         diameters=f"{ours.diameters} against {other.diameters}" if differ else None,
     )
+
+
+_ADD_POINTS = 1000
+LOOP_HYPOTHESES = 50
+"""Of the loop: published practice."""
+OUR_HYPOTHESES = (50, 128, 1024)
+_LOOP = "RANSAC, one by one (NumPy)"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VotingCase:
+    """One cloud in the camera frame, the network's unit directions from its points, and the truth.
+
+    ``is_adds``: ADD-S decides, not ADD.
+    """
+
+    points_m: Float[Tensor, "n 3"]
+    directions: Float[Tensor, "n k 3"]
+    model: ObjectModel
+    truth: Rigid
+    is_adds: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class VotingRow:
+    """A way of voting, measured.
+
+    ``points``: at most so many of each cloud; ``votes``: their mean; ``success``: percent of the
+    clouds whose pose is right; ``milliseconds``: of the vote alone, the median; ``times_faster``:
+    than the loop.
+    """
+
+    points: int
+    votes: float
+    method: str
+    hypotheses: int | None
+    inlier_test: str
+    instances: int
+    success: float
+    milliseconds: float
+    times_faster: float = 1.0
+
+    def columns(self) -> dict[str, Any]:
+        """Give the columns of a table, in its order."""
+        titles = {"inlier_test": "inliers by", "times_faster": "times faster"}
+        return {titles.get(name, name): value for name, value in asdict(self).items()}
+
+
+def cases_of(
+    net: GeoPoseNet, views: Iterable[ViewSample], points: int
+) -> Iterator[VotingCase | None]:
+    """Give the votes of up to so many points of each view; None where it has too few to be posed.
+
+    The points are chosen at random, the same each time. Each votes from its own place; points of
+    one voxel share the network's direction. The net's objects have the names in the views.
+
+    Raises:
+        InputError: the weights are of another kind.
+    """
+    network = net.weights.network
+    if not isinstance(network, ResUNet):
+        raise InputError("table 3.3 compares ways of voting: give weights of the sparse network")
+    numbers = {model.name: k for k, model in enumerate(net.weights.models)}
+    for view in views:
+        number = numbers[view.input.object]
+        model, given = net.weights.models[number], view.input
+        cloud = cloud_from_depth(given.depth_m, given.mask, given.K, model.diameter_m).float()
+        generator = torch.Generator().manual_seed(0)
+        points_m = sample_points(cloud, points, generator)
+        if refusal_of(points_m, net.weights.cloud) is not None:
+            yield None
+            continue
+        grid = voxelise(points_m, net.weights.cloud)
+        places = torch.nn.functional.pad(grid.coordinates, (1, 0))
+        voxels = Voxels.from_points(places, grid.features)
+        with torch.inference_mode():
+            outputs = network.forward_class(voxels, number)[..., :3] @ grid.grid_from_camera
+            directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
+        yield VotingCase(
+            points_m=points_m,
+            directions=directions,
+            model=model,
+            truth=view.truth.camera_from_model,
+            is_adds=not model.symmetries.is_none,
+        )
+
+
+def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[VotingRow]:
+    """Let every way vote on every case, one after the other, and sum up.
+
+    The pose follows by the same fit for all: without the covariances that only ours give. What has
+    too few points is a failure of every way. The time is that of the vote alone, its median, on one
+    thread.
+    """
+    usable = [case for case in cases if case is not None]
+    if not usable:
+        raise InputError(f"none of the {len(cases)} views has enough points to be posed")
+    votes = sum(len(case.points_m) for case in usable) / len(usable)
+    rows: list[VotingRow] = []
+    threads = torch.get_num_threads()
+    for method, hypotheses, test, vote in _ways():
+        successes, seconds = 0, []
+        torch.set_num_threads(1)
+        try:
+            vote(usable[0])  # warm
+            for case in usable:
+                # Processor time of the one thread: other work on the machine does not count.
+                start = time.thread_time()
+                keypoints_m = vote(case)
+                seconds.append(time.thread_time() - start)
+                successes += _is_success(case, keypoints_m.double())
+        finally:
+            torch.set_num_threads(threads)
+        row = VotingRow(
+            points=points,
+            votes=votes,
+            method=method,
+            hypotheses=hypotheses,
+            inlier_test=test,
+            instances=len(cases),
+            success=100 * successes / len(cases),
+            milliseconds=1000 * statistics.median(seconds),
+        )
+        rows.append(row)
+    slow = next(row.milliseconds for row in rows if row.method == _LOOP)
+    return [replace(row, times_faster=slow / row.milliseconds) for row in rows]
+
+
+def _ways() -> Iterator[tuple[str, int | None, str, Callable[[VotingCase], Tensor]]]:
+    """Give the name, the number of hypotheses, the test for inliers, and the vote itself."""
+
+    def one_by_one(case: VotingCase) -> Tensor:
+        points, directions = (part.double().numpy() for part in (case.points_m, case.directions))
+        return torch.from_numpy(ransac_one_by_one(points, directions, LOOP_HYPOTHESES))
+
+    def ransac(case: VotingCase, config: VotingConfig) -> Tensor:
+        return vote_ransac(case.points_m, case.directions, None, config).keypoints_m
+
+    def lines(case: VotingCase, refinements: int) -> Tensor:
+        return meet_lines(case.points_m, case.directions, None, refinements).keypoints_m
+
+    yield (_LOOP, LOOP_HYPOTHESES, "angle", one_by_one)
+    for hypotheses in OUR_HYPOTHESES:
+        for test in ("angle", "distance"):
+            config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
+            yield ("RANSAC, ours", hypotheses, test, partial(ransac, config=config))
+    yield ("least squares, published", None, "", partial(lines, refinements=0))
+    yield ("least squares, ours", None, "", partial(lines, refinements=3))
+
+
+def _is_success(case: VotingCase, keypoints_m: Float[Tensor, "k 3"]) -> bool:
+    alike = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
+    pose = fit_pose(keypoints_m, alike, case.model.keypoints_m).camera_from_model
+    step = max(1, len(case.model.vertices_m) // _ADD_POINTS)
+    points_m, diameter_m = case.model.vertices_m[::step], case.model.diameter_m
+    share = add_share(pose, case.truth, points_m, diameter_m, is_adds=case.is_adds)
+    return bool(is_within_diameter(torch.tensor(share)))

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,15 +19,10 @@ _POSE = {
 
 
 class Step(NamedTuple):
-    """One command.
+    """One command: its description, the arguments of ``depthpose``, and the file that it makes.
 
-    Attributes:
-        what: its description.
-        words: arguments of ``depthpose``.
-        makes: the file that it writes.
-        of: files of earlier steps that it reads; it is done again if one is newer.
-        is_replaced: an older ``makes`` and its card are deleted first, because the command replaces
-            no file.
+    It is done again if a file of earlier steps, ``of``, is newer. ``is_replaced``: an older file
+    and its card are deleted first, because the command replaces none.
     """
 
     what: str
@@ -42,22 +38,6 @@ class Step(NamedTuple):
             return False
         made = self.makes.stat().st_mtime
         return all(path.is_file() and path.stat().st_mtime <= made for path in self.of)
-
-
-class Source(NamedTuple):
-    """Where data and configs are, where results go, and how they are measured."""
-
-    data: Path
-    configs: Path
-    out: Path
-    device: Literal["auto", "cpu"]
-
-    @property
-    def table_device(self) -> str:
-        """Name of the device for the commands of tables."""
-        import torch
-
-        return "cuda" if self.device == "auto" and torch.cuda.is_available() else "cpu"
 
 
 def reproduce_all(
@@ -101,99 +81,63 @@ def reproduce_all(
         )
     steps: list[Step] = []
     if kitti is not None:
-        steps += depth_steps(Source(kitti, configs, out, device), split, protocol)
+        steps += _depth_steps(kitti, configs, out / "depth", device, split, protocol)
     if linemod is not None:
-        steps += pose_steps(Source(linemod, configs, out, device))
+        steps += _pose_steps(linemod, configs, out / "pose", device)
     return walk(steps)
 
 
-def depth_steps(source: Source, split: str, protocol: str) -> list[Step]:
-    """List the steps from KITTI to tables 2.1, 2.2 and 2.3.
+def _depth_steps(
+    kitti: Path, configs: Path, home: Path, device: str, split: str, protocol: str
+) -> list[Step]:
+    """List the steps from KITTI to tables 2.1, 2.2 and 2.3."""
+    from depthpose.cli.depth.evaluating import open_frames
 
-    Raises:
-        InputError: frames of the tables are missing, or the folder is that of other settings.
-    """
-    home = _claim_depth(source, split, protocol)
+    open_frames(kitti, None if split == "all" else split)  # not only after days of training
+    names = [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")]
+    _claim(home, kitti, configs, names, {"split": split, "protocol": protocol})
     generator, matcher = home / "view/generator.safetensors", home / "stereo/matcher.safetensors"
     apart, tuned = home / "apart.safetensors", home / "finetune/fakestereo.safetensors"
     begin = ("--generator", str(generator), "--matcher", str(matcher))
     pack = ("weights", "pack", str(generator), "--matcher", str(matcher), "--out", str(apart))
-    how = ("--split", split, "--protocol", protocol)
-
-    def trained(stage: str, makes: Path, *more: str, of: Sequence[Path] = ()) -> Step:
-        return _training(source, ("depth", "train", stage, *more), f"depth/{stage}.yaml", makes, of)
-
-    def table(number: str, *weights: Path) -> Step:
-        words = ("reproduce", number, "--kitti", str(source.data), *how)
-        return _table(number, words, weights, source, home)
-
+    train = partial(_training, kitti, configs, device)
+    how = ("--kitti", str(kitti), "--split", split, "--protocol", protocol)
+    table = partial(_table, home, device, how)
     return [
-        trained("view", generator),
-        trained("stereo", matcher),
+        train("depth/view.yaml", ("depth", "train", "view"), generator),
+        train("depth/stereo.yaml", ("depth", "train", "stereo"), matcher),
         Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher), True),
-        table("2.1", apart),
-        table("2.2", matcher),
-        trained("finetune", tuned, *begin, of=(generator, matcher)),
-        table("2.3", apart, tuned),
+        table("2.1", (apart,)),
+        table("2.2", (matcher,)),
+        train("depth/finetune.yaml", ("depth", "train", "finetune", *begin), tuned)._replace(
+            of=(generator, matcher)
+        ),
+        table("2.3", (apart, tuned)),
     ]
 
 
-def _claim_depth(source: Source, split: str, protocol: str) -> Path:
-    """Claim the folder of the steps from KITTI, whose frames must be there; give it."""
-    from depthpose.cli.depth.evaluating import open_frames
-
-    open_frames(source.data, None if split == "all" else split)  # not only after days of training
-    home = source.out / "depth"
-    configs = [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")]
-    _claim(home, source, configs, {"split": split, "protocol": protocol})
-    return home
-
-
-def pose_steps(source: Source) -> list[Step]:
-    """List the steps from Linemod_preprocessed to tables 3.1, 3.2 and 3.3.
-
-    Raises:
-        InputError: test frames are missing, or the folder is that of other settings.
-    """
+def _pose_steps(linemod: Path, configs: Path, home: Path, device: str) -> list[Step]:
+    """List the steps from Linemod_preprocessed to tables 3.1, 3.2 and 3.3."""
     from depthpose.pose.datasets import open_bop
 
-    dataset = open_bop(source.data, "test")
-    print(f"{source.data}: {len(dataset.instances)} instances to test on")
-    home = source.out / "pose"
-    _claim(home, source, [f"pose/{name}.yaml" for name in _POSE], {})
-    steps = [
-        _training(
-            source,
-            ("pose", "train", "--what", what),
-            f"pose/{name}.yaml",
-            home / f"{what}/{what}.safetensors",
-        )
-        for name, what in _POSE.items()
-    ]
-    return [*steps, *_pose_tables(source, home, [step.makes for step in steps])]
-
-
-def _pose_tables(source: Source, home: Path, weights: Sequence[Path]) -> list[Step]:
-    ours, pointnet, depth_image, masks = weights
-    shown = ("--no-icp", "--masks", "truth", str(masks))
+    dataset = open_bop(linemod, "test")
+    print(f"{linemod}: {len(dataset.instances)} instances to test on")
+    _claim(home, linemod, configs, [f"pose/{name}.yaml" for name in _POSE], {})
     steps: list[Step] = []
-    for number, more, own in (
-        ("3.1", shown, (ours, pointnet, depth_image)),
-        ("3.2", shown, (ours,)),
-        ("3.3", (), (ours,)),
-    ):
-        words = ("reproduce", number, "--linemod", str(source.data), *more)
-        table = _table(number, words, own, source, home)
-        steps.append(table._replace(of=(*table.of, masks)) if more else table)
-    return steps
+    for name, what in _POSE.items():
+        words, makes = ("pose", "train", "--what", what), home / f"{what}/{what}.safetensors"
+        steps.append(_training(linemod, configs, device, f"pose/{name}.yaml", words, makes))
+    ours, pointnet, depth_image, masks = [step.makes for step in steps]
+    data = ("--linemod", str(linemod))
+    shown = (*data, "--no-icp", "--masks", "truth", str(masks))
+    for number, weights in (("3.1", (ours, pointnet, depth_image)), ("3.2", (ours,))):
+        table = _table(home, device, shown, number, weights)
+        steps.append(table._replace(of=(*weights, masks)))
+    return [*steps, _table(home, device, data, "3.3", (ours,))]
 
 
 def walk(steps: Sequence[Step]) -> int:
-    """Run the steps that are not done; stop at the first that fails.
-
-    Returns:
-        The exit code of the commands: the one that stopped, or the largest.
-    """
+    """Run what is not done, to the first that fails; give its exit code, or the largest."""
     from depthpose.cli import main
 
     code = 0
@@ -206,41 +150,47 @@ def walk(steps: Sequence[Step]) -> int:
         if step.is_replaced:
             for path in (step.makes, step.makes.with_suffix(".md")):
                 path.unlink(missing_ok=True)
-        found = main(step.words)
-        if found > 1:
-            return found
-        code = max(code, found)
+        own = main(step.words)
+        if own > 1:
+            return own
+        code = max(code, own)
     return code
 
 
 def _training(
-    source: Source, words: Sequence[str], config: str, makes: Path, of: Sequence[Path] = ()
+    data: Path, configs: Path, device: str, config: str, words: Sequence[str], makes: Path
 ) -> Step:
     """Make the step of a training, which is resumed if it was stopped."""
-    end = ("--config", str(source.configs / config), "--data", str(source.data))
-    end += ("--out", str(makes.parent), "--device", source.device, "--resume")
-    return Step(f"training by {config}", (*words, *end), makes, of)
+    end = ("--config", str(configs / config), "--data", str(data))
+    end += ("--out", str(makes.parent), "--device", device, "--resume")
+    return Step(f"training by {config}", (*words, *end), makes)
 
 
 def _table(
-    number: str, words: Sequence[str], weights: Sequence[Path], source: Source, home: Path
+    home: Path, device: str, words: Sequence[str], number: str, weights: Sequence[Path]
 ) -> Step:
+    import torch
+
     out = home / f"table-{number}"
-    end = ("--weights", *map(str, weights), "--out", str(out))
-    device = () if number == "3.3" else ("--device", source.table_device)
-    return Step(f"table {number}", (*words, *end, *device), out / "report.html", weights)
+    every = ("reproduce", number, *words, "--weights", *map(str, weights), "--out", str(out))
+    if number != "3.3":  # it has no such option
+        is_gpu = device == "auto" and torch.cuda.is_available()
+        every += ("--device", "cuda" if is_gpu else "cpu")
+    return Step(f"table {number}", every, out / "report.html", weights)
 
 
-def _claim(home: Path, source: Source, configs: Sequence[str], settings: Mapping[str, str]) -> None:
+def _claim(
+    home: Path, data: Path, configs: Path, names: Sequence[str], settings: Mapping[str, str]
+) -> None:
     """Claim the folder for this data, these configs and this protocol."""
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.run import claim_folder
 
-    missing = [name for name in configs if not (source.configs / name).is_file()]
+    missing = [name for name in names if not (configs / name).is_file()]
     if missing:
         raise InputError(
-            f"{source.configs}: there is no {missing[0]}; give the folder of the thesis's configs, "
-            "which is in the repository, by --configs"
+            f"{configs}: there is no {missing[0]}; give the folder of the thesis's configs, which "
+            "is in the repository, by --configs"
         )
-    files = {name: file_sha256(source.configs / name) for name in configs}
-    claim_folder(home, {"data": str(source.data.resolve()), "configs": files, **settings})
+    files = {name: file_sha256(configs / name) for name in names}
+    claim_folder(home, {"data": str(data.resolve()), "configs": files, **settings})

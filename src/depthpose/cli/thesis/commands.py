@@ -1,0 +1,357 @@
+"""``depthpose reproduce ...`` and ``depthpose figure ...``: the options of each command."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions, refuse_ignored
+from depthpose.cli.help import group
+from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
+from depthpose.core.errors import InputError
+from depthpose.depth.config import MatcherConfig
+
+if TYPE_CHECKING:
+    from depthpose.cli.depth.methods import Method
+    from depthpose.depth.datasets import Dataset
+    from depthpose.thesis.depth_tables import PublishedTable
+
+
+@group
+class RowOptions:
+    """The methods of a table, a row each."""
+
+    weights: tuple[str, ...] = ()
+    """weights files; 2.2 takes a stereo matcher's too."""
+    matcher: Literal["sgbm"] | None = None
+    """sgbm: OpenCV's StereoSGBM as a row of table 2.2."""
+    beside: tuple[str, ...] | None = None
+    """tables 2.1 and 2.3: weights of other methods, a row each; by default those that ship.
+    '--beside' without a name: none."""
+    train: tuple[Path, ...] = ()
+    """training folders, for two baselines (best depth of each row, nearest image)."""
+    train_without: tuple[str, ...] = ()
+    """names of training frames to leave out."""
+
+    def refuse_unusable(self, table: "PublishedTable") -> None:
+        """Refuse, before any work, rows that a table does not have, and those that it lacks."""
+        if self.beside is not None and table.with_right:
+            raise InputError(
+                f"--beside {' '.join(self.beside)}: adds methods of one image, and table "
+                f"{table.number} is of pairs; leave it out, or give more --weights"
+            )
+        if self.train_without and not self.train:
+            raise InputError(
+                f"--train-without {' '.join(self.train_without)}: leaves frames out of --train, "
+                "and none is given; give its folders, or leave this out"
+            )
+        if self.matcher is not None and not table.with_right:
+            raise InputError(
+                f"--matcher {self.matcher}: matches pairs, and table {table.number} is of one "
+                "image; table 2.2 takes it."
+            )
+        if not self.weights and self.matcher is None:
+            more = " or --matcher sgbm" if table.with_right else ""
+            raise InputError(
+                f"table {table.number}: there is nothing to measure; give --weights FILE{more}."
+            )
+        if len(table.own) > 1 and len(self.weights) != len(table.own):
+            rows = " and ".join(f"'{name}'" for name in table.own)
+            raise InputError(
+                f"table {table.number}: has the rows {rows}, but {len(self.weights)} weights were "
+                "given; give one for each, in this order."
+            )
+
+    def methods(
+        self, table: "PublishedTable", config: MatcherConfig, dataset: "Dataset"
+    ) -> "list[tuple[str, Method]]":
+        """Build each method for a dataset, with the thesis's own row that it stands for, if any."""
+        from depthpose.cli.depth import evaluating, methods
+
+        is_by_place = len(table.own) == len(self.weights)
+        owns = table.own if is_by_place else [table.own[0]] * len(self.weights)
+        chosen = [
+            (own, methods.weights_method(file, config, with_right=table.with_right))
+            for own, file in zip(owns, self.weights, strict=True)
+        ]
+        names = [method.name for _, method in chosen]
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"two weights are called {names[0]!r}, and so would their predictions be: rename "
+                "one."
+            )
+        if self.matcher is not None:
+            chosen.append((table.own[0], methods.sgbm_method(with_filled_holes=True)))
+        if not table.with_right:
+            named = ("default",) if self.beside is None else self.beside
+            others = [methods.weights_method(n, config, with_right=False) for n in named]
+            chosen += [("", other) for other in others if other.name not in names]
+        if self.train:
+            training = evaluating.open_training(self.train, self.train_without, dataset)
+            baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
+            # A baseline uses no right image, but is measured on the frames of the other rows.
+            chosen += [("", one._replace(with_right=table.with_right)) for one in baselines]
+        return chosen
+
+
+def reproduce(
+    table: tyro.conf.Positional[Literal["2.1", "2.2", "2.3"]],
+    kitti: Path,
+    out: Path,
+    rows: RowOptions = RowOptions(),
+    split: str = "eigen-test",
+    pictures: int = 3,
+    comparison: ProtocolOptions = ProtocolOptions(),
+    matching: MatcherOptions = MatcherOptions(),
+) -> int:
+    """Reproduce a table of the thesis, from data on disk to published rows, ours and difference.
+
+    2.1: depth from one image. 2.2: depth from the real stereo pair. 2.3: depth from one image
+    without and with fine-tuning: give two weights, in this order. Writes rows.json, rows.csv,
+    table.md, report.md and report.html (with the frames of figures 2-1 and 2-5), with protocol,
+    weights, settings and environment. A rerun uses existing predictions.
+
+        depthpose reproduce 2.1 --kitti /data/kitti --weights apart.safetensors --out out/table-2.1
+
+    Args:
+        table: number in the thesis.
+        kitti: KITTI raw with LiDAR; or any folder that 'depth evaluate' takes, with --split all.
+        out: folder to write to.
+        split: eigen-test (697 frames), another split, a file of frames, or all.
+        pictures: how many frames the page shows.
+    """
+    from depthpose.cli.depth.evaluating import open_frames
+    from depthpose.cli.thesis.depth import reproduce_table
+    from depthpose.depth.evaluate import find_protocol
+    from depthpose.thesis.depth_tables import find_table
+
+    published = find_table(table)
+    if find_protocol(comparison.protocol).truth == "disparity":
+        raise InputError(
+            f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
+        )
+    comparison.refuse_unusable()
+    refuse_below(0, "--pictures", pictures, "3")
+    rows.refuse_unusable(published)
+    refuse_ignored(rows.weights, matching)
+    dataset = open_frames(kitti, None if split == "all" else split)
+    methods = rows.methods(published, matching.config, dataset)
+    return reproduce_table(
+        published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
+    )
+
+
+def figure(
+    figure: tyro.conf.Positional[Literal["2-1", "2-5"]],
+    kitti: Path,
+    weights: str,
+    out: Path,
+    frames: tuple[str, ...] = (),
+    number: int | None = None,
+    split: str | None = None,
+    matching: MatcherOptions = MatcherOptions(),
+) -> int:
+    """Draw a figure of the thesis from your frames and weights.
+
+    2-1, one frame: left, real right, synthesised right, depth from left and synthesised right,
+    depth from the real pair, LiDAR. 2-5, a column a frame: left, real right, predicted depth,
+    predicted right, LiDAR. Colours mean the same metres in every panel. Writes figure-2-1.png or
+    figure-2-5.png, and report.html with each panel and its caption.
+
+        depthpose figure 2-5 --kitti /data/kitti --weights W.safetensors --out out/figure-2-5
+
+    Args:
+        figure: number in the thesis.
+        kitti: KITTI raw, or any folder of pairs.
+        weights: weights that synthesise the right view (2-5 takes a stereo matcher's too).
+        out: folder for the figure.
+        frames: names of frames; by default some from all over the folder.
+        number: how many frames where none is named: 1 for figure 2-1 and 4 for 2-5.
+        split: choose among the frames of a split, such as eigen-test.
+    """
+    from depthpose.cli.depth.evaluating import open_frames
+    from depthpose.cli.depth.methods import weights_method
+    from depthpose.cli.thesis.depth import choose_frames, write_figure
+
+    dataset = open_frames(kitti, split)
+    if number is not None:
+        refuse_below(1, "--number", number, "4")
+    chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
+    with_right = False if figure == "2-1" else None
+    method = weights_method(weights, matching.config, with_right=with_right)
+    return write_figure(figure, dataset, chosen, method, out)
+
+
+def table_3_1(
+    weights: tuple[str, ...],
+    out: Path,
+    data: PoseDataOptions = PoseDataOptions(),
+    estimates: PoseTableOptions = PoseTableOptions(),
+) -> int:
+    """Reproduce table 3.1: the method beside its baselines, by object, on the same data.
+
+    Give weights of the method first, then of the baselines (kinds pointnet and depth-image): each
+    is run by the estimator of its kind. Writes rows.json, rows.csv, table.md (percent by object),
+    all.json (every number), instances.csv, report.md and report.html. The thesis's own
+    numbers are not at hand: differences are those of the first weights to the others.
+
+        depthpose reproduce 3.1 --bop lm --weights ours.safetensors pointnet.safetensors --out out
+
+    Args:
+        weights: the method's, then those of each baseline; open3d is Open3D's registration
+            (an extra), which needs no weights.
+        out: folder to write to.
+    """
+    from depthpose.cli.thesis.pose import reproduce_by_object
+
+    if len(weights) < 2:
+        raise InputError(
+            "table 3.1 compares the method with its baselines: give two weights or more"
+        )
+    return reproduce_by_object("3.1", data, estimates, weights, (), out)
+
+
+def table_3_2(
+    out: Path,
+    weights: tuple[str, ...] = (),
+    csv: tuple[Path, ...] = (),
+    data: PoseDataOptions = PoseDataOptions(),
+    estimates: PoseTableOptions = PoseTableOptions(),
+) -> int:
+    """Reproduce table 3.2: LineMOD's ADD(-S) by object, published rows, ours, and the difference.
+
+    Writes rows.json, rows.csv, table.md (percent by object), all.json (every number),
+    instances.csv, report.md and report.html. Masks truth and predicted are two rows of ours.
+
+        depthpose reproduce 3.2 --linemod Linemod_preprocessed --weights W --out out/table-3.2
+
+    Args:
+        out: folder to write to.
+        weights: files or names.
+        csv: BOP results of any method, each a row of ours.
+    """
+    from depthpose.cli.thesis.pose import reproduce_by_object
+
+    if not weights and not csv:
+        raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
+    return reproduce_by_object("3.2", data, estimates, weights, csv, out)
+
+
+def table_3_3(
+    weights: str,
+    out: Path,
+    data: PoseDataOptions = PoseDataOptions(),
+    synthetic: int | None = None,
+    points: tuple[int, ...] = (500, 1000, 2000, 5000),
+) -> int:
+    """Reproduce table 3.3: RANSAC against least squares on the same directions of one network.
+
+    Compares a loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50,
+    128 and 1024 hypotheses by both tests for inliers, and least squares as published and as ours:
+    success by ADD(-S) without ICP, and milliseconds of the vote alone, all in one process. Without
+    a data set the clouds are synthetic views of the weights' objects.
+
+        depthpose reproduce 3.3 --weights W.safetensors --linemod Linemod_preprocessed --out out
+
+    Args:
+        weights: file or name, of the sparse network.
+        out: folder for rows.json, rows.csv, table.md and report.html.
+        synthetic: number of synthetic views where no data set is given; 40 unless told.
+        points: at most so many votes of a cloud; a block of rows each.
+    """
+    from depthpose.cli.thesis.pose import reproduce_voting
+
+    if synthetic is not None and data.folder is not None:
+        raise InputError(
+            f"--synthetic {synthetic}: views are rendered where no data set is given, and "
+            f"{data.folder} is; leave one out"
+        )
+    number = 40 if synthetic is None else synthetic
+    refuse_below(1, "--synthetic", number, "40")
+    if not points:
+        raise InputError("--points without a value: give a number of votes, such as 500")
+    for count in points:
+        refuse_below(1, "--points", count, "500")
+        if points.count(count) > 1:
+            raise InputError(f"--points {count} is given twice; each is a block: give it once")
+    return reproduce_voting(weights, data, number, points, out)
+
+
+def figure_3_2(
+    weights: str,
+    out: Path,
+    data: PoseDataOptions = PoseDataOptions(),
+    number: int = 4,
+    perplexity: float = 40.0,
+) -> int:
+    """Draw figure 3-2: features of partial clouds as colours, each cloud posed on its model.
+
+    The features before the last layer (64 numbers a point) of all clouds are mapped to one number
+    by an exact t-SNE and shown in the Spectral scale; the model is black. Without a data set the
+    clouds are synthetic views of the weights' objects. Writes figure-3-2.png, panels, report.html.
+
+        depthpose figure 3-2 --weights W.safetensors --out out/figure-3-2
+
+    Args:
+        weights: file or name, of the sparse network.
+        out: folder for the figure.
+        number: how many clouds.
+        perplexity: of t-SNE.
+    """
+    from depthpose.cli.thesis.pose import feature_panels, open_figure, write_figure
+
+    net, views = open_figure("3-2", weights, out, data, number, perplexity=perplexity)
+    text = (
+        "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
+        "model is black, each cloud posed on it by the truth."
+    )
+    return write_figure("3-2", text, feature_panels(net, views, perplexity), out, columns=4)
+
+
+def figure_3_4(
+    weights: str,
+    out: Path,
+    data: PoseDataOptions = PoseDataOptions(),
+    number: int = 20,
+    keypoint: int | None = None,
+) -> int:
+    """Draw figure 3-4: true and predicted directions to the keypoint with the largest error.
+
+    Looks at some views and shows the worst. In the plane of the camera's x and y: a yellow star is
+    the true keypoint, a red cross the voted one. Without a data set the views are synthetic, of the
+    weights' objects. Writes figure-3-4.png, panels and report.html.
+
+        depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4
+
+    Args:
+        weights: file or name, of the sparse network.
+        out: folder for the figure.
+        number: how many views are looked at.
+        keypoint: only this one, from 0 on.
+    """
+    from depthpose.cli.thesis.pose import field_panels, open_figure, write_figure
+
+    net, views = open_figure("3-4", weights, out, data, number, keypoint=keypoint)
+    text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
+    return write_figure("3-4", text, field_panels(net, views, keypoint), out, columns=3)
+
+
+def figure_3_5(
+    weights: str, out: Path, data: PoseDataOptions = PoseDataOptions(), number: int = 6
+) -> int:
+    """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
+
+    Over the picture, or the depth where there is none. Without a data set the views are synthetic,
+    of the weights' objects. Writes figure-3-5.png, panels and report.html.
+
+        depthpose figure 3-5 --weights W.safetensors --linemod Linemod_preprocessed --out out
+
+    Args:
+        weights: file or name, of the method or of a baseline that votes.
+        out: folder for the figure.
+        number: how many views.
+    """
+    from depthpose.cli.thesis.pose import BOXES, box_panels, open_figure, write_figure
+
+    net, views = open_figure("3-5", weights, out, data, number)
+    return write_figure("3-5", BOXES, box_panels(net, views), out, columns=3)

@@ -1,0 +1,198 @@
+"""Tables and figures of chapter 2: predict, measure, join with the printed rows, draw, write."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from depthpose.cli.depth import evaluating
+from depthpose.cli.depth.methods import Method
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import write_image
+from depthpose.core.run import claim_folder, environment, find_rank
+from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
+from depthpose.depth.evaluate import find_protocol
+from depthpose.depth.predictions import has_prediction, read_estimate
+from depthpose.report.choose import spread_evenly
+from depthpose.report.tables import (
+    Drawing,
+    Picture,
+    Section,
+    markdown_table,
+    table_files,
+    write_markdown,
+    write_page,
+    write_table,
+)
+from depthpose.thesis.depth_figures import (
+    DEPTH_SCALE,
+    arrange,
+    draw_figure_2_1,
+    draw_figure_2_5,
+    shrink_to_width,
+)
+from depthpose.thesis.depth_tables import PublishedTable, join_published
+
+_PICTURE_WIDTH_PX = 621
+
+
+def reproduce_table(
+    table: PublishedTable,
+    dataset: Dataset,
+    methods: Sequence[tuple[str, Method]],
+    out: Path,
+    protocol: str,
+    caps_m: Sequence[float],
+    pictures: int,
+) -> int:
+    """Predict what is missing, measure, join with the published rows, and write everything."""
+    settings = {
+        "table": table.number,
+        "dataset": dataset.name,
+        "frames": len(dataset),
+        "frames_sha256": _frames_hash(dataset.frames),
+        "protocol": protocol,
+        "caps_m": list(caps_m),
+        "methods": {method.name: method.settings for _, method in methods},
+    }
+    results = (*table_files("rows", "frames", "confidence"), "report.md", "report.html")
+    claim_folder(out, settings, (*results, "predictions", "figures"))
+    rule = find_protocol(protocol)
+    home = out / "predictions"
+    folders = [evaluating.predict_all(dataset, method, rule, home) for _, method in methods]
+    if find_rank().rank > 0:
+        return 0
+    measured = evaluating.measure_all(dataset, folders, protocol, caps_m)
+    owns = [own for own, _ in methods for _ in caps_m]
+    joined = join_published(table, list(zip(owns, measured.rows, strict=True)))
+    rows = evaluating.columns(joined)
+    write_table(out, rows)
+    evaluating.write_details(measured, out)
+    how = (
+        f"Ours: {evaluating.describe_protocol(protocol)} The printed rows are of the 697 frames of "
+        "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
+        "other frames (see the columns), does not compare with the printed ones."
+    )
+    sections = [
+        Section(title="Published rows, ours, and difference", text=how, rows=rows),
+        *_picture_sections(dataset, [method for _, method in methods], pictures, out),
+        *evaluating.detail_sections(measured),
+        Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
+    ]
+    title = f"{table.title}, on {dataset.name}"
+    write_markdown(out / "report.md", title, sections, environment())
+    write_page(out / "report.html", title, sections, environment())
+    print(markdown_table(rows))
+    evaluating.say_skipped(measured)
+    print(f"the page: {out / 'report.html'}")
+    return 0
+
+
+def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[int]:
+    """Give the indices of the frames that were named, or of some from all over the dataset.
+
+    Frames chosen by us have a right view, and LiDAR where any frame has both.
+    """
+    if names:
+        known = {frame.name: i for i, frame in enumerate(dataset.frames)}
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            hint = nearest_name(unknown[0], known)[:300]
+            raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
+        return [known[name] for name in names]
+    pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
+    chosen = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
+    if not chosen:
+        raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
+    return [chosen[place] for place in spread_evenly(len(chosen), max(1, number))]
+
+
+def write_figure(
+    number: str, dataset: Dataset, indices: Sequence[int], method: Method, out: Path
+) -> int:
+    """Estimate the frames, draw the figure, and write it with a page that explains it."""
+    frames = [dataset.frames[index] for index in indices]
+    about = {"frames": [f.name for f in frames], "frames_sha256": _frames_hash(frames)}
+    settings = {"command": f"figure {number}", **about, "method": method.settings}
+    claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
+    columns: list[list[Drawing]] = []
+    for index in tqdm(indices, unit=" frames", disable=None):
+        pair, lidar_m = dataset.read_input(index), _lidar(dataset.frames[index])
+        estimate = method.net.estimate_pair(
+            pair if method.with_right else replace(pair, right=None)
+        )
+        if number == "2-5":
+            columns.append(draw_figure_2_5(pair, lidar_m, estimate))
+        else:
+            stereo = method.net.estimate_pair(pair)
+            columns.append(draw_figure_2_1(pair, lidar_m, estimate, stereo))
+    path = out / f"figure-{number}.png"
+    write_image(path, arrange(columns))
+    sections = [
+        _panel_section(frame.name, panels, out / "panels" / frame.name)
+        for frame, panels in zip(frames, columns, strict=True)
+    ]
+    sections.append(Section(title="Settings", rows=_setting_rows(method)))
+    write_page(out / "report.html", f"Figure {number}", sections, environment())
+    captions = "; ".join(panel.caption for panel in columns[0])
+    print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
+    return 0
+
+
+def _picture_sections(
+    dataset: Dataset, methods: Sequence[Method], number: int, out: Path
+) -> list[Section]:
+    """Draw some frames of each method, from the files that were measured."""
+    sections: list[Section] = []
+    for method in methods if number > 0 else ():
+        folder, home = (out / kind / method.name for kind in ("predictions", "figures"))
+        frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
+        shown = replace(dataset, frames=frames)
+        for place, index in enumerate(choose_frames(shown, (), number)):
+            pair, lidar_m = shown.read_input(index), _lidar(frames[index])
+            estimate = read_estimate(folder, pair.name, pair.camera)
+            figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
+            if place == 0 and estimate.right is not None and pair.right is not None:
+                stereo = method.net.estimate_pair(pair)
+                figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
+            sections += [
+                _panel_section(
+                    f"Figure {figure}: {method.name}, {pair.name}",
+                    panels,
+                    home / f"{figure}_{pair.name}",
+                )
+                for figure, panels in figures.items()
+            ]
+    return sections
+
+
+def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section:
+    """Write each panel as a picture of its own, small enough for a page of many."""
+    pictures: list[Picture] = []
+    for k, panel in enumerate(panels, 1):
+        path = home.with_name(f"{home.name}.{k}.jpg")
+        write_image(path, shrink_to_width(panel.image, _PICTURE_WIDTH_PX))
+        pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
+    return Section(title=title, text=DEPTH_SCALE, pictures=pictures)
+
+
+def _lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
+    return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
+
+
+def _frames_hash(frames: Sequence[Frame]) -> str:
+    """Give the SHA-256 of the list of left images, a line each."""
+    lines = "".join(f"{frame.left.resolve()}\n" for frame in frames)
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def _setting_rows(method: Method) -> list[dict[str, Any]]:
+    return [
+        {"method": method.name, "setting": name, "value": str(value)}
+        for name, value in method.settings.items()
+    ]
