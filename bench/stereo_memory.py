@@ -1,6 +1,6 @@
-"""Peak memory of stereo matching, bounded and unbounded, each run in a process of its own.
+"""Peak memory of stereo matching, with a bound and without, each run in a process of its own.
 
-python bench/stereo_memory.py [--size 375x1242] [--bound-mb 1000 least] [--weights F.tar]
+python bench/stereo_memory.py [--size 375x1242] [--bound-mb 1000] [--weights F.tar]
 """
 
 import argparse
@@ -15,7 +15,8 @@ import torch
 from stereo_speed import network_for, out_folder, plain_match, random_pair, size_of
 
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.stereo import Footprint, PSMNetMatcher, Steps
+from depthpose.depth.stereo import PSMNetMatcher
+from depthpose.depth.stereo.plan import PSMNetFootprint
 
 PLAIN = 0
 """Marks the plain network, in place of a bound."""
@@ -58,11 +59,11 @@ def measure(
 
 
 def least_bytes(size: tuple[int, int], weights: Path | None) -> int:
-    """The least bound that the planner accepts."""
+    """The least bound that is accepted."""
     config = network_for(weights).config
     h, w = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
-    footprint = Footprint(config=config, height=h, width=w, dtype=torch.float32)
-    return footprint.estimate_bytes(Steps(rows=2))
+    footprint = PSMNetFootprint(config=config, height=h, width=w, dtype=torch.float32)
+    return footprint.estimate_bytes()
 
 
 def main() -> None:
@@ -88,7 +89,7 @@ def main() -> None:
 
 
 def rows_of(size: tuple[int, int], args: argparse.Namespace) -> list[dict[str, object]]:
-    """Measure the plain network, then ours without bound, with one, and with the least one."""
+    """Measure the network as it is trained, then the matcher without a bound, with two."""
     plain, peak = measure(size, args.weights, PLAIN)
     reference = plain
     name = f"{size[0]}x{size[1]}"

@@ -1,5 +1,6 @@
-"""Laws of fast inference: the same answer as the plain network, whatever the size and the bound."""
+"""Laws of matching with PSMNet: the plain network's answer, whatever the size and the rows."""
 
+import copy
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,19 +15,17 @@ from depthpose.core.devices import PrecisionNotice, computes_bf16
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import (
-    Footprint,
     PSMNet,
-    PSMNetInference,
     PSMNetMatcher,
-    Steps,
     folding,
     normalise,
+    psmnet,
     tile_change_px,
 )
 from depthpose.depth.stereo.network_matcher import lower_where_disagreeing, pad_top_right
-from depthpose.depth.stereo.plan import Tiling, match_tiles
+from depthpose.depth.stereo.plan import PSMNetFootprint, Tiling, match_tiles
 from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
-from depthpose.depth.stereo.volume import FirstLayer, Size, expected_disparity
+from depthpose.depth.stereo.volume import Size, expected_disparity
 from depthpose.depth.types import Match
 
 SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4, 2))
@@ -100,8 +99,8 @@ def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.Mon
 def test_an_onednn_operator_that_answers_otherwise_is_not_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def wrong(rows: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        return torch.zeros_like(rows)
+    def wrong(volume: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(volume)
 
     monkeypatch.setattr(folding, "_onednn_transposed", wrong)
     folding.has_onednn_operators.cache_clear()
@@ -111,16 +110,42 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
         folding.has_onednn_operators.cache_clear()
 
 
-@pytest.mark.parametrize("rows", [2, 4, 6, 10, 64])
-def test_slabs_of_any_height_give_one_answer_in_double_precision(rows: int) -> None:
+@pytest.mark.parametrize("rows", [1, 2, 3, 6, 10, 64])
+def test_any_number_of_rows_gives_one_answer_in_double_precision(rows: int) -> None:
     network = random_network(SMALL).double()
     left, right = torch.rand(2, 2, 3, 80, 96, dtype=torch.float64)
-    inference = PSMNetInference(network, torch.float64)
-    found = inference.match(left, right, Steps(rows=rows, chunk_bytes=1))
-    disparity_px = torch.stack([match.disparity_px for match in found])
+    folded = folding.fold_volumes(copy.deepcopy(network), left)
+    folding.fold_features(folded.features, left)
+    folded.rows = rows
     with torch.no_grad():
-        expected_px = network(left, right)[-1]
-    assert float((disparity_px - expected_px).abs().max()) < 1e-9
+        found_px, expected_px = (one(left, right)[-1] for one in (folded, network))
+    assert float((found_px - expected_px).abs().max()) < 1e-9
+
+
+def test_no_concatenation_volume_of_all_rows_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    matcher = PSMNetMatcher(random_network(SMALL))
+    made: list[int] = []
+
+    def noted(left: torch.Tensor, right: torch.Tensor, bins: int) -> torch.Tensor:
+        made.append(left.shape[-2])
+        return concatenation_volume(left, right, bins)
+
+    monkeypatch.setattr(psmnet, "concatenation_volume", noted)
+    matcher.match(*torch.rand(2, 3, 400, 32))
+    assert made == [36, 40, 40, 8], "32 rows of 100 at a time, and four on each side"
+
+
+def test_more_disparities_than_in_training_equal_a_network_made_for_them() -> None:
+    network = random_network(SMALL)
+    farther = PSMNet(replace(SMALL, max_disparity_px=48)).eval()
+    farther.load_state_dict(network.state_dict())
+    left, right = torch.randn(2, 2, 3, 32, 64)
+    found = PSMNetMatcher(network).run(left, right, farther.config)
+    with torch.no_grad():
+        expected_px = farther(left, right)[-1]
+    assert len(found) == 2
+    for match, expected in zip(found, expected_px, strict=True):
+        assert torch.allclose(match.disparity_px, expected, atol=1e-3)
 
 
 @pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
@@ -141,20 +166,6 @@ def test_without_bf16_fp32_is_taken_and_said(monkeypatch: pytest.MonkeyPatch) ->
     assert matcher.config.precision == "fp32"
     expected = PSMNetMatcher(network).match(left, right)
     assert torch.equal(matcher.match(left, right).disparity_px, expected.disparity_px)
-
-
-@pytest.mark.parametrize(
-    ("width", "bins"), [(20, 8), (10, 8), (9, 8), (8, 8), (6, 8), (3, 8), (30, 4)]
-)
-def test_first_layer_equals_a_convolution_over_the_volume(width: int, bins: int) -> None:
-    left, right = torch.randn(2, 1, 3, 5, width, dtype=torch.float64)
-    weight = torch.randn(4, 6, 3, 3, 3, dtype=torch.float64)
-    bias = torch.randn(4, dtype=torch.float64)
-    volume = concatenation_volume(left, right, bins)
-    expected = F.relu(F.conv3d(volume, weight, bias, padding=1)).transpose(2, 3)
-    looked = FirstLayer(weight, bias, left).look(left, right, bins)
-    assert torch.allclose(looked.rows(0, 5), expected, atol=1e-12)
-    assert torch.allclose(looked.rows(1, 3), expected[:, :, 1:3], atol=1e-12)
 
 
 @pytest.mark.parametrize("align_corners", [True, False])
@@ -191,30 +202,29 @@ def test_confidence_is_one_where_one_disparity_wins_and_small_where_two_do() -> 
 
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 320)])
-def test_bounded_answer_is_the_unbounded_one_and_the_least_bound_works(
-    size: tuple[int, int],
-) -> None:
+def test_a_bound_is_met_or_refused_with_the_least_that_works(size: tuple[int, int]) -> None:
     network = random_network(SMALL)
     left, right = torch.rand(2, 3, *size)
-    with pytest.raises(InputError, match="the least that works is") as caught:
+    with pytest.raises(InputError, match="this matcher takes") as caught:
         PSMNetMatcher(network, MatcherConfig(max_memory_bytes=1000)).match(left, right)
     assert "max_memory_bytes=1000 is too small for images of" in str(caught.value)
-    least = int(str(caught.value).split("the least that works is ")[1].split(";")[0])
+    assert "precision='bf16'" in str(caught.value)
+    assert "tiles (tile_px)" in str(caught.value)
+    least = int(str(caught.value).split("this matcher takes ")[1].split(";")[0])
     free = PSMNetMatcher(network).match(left, right)
     bound = PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least)).match(left, right)
-    assert float((free.disparity_px - bound.disparity_px).abs().max()) < 1e-3
-    with pytest.raises(InputError, match=f"the least that works is {least}"):
+    assert torch.equal(free.disparity_px, bound.disparity_px)
+    with pytest.raises(InputError, match=f"this matcher takes {least}"):
         PSMNetMatcher(network, MatcherConfig(max_memory_bytes=least - 1)).match(left, right)
 
 
-def test_plan_takes_larger_slabs_under_a_larger_bound() -> None:
-    footprint = Footprint(config=PSMNetConfig(), height=384, width=1248, dtype=torch.float32)
-    least = footprint.estimate_bytes(Steps(rows=2))
-    rows = [footprint.plan(round(least * by)).rows for by in (1, 1.05, 1.1, 2)]
-    assert rows == sorted(rows)
-    assert rows[0] == 2
-    assert rows[-1] == footprint.plan(None).rows
-    assert footprint.estimate_bytes(Steps()) < 1_000_000_000
+def test_the_published_size_takes_less_than_1_gb_of_a_pair_of_kitti() -> None:
+    footprint = PSMNetFootprint(config=PSMNetConfig(), height=384, width=1248, dtype=torch.float32)
+    assert footprint.estimate_bytes() < 1_000_000_000
+    half = replace(footprint, dtype=torch.bfloat16)
+    assert half.estimate_bytes() < footprint.estimate_bytes()
+    fewer = replace(footprint, rows=8)
+    assert fewer.estimate_bytes() < footprint.estimate_bytes()
 
 
 @pytest.mark.parametrize("overlap", [0, 8])
@@ -307,10 +317,11 @@ def test_unknown_device_is_refused() -> None:
 
 
 _PSMNET = """
-from depthpose.depth.stereo import Footprint, PSMNet, PSMNetMatcher as Matcher, Steps
+from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
+from depthpose.depth.stereo.plan import PSMNetFootprint
 network = PSMNet().eval()
-footprint = Footprint(config=network.config, height=256, width=1024, dtype=torch.float32)
-least = footprint.estimate_bytes(Steps(rows=2))
+footprint = PSMNetFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
+least = footprint.estimate_bytes()
 """
 _LIGHT = """
 from depthpose.depth.config import LightConfig

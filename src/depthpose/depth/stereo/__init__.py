@@ -1,6 +1,5 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
-from depthpose.depth.stereo.inference import PSMNetInference
 from depthpose.depth.stereo.light import LightStereo
 from depthpose.depth.stereo.light_matcher import LightMatcher
 from depthpose.depth.stereo.matcher import (
@@ -16,7 +15,6 @@ from depthpose.depth.stereo.network_matcher import (
     tile_change_px,
     with_usable_precision,
 )
-from depthpose.depth.stereo.plan import Footprint, Steps
 from depthpose.depth.stereo.psmnet import PSMNet
 from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
 from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
@@ -27,17 +25,14 @@ __all__ = [
     "MATCHERS",
     "CallableMatcher",
     "CameraMatcher",
-    "Footprint",
     "LightMatcher",
     "LightStereo",
     "Matcher",
     "MatcherKind",
     "NetworkMatcher",
     "PSMNet",
-    "PSMNetInference",
     "PSMNetMatcher",
     "SGBMMatcher",
-    "Steps",
     "StereoNetwork",
     "check_pair",
     "fill_holes",

@@ -1,7 +1,6 @@
 """Batch norm folded into the convolution before it: the same function, one pass less."""
 
 from functools import cache
-from itertools import product
 from typing import TypeVar, cast
 
 import torch
@@ -12,9 +11,8 @@ from depthpose.depth.stereo.psmnet import ConvNorm
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
 Norm = nn.BatchNorm2d | nn.BatchNorm3d
-Rows = Float[Tensor, "b _ _ _ _"]
+Volume = Float[Tensor, "b _ _ _ _"]
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
-_ROWS_PADDING = (0, 1, 1)
 
 
 def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
@@ -81,92 +79,32 @@ class VolumeConv(nn.Module):
         self.weight = nn.Parameter(weight, requires_grad=False)
         self.bias = nn.Parameter(bias.detach().to(like), requires_grad=False)
 
-    def forward(self, volume: Rows) -> Rows:
-        """Convolve a volume."""
+    def forward(self, volume: Volume) -> Volume:
+        """Convolve a volume, in the type of the weights."""
+        volume = volume.to(self.weight.dtype)
         if self.is_transposed:
             transposed = _onednn_transposed if _has_onednn(volume) else _transposed
             return transposed(volume, self.weight, self.bias)
         convolved = _onednn_convolved if _has_onednn(volume) else _convolved
-        return convolved(volume, self.weight, self.bias, self.stride, (1, 1, 1))
+        return convolved(volume, self.weight, self.bias, self.stride)
 
 
-class RowsConv:
-    """A folded 3x3x3 convolution for volumes whose rows stand before disparities.
-
-    Inference keeps volumes as ``(pairs, C, rows, disparities, columns)`` with channels last in
-    memory, so some rows of a volume are one piece of memory and no copy is needed to take them.
-    """
-
-    def __init__(self, layer: ConvNorm, like: Tensor) -> None:
-        self.is_transposed = isinstance(layer.conv, nn.ConvTranspose3d)
-        self.stride = cast("Conv", layer.conv).stride[0]
-        weight, bias = folded_weight(layer)
-        turned = weight.transpose(2, 3).to(like)
-        self.weight = turned.contiguous(memory_format=torch.channels_last_3d)
-        self.bias = bias.to(like)
-
-    def __call__(self, rows: Rows) -> Rows:
-        """Convolve rows that carry their own halo; the answer has none."""
-        if self.is_transposed:
-            # Row 2i+1 uses rows i and i+1, so the last pair of rows lacks its halo.
-            transposed = _onednn_transposed if _has_onednn(rows) else _transposed
-            return transposed(rows, self.weight, self.bias)[:, :, :-2]
-        convolved = _onednn_convolved if _has_onednn(rows) else _convolved
-        return convolved(rows, self.weight, self.bias, self.stride)
+def _convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    return nn.functional.conv3d(volume, weight, bias, stride, 1)
 
 
-class CostConv:
-    """The 3x3x3 convolution to one channel, always in float32 at least.
-
-    One product makes the 27 taps of each voxel, which are then added where they belong: a
-    convolution to a single channel leaves most of a processor idle.
-    """
-
-    def __init__(self, conv: nn.Conv3d, like: Tensor) -> None:
-        self.dtype = torch.promote_types(like.dtype, torch.float32)
-        turned = conv.weight.detach()[0].permute(2, 1, 3, 0)
-        self.weight = turned.reshape(27, -1).to(like.device, self.dtype)
-
-    def __call__(self, rows: Float[Tensor, "c n d w"]) -> Float[Tensor, "m d w"]:
-        """Convolve rows of one pair that carry their own halo; the answer has none."""
-        c, n, bins, width = rows.shape
-        voxels = rows.permute(1, 2, 3, 0).reshape(-1, c).to(self.dtype)
-        taps = (self.weight @ voxels.T).view(3, 3, 3, n, bins, width)
-        out = taps.new_zeros(n - 2, bins + 2, width + 2)
-        for y, d, x in product(range(3), repeat=3):
-            target = out[:, 2 - d : bins + 2 - d, 2 - x : width + 2 - x]
-            target += taps[y, d, x, y : y + n - 2]
-        return out[:, 1:-1, 1:-1]
-
-
-def _convolved(
-    rows: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    stride: int,
-    padding: tuple[int, int, int] = _ROWS_PADDING,
-) -> Tensor:
-    return nn.functional.conv3d(rows, weight, bias, stride, padding)
-
-
-def _onednn_convolved(
-    rows: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    stride: int,
-    padding: tuple[int, int, int] = _ROWS_PADDING,
-) -> Tensor:
+def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
     strides = (stride,) * 3
-    return torch.mkldnn_convolution(rows, weight, bias, padding, strides, (1, 1, 1), 1)
+    return torch.mkldnn_convolution(volume, weight, bias, (1, 1, 1), strides, (1, 1, 1), 1)
 
 
-def _transposed(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    return nn.functional.conv_transpose3d(rows, weight, bias, 2, 1, 1)
+def _transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return nn.functional.conv_transpose3d(volume, weight, bias, 2, 1, 1)
 
 
-def _onednn_transposed(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
-    args = (rows, weight, bias, *sizes, "none", [], "")
+    args = (volume, weight, bias, *sizes, "none", [], "")
     return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
 
 
@@ -184,15 +122,15 @@ def has_onednn_operators() -> bool:
     """
     if not torch.backends.mkldnn.is_available():
         return False
-    rows, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
+    volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
     try:
         with torch.no_grad():
             found = (
-                _onednn_convolved(rows, weight, bias, 1),
-                _onednn_transposed(rows, weight, bias),
+                _onednn_convolved(volume, weight, bias, 1),
+                _onednn_transposed(volume, weight, bias),
             )
     except (AttributeError, RuntimeError, TypeError):
         return False
-    wanted = (_convolved(rows, weight, bias, 1), _transposed(rows, weight, bias))
+    wanted = (_convolved(volume, weight, bias, 1), _transposed(volume, weight, bias))
     both = zip(found, wanted, strict=True)
     return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)

@@ -1,10 +1,11 @@
-"""How much memory a match takes, slabs that stay below a bound, and matching by tiles.
+"""How much memory a match takes, and matching by tiles.
 
 Tiles take less memory than a whole pair, and only nearly give the same disparity.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, PSMNetConfig
+from depthpose.depth.stereo.volume import CHUNK_BYTES
 from depthpose.depth.types import Match
 
 MARGIN = 1.1
@@ -21,115 +23,12 @@ MARGIN = 1.1
 OVERHEAD_BYTES = 128 << 20
 """... plus this, which the first convolutions take for themselves whatever the size."""
 
-CHUNK_BYTES = 6 << 20
-"""Size of one piece of the soft arg-min; it fits the caches."""
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How much is computed at a time.
-
-    Attributes:
-        rows: quarter-size rows of a slab, even.
-        chunk_bytes: size of one piece of the soft arg-min.
-    """
-
-    rows: int = 12
-    chunk_bytes: int = CHUNK_BYTES
-
 
 @dataclass(frozen=True, kw_only=True)
-class Footprint:
+class Footprint(ABC):
     """A network at a size of images, as far as memory is concerned.
 
-    Attributes:
-        config: the network.
-        height: rows of the padded image [px].
-        width: columns of the padded image [px].
-        dtype: what volumes are computed in.
-    """
-
-    config: PSMNetConfig
-    height: int
-    width: int
-    dtype: torch.dtype
-
-    def estimate_bytes(self, steps: Steps) -> int:
-        """Peak memory of activations [bytes]: the largest stage, with margin for the allocator."""
-        stages = (
-            self._features_bytes(),
-            self._first_layers_bytes(steps),
-            self._hourglass_bytes(steps),
-            self._expectation_bytes(steps),
-        )
-        return int(MARGIN * max(stages)) + OVERHEAD_BYTES
-
-    def plan(self, max_memory_bytes: int | None) -> Steps:
-        """Choose the largest slabs that stay below the bound.
-
-        Raises:
-            InputError: even the smallest slabs need more; the message says how much.
-        """
-        steps = Steps()
-        if max_memory_bytes is None:
-            return steps
-        while self.estimate_bytes(steps) > max_memory_bytes and steps.rows > 2:
-            steps = replace(steps, rows=steps.rows - 2)
-        least = self.estimate_bytes(steps)
-        if least > max_memory_bytes:
-            raise InputError(
-                f"max_memory_bytes={max_memory_bytes} is too small for images of "
-                f"{self.height}x{self.width} (padded): the least that works is {least}; allow "
-                f"that, take precision='bf16', or match tiles (tile_px)"
-            )
-        return steps
-
-    @property
-    def _row_bytes(self) -> int:
-        """One row of a volume at quarter size."""
-        return self._map_bytes * (self.config.max_disparity_px // 4) // (self.height // 4)
-
-    @property
-    def _map_bytes(self) -> int:
-        """One quarter-size map of features."""
-        return self.config.width * (self.height // 4) * (self.width // 4) * self.dtype.itemsize
-
-    @property
-    def _volume_bytes(self) -> int:
-        return self._row_bytes * (self.height // 4)
-
-    def _features_bytes(self) -> int:
-        """Five half-size maps in the first stage; joined levels, twice, in the last."""
-        levels = 6 + len(self.config.pools)
-        return self._map_bytes * max(5 * 4, 2 * levels + 12)
-
-    def _first_layers_bytes(self, steps: Steps) -> int:
-        """``cost0``, both views convolved in 21 ways, and three layers of a slab."""
-        return self._volume_bytes + 21 * self._map_bytes + (3 * steps.rows + 16) * self._row_bytes
-
-    def _hourglass_bytes(self, steps: Steps) -> int:
-        """``cost0``, three half-size volumes (a quarter of it each) and a slab in the head."""
-        tap_rows = 27 * 4 / (self.config.width * self.dtype.itemsize)
-        slab_rows = (2 + tap_rows) * (steps.rows + 2) + 2 * (steps.rows + 6)
-        cost_bytes = self._volume_bytes * 4 // (self.config.width * self.dtype.itemsize)
-        held = self._volume_bytes + 3 * self._volume_bytes // 4 + 2 * cost_bytes
-        return held + int(slab_rows * self._row_bytes)
-
-    def _expectation_bytes(self, steps: Steps) -> int:
-        """Quarter-size cost, full-size maps, and the pieces in between."""
-        cost_bytes = 4 * self._volume_bytes // (self.config.width * self.dtype.itemsize)
-        row_bytes = 4 * self.width * self.config.max_disparity_px
-        return (
-            2 * cost_bytes + 16 * self.height * self.width + 5 * max(steps.chunk_bytes, row_bytes)
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class LightFootprint:
-    """The light network at a size of images, as far as memory is concerned.
-
-    One volume of the largest size is held whole: a bound can be met or refused, not traded for
-    time.
+    Volumes are held whole: a bound can be met or refused, not traded for time.
 
     Attributes:
         config: the network.
@@ -139,10 +38,71 @@ class LightFootprint:
         rows: at quarter size, computed at a time.
     """
 
-    config: LightConfig
+    config: PSMNetConfig | LightConfig
     height: int
     width: int
     dtype: torch.dtype
+    rows: int
+
+    @abstractmethod
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+
+    def refuse_more_than(self, max_memory_bytes: int | None) -> None:
+        """Refuse a bound that a match would exceed.
+
+        Raises:
+            InputError: it does; the message says how much it takes.
+        """
+        least = self.estimate_bytes()
+        if max_memory_bytes is not None and least > max_memory_bytes:
+            quick = "" if self.config.work_focal_px is None else " or speed='quick'"
+            raise InputError(
+                f"max_memory_bytes={max_memory_bytes} is too small for images of "
+                f"{self.height}x{self.width} (padded): this matcher takes {least}; allow "
+                f"that, take precision='bf16'{quick}, or match tiles (tile_px)"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PSMNetFootprint(Footprint):
+    """PSMNet at a size of images: two volumes of the largest size are held whole."""
+
+    config: PSMNetConfig
+    rows: int = 32
+
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+        height, width = self.height // 4, self.width // 4
+        row_bytes = self.config.width * width * self.dtype.itemsize
+        map_bytes = row_bytes * height
+        bins = self.config.max_disparity_px // 4
+        volume_bytes = map_bytes * bins
+
+        def slab_bytes(halo: int) -> int:
+            return min(self.rows + 2 * halo, height) * row_bytes * bins
+
+        levels = 6 + len(self.config.pools)
+        cost_bytes = 4 * bins * height * width
+        # Costs are computed in float32.
+        head_slabs = 2 if self.dtype.itemsize >= 4 else 4
+        stages = (
+            # Five half-size maps in the first stage; joined levels, twice, in the last.
+            2 * map_bytes * max(5 * 4, 2 * levels + 12),
+            # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
+            volume_bytes + 2 * map_bytes + 3 * slab_bytes(4),
+            # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
+            2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab_bytes(2) + 3 * cost_bytes,
+            4 * cost_bytes + 16 * self.height * self.width + 5 * CHUNK_BYTES,
+        )
+        return int(MARGIN * max(stages)) + OVERHEAD_BYTES
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightFootprint(Footprint):
+    """The light network at a size of images: one volume of the largest size is held whole."""
+
+    config: LightConfig
     rows: int = 16
 
     def estimate_bytes(self) -> int:
@@ -170,20 +130,6 @@ class LightFootprint:
         joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
         compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
         return pixels * (joined + compared + 3 * 4 * 36 * 4)
-
-    def refuse_more_than(self, max_memory_bytes: int | None) -> None:
-        """Refuse a bound that a match would exceed.
-
-        Raises:
-            InputError: it does; the message says how much it takes.
-        """
-        least = self.estimate_bytes()
-        if max_memory_bytes is not None and least > max_memory_bytes:
-            raise InputError(
-                f"max_memory_bytes={max_memory_bytes} is too small for images of "
-                f"{self.height}x{self.width} (padded): the light matcher takes {least}; allow "
-                f"that, take precision='bf16' or speed='quick', or match tiles (tile_px)"
-            )
 
 
 Image = Float[Tensor, "3 h w"]

@@ -1,8 +1,5 @@
 """PSMNet, stacked hourglass: a rectified pair to disparity (Chang and Chen, CVPR 2018).
 
-This is the network as it is trained, in its plain form. ``inference`` runs the same weights faster
-and in bounded memory.
-
 The features of one view come first: residual layers and a spatial pyramid, at 1/4 size.
 """
 
@@ -16,6 +13,7 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo.network_matcher import Maps, StereoNetwork
+from depthpose.depth.stereo.volume import by_rows
 
 
 class ConvNorm(nn.Module):
@@ -115,6 +113,7 @@ class FeatureExtractor(nn.Module):
         )
 
 
+Features = Float[Tensor, "b _ _ _"]
 Volume = Float[Tensor, "b _ _ _ _"]
 
 
@@ -144,19 +143,18 @@ class Hourglass(nn.Module):
 
     def forward(
         self, x: Volume, first: Volume | None, before: Volume | None
-    ) -> tuple[Volume, Volume, Volume]:
-        """Answer the volume to add, and the half-size volumes going down and coming up.
+    ) -> tuple[Volume, Volume]:
+        """Answer the half-size volumes going down and coming up, between ``down1`` and ``up1``.
 
         Args:
-            x: what the hourglass refines.
+            x: what ``down1`` made of the volume that the hourglass refines; it is overwritten.
             first: half-size volume of the first hourglass going down; None in the first itself.
             before: half-size volume of the hourglass before, coming up; None in the first.
         """
-        down = self.same1(F.relu(self.down1(x)))
-        down = F.relu(down if before is None else down + before)
-        up = self.up2(F.relu(self.same2(F.relu(self.down2(down)))))
-        up = F.relu(up + (down if first is None else first))
-        return self.up1(up), down, up
+        down = self.same1(x.relu_())
+        down = (down if before is None else down.add_(before)).relu_()
+        up = self.up2(self.same2(self.down2(down).relu_()).relu_())
+        return down, up.add_(down if first is None else first).relu_()
 
 
 class Head(nn.Module):
@@ -169,7 +167,7 @@ class Head(nn.Module):
 
     def forward(self, x: Volume) -> Volume:
         """Score each voxel."""
-        return self.cost(F.relu(self.hidden(x)))
+        return self.cost(self.hidden(x).relu_())
 
 
 def concatenation_volume(
@@ -206,7 +204,13 @@ class PSMNet(StereoNetwork):
 
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 16 and
     at least ``config.min_side_px``. The default size has 5,224,768 parameters.
+
+    Attributes:
+        rows: at 1/4 size, that are computed at a time where something large would be held, with no
+            gradient; None, as in training and in exported graphs: all.
     """
+
+    rows: int | None = None
 
     def __init__(self, config: PSMNetConfig | None = None) -> None:
         super().__init__()
@@ -241,26 +245,48 @@ class PSMNet(StereoNetwork):
         )
 
     def costs(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
+        self,
+        left: Float[Tensor, "b 3 h w"],
+        right: Float[Tensor, "b 3 h w"],
+        max_disparity_px: int | None = None,
     ) -> tuple[Volume, Volume, Volume]:
-        """Answer the quarter-size cost after each hourglass; each adds to the one before."""
-        bins = self.config.max_disparity_px // 4
-        return self.costs_of(concatenation_volume(self.features(left), self.features(right), bins))
+        """Answer the quarter-size cost after each hourglass; each adds to the one before.
+
+        ``max_disparity_px`` takes the place of the network's own: the same filters look over all
+        disparities, so they can look farther than they did in training.
+        """
+        bins = (max_disparity_px or self.config.max_disparity_px) // 4
+
+        def begin(left: Features, right: Features) -> Volume:
+            return self._aggregate(concatenation_volume(left, right, bins))
+
+        views = self.features(left), self.features(right)
+        # Four convolutions follow each other.
+        return self._costs_from(by_rows(begin, views, halo=4, rows=self.rows))
 
     def costs_of(self, volume: Volume) -> tuple[Volume, Volume, Volume]:
         """Answer the costs of a concatenation volume, however it was made."""
-        cost0 = self._aggregate(volume)
-        x, first, before, costs = cost0, None, None, []
-        for hourglass, head in zip(self.hourglasses, self.heads, strict=True):
-            refined, down, before = hourglass(x, first, before)
-            first = down if first is None else first
-            x = refined + cost0
-            costs.append(head(x) + costs[-1] if costs else head(x))
-        return cast("tuple[Volume, Volume, Volume]", tuple(costs))
+        return self._costs_from(self._aggregate(volume))
 
     def _aggregate(self, volume: Volume) -> Volume:
-        x = F.relu(self.dres0[1](F.relu(self.dres0[0](volume))))
-        return self.dres1[1](F.relu(self.dres1[0](x))) + x
+        x = self.dres0[0](volume).relu_()
+        del volume
+        x = self.dres0[1](x).relu_()
+        return self.dres1[1](self.dres1[0](x).relu_()).add_(x)
+
+    def _costs_from(self, cost0: Volume) -> tuple[Volume, Volume, Volume]:
+        x, first, up, costs = cost0, None, None, []
+        for module, head in zip(self.hourglasses, self.heads, strict=True):
+            hourglass = cast("Hourglass", module)
+            # Under the same name, so that one volume of the full size is held beside ``cost0``.
+            x = hourglass.down1(x)
+            down, up = hourglass(x, first, up)
+            first = down if first is None else first
+            del down
+            x = hourglass.up1(up).add_(cost0)
+            cost = by_rows(head, (x,), halo=2, rows=self.rows)
+            costs.append(cost + costs[-1] if costs else cost)
+        return cast("tuple[Volume, Volume, Volume]", tuple(costs))
 
     def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
         h, w = image.shape[-2:]
