@@ -70,9 +70,12 @@ def test_a_near_pose_becomes_the_true_one(stone: ObjectModel, surface: Surface) 
     assert torch.allclose(one.R, refined.camera_from_model.R[2], atol=1e-4)
 
 
-def test_the_refined_pose_moves_with_the_cloud(stone: ObjectModel, surface: Surface) -> None:
+def test_the_refined_pose_turns_with_the_cloud(stone: ObjectModel, surface: Surface) -> None:
+    """About the camera: else another side of the stone would face it."""
     cloud, start = seen_half(stone, TRUE), pose_near(TRUE, 5, 0.1, 0.005)
-    motion = perturb(TRUE, torch.tensor([1.0, 0.4, -0.3, 0.2, 0.1, -0.3]).double())
+    motion = perturb(
+        Rigid(torch.eye(3).double(), ORIGIN), torch.tensor([0.3, 0.4, -0.8, 0, 0, 0]).double()
+    )
     here = refine_pose(cloud, start, surface).camera_from_model
     there = refine_pose(motion.apply(cloud), motion @ start, surface).camera_from_model
     assert torch.allclose((motion @ here).R, there.R, atol=1e-9)
@@ -109,7 +112,7 @@ def test_a_far_turn_ends_at_the_true_pose_and_turns_about_the_object(
         seen_half(stone, TRUE) + torch.tensor([0, 0, 5.0]), Rigid(start.R, far), surface
     )
     assert torch.allclose(moved.camera_from_model.t_m, refined.camera_from_model.t_m
-                          + torch.tensor([0, 0, 5.0]), atol=1e-6)  # fmt: skip
+                          + torch.tensor([0, 0, 5.0]), atol=2e-4)  # fmt: skip
 
 
 def test_the_best_of_several_starts_is_found_and_named(
@@ -140,6 +143,38 @@ def test_a_pose_that_would_hide_what_was_seen_is_not_the_best() -> None:
     best = refine_best(face, batch, prepare_surface(plate))
     assert best.start == 1
     assert float(((best.refined.camera_from_model.t_m - TRUE.t_m) @ toward).abs()) < 1e-3
+
+
+@pytest.mark.parametrize("kind", ["mesh", "inside out", "mixed", "points"])
+def test_a_thin_plate_is_not_found_on_its_back(kind: str) -> None:
+    """Its own thickness nearer to the camera the back lies where the front was seen."""
+    mesh = trimesh.creation.box((0.16, 0.1, 0.008)).subdivide().subdivide().subdivide()
+    vertices, faces = (torch.from_numpy(np.array(part)) for part in (mesh.vertices, mesh.faces))
+    plate = make_model(vertices, faces, name="plate")
+    seen = seen_half(plate, TRUE)
+    toward = -torch.sign(TRUE.R[:, 2] @ TRUE.t_m) * TRUE.R[:, 2]
+    if kind == "points":
+        plate = make_model(sample_surface(plate, 5000)[0], torch.zeros(0, 3).long(), name="plate")
+    elif kind != "mesh":
+        every = 1 if kind == "inside out" else 2
+        faces[::every] = faces[::every].flip(1)
+        plate = make_model(vertices, faces, name="plate")
+    start = Rigid(TRUE.R, TRUE.t_m + 0.008 * toward)
+    found = refine_pose(seen, start, prepare_surface(plate)).camera_from_model
+    assert float(((found.t_m - TRUE.t_m) @ toward).abs()) < 5e-4
+
+
+def test_noise_along_the_ray_draws_nothing_nearer() -> None:
+    model, offs_m = bracket(), []
+    truth, part = pose_at(seed=3), prepare_surface(model)
+    true = Rigid(truth.R.double(), truth.t_m.double())
+    clean_m = cloud_of(model, truth).double()
+    for seed in range(8):
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(len(clean_m), 1, generator=generator, dtype=torch.float64)
+        found = refine_pose(clean_m * (1 + 0.003 / clean_m[:, 2:] * noise), true, part)
+        offs_m.append(found.camera_from_model.t_m[2] - true.t_m[2])
+    assert abs(float(torch.stack(offs_m).mean())) < 4e-4
 
 
 def test_another_pose_of_a_symmetric_part_is_kept() -> None:

@@ -5,21 +5,22 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
-from depthpose.pose.compiled import serves
+from depthpose.pose.compiled import LOOKED_UP, ON_RAY, SEARCHED, serves
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.match import match
 from depthpose.pose.surface import Surface, look_along_rays
 
 _CONVERGED = 3e-4
 """Stop when a step turns by less than this [rad] and shifts by less than this in diameters."""
 _TURN_RAD = math.radians(15)
 """By how much further starts are turned."""
-_ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0)
+_ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Of the starts, step by step, over the last limit of all: they begin farther off."""
 _ROUGH_POINTS = 100
 """Points of the cloud that refine and compare starts."""
@@ -36,6 +37,12 @@ _TRUST = 0.02
 to be believed: a plane fits many places, and noise would choose among them. Where a start ended
 roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
 
+_BLOCKS = (0.15, 0.2, 0.3, 0.4)
+"""Sides of blocks of points whose errors may be alike, in diameters."""
+_TAKEN_UP = 1.5
+"""Power of the ratio by which errors within a block exceed independent ones, such that intervals
+hold what they promise for four kinds of sensor (``bench/covariance.py``)."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Refined:
@@ -44,9 +51,10 @@ class Refined:
     Attributes:
         camera_from_model: the pose.
         covariance: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from
-            the curvature of the sum and the spread of the residuals, if the points were
-            independent; what the surface does not fix (a turn of a ball) is far too uncertain to
-            be missed. Local: of this minimum alone, whether it is the right one or not.
+            the curvature of the sum and the residuals, of which neighbours may be alike; what the
+            surface does not fix (a turn of a ball) is far too uncertain to be missed. Local: of
+            this minimum alone, whether it is the right one or not. An error that a sensor makes
+            everywhere, such as an offset along the ray, is not in it.
         residual_m: root mean square distance to the surface, of the points that count.
         inlier_share: share of the points within the last limit of the surface.
     """
@@ -84,8 +92,11 @@ def refine_pose(
 
     Every point of a partial cloud has a place on the whole model, so points seek the surface and
     not the reverse. Each step minimises ``sum w (n . (T^-1 x - s))^2`` over the nearest surface
-    point ``s`` with normal ``n`` (Chen and Medioni 1991); the weight is Tukey's, and its limit
-    shrinks from ``start_distance`` to ``end_distance``.
+    point ``s`` with normal ``n`` (Chen and Medioni 1991) that faces the camera; the weight is
+    Tukey's, and its limit shrinks from ``start_distance`` to ``end_distance``. After half of
+    the steps ``s`` is where the ray of ``x`` meets the surface: noise is along the ray, and the
+    nearest point would be on another face where it errs inward near an edge, and draw the model
+    toward the camera.
 
     Where no point of the cloud comes near the surface a pose stays as it was, with an
     ``inlier_share`` of 0.
@@ -103,10 +114,10 @@ def refine_pose(
     _refuse_no_points(points_m)
     cloud = take_evenly(points_m.double(), config.cloud_points)
     limits_m = _limits(config, surface.diameter_m)
-    pose = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
+    pose, index = _iterated(cloud, initial.double(), surface, limits_m, is_exact=True)
     end_m = config.end_distance_diameters * surface.diameter_m
-    equations = _normal_equations(cloud, pose, surface, end_m, is_exact=True)
-    return _result(points_m, pose, equations, _middle(cloud))
+    equations = _normal_equations(cloud, pose, surface, end_m, index, ON_RAY)
+    return _result(points_m, cloud, pose, equations, surface.diameter_m)
 
 
 def refine_best(
@@ -172,7 +183,7 @@ def refine_roughly(
     few = take_evenly(points_m.double(), _ROUGH_POINTS)
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _iterated(few, starts, surface, limits_m, is_exact=False)
+    return _iterated(few, starts, surface, limits_m, is_exact=False)[0]
 
 
 def _refuse_no_points(points_m: Float[Tensor, "n 3"]) -> None:
@@ -190,24 +201,33 @@ def _iterated(
     limits_m: list[float],
     *,
     is_exact: bool,
-) -> Rigid:
-    """Step by step to where the cloud lies on the surface, each until it moves no more."""
+) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
+    """Step by step to where the cloud lies on the surface, each until it moves no more.
+
+    The last limit moves nothing. Gives the poses and the number of each point's sample, or -1.
+    """
     if serves(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.icp import refined
 
-        steps = (limits_m, _CONVERGED, surface.diameter_m)
-        return refined(cloud, pose, surface.target, steps, is_exact=is_exact)
+        settings = (limits_m, _CONVERGED, surface.diameter_m)
+        return refined(cloud, pose, surface.target, settings, is_exact=is_exact)
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
-    for limit_m in limits_m:
-        H, pull, _, _ = _normal_equations(cloud, pose, surface, limit_m, is_exact=is_exact)
+    index, steps = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1), len(limits_m) - 1
+    for k, limit_m in enumerate(limits_m):
+        how = LOOKED_UP if not is_exact else SEARCHED if 2 * k < steps else ON_RAY
+        found = match(cloud, pose, surface, limit_m, how, index)
+        index = torch.where(moves > 0, found, index)
+        if k == steps:
+            break
+        H, pull, *_ = _normal_equations(cloud, pose, surface, limit_m, index, how)
         motion = torch.linalg.solve(H, pull) * moves
         pose = _moved(pose, motion, _middle(cloud))
-        if limit_m <= limits_m[-1]:
+        if limit_m <= limits_m[-1] and how != SEARCHED:
             moves = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
             if not bool(moves.any()):
                 break
-    return pose
+    return pose, index
 
 
 def _starts(poses: Rigid, surface: Surface, count: int) -> Rigid:
@@ -229,7 +249,8 @@ def _worth(
     """
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
     few = take_evenly(cloud, _ROUGH_POINTS)
-    _, _, residual_m, weight = _normal_equations(few, poses, surface, limit_m, is_exact=False)
+    index = match(few, poses, surface, limit_m, LOOKED_UP)
+    _, _, residual_m, weight, _ = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
     near = (weight > 0).double().mean(-1)
     front, unseen = look_along_rays(cloud, poses, surface, every=4)
     # Of equals, the nearer one.
@@ -268,11 +289,11 @@ def _distinct(poses: Rigid, worth: Float64[Tensor, " b"], surface: Surface) -> R
 
 
 def _limits(config: IcpConfig, diameter_m: float) -> list[float]:
-    """Shrink the limit in even ratios over half of the steps; then keep it."""
+    """Shrink the limit in even ratios over half of the steps; then keep it, and check by it."""
     start, end = config.start_distance_diameters, config.end_distance_diameters
     half = max(1, config.iterations // 2)
     shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
-    return [share * diameter_m for share in shares]
+    return [share * diameter_m for share in (*shares, end)]
 
 
 def _middle(cloud: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
@@ -284,20 +305,21 @@ def _normal_equations(
     pose: Rigid,
     surface: Surface,
     limit_m: float,
-    *,
-    is_exact: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    index: Int64[Tensor, "*batch n"],
+    how: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Linearise about the middle of the cloud, where turning and shifting hardly mix."""
-    inverse = pose.inverse()
-    local = cloud @ inverse.R.mT + inverse.t_m[..., None, :]
-    index = surface.find(local, is_exact=is_exact)
     # In the camera frame, where the covariance is wanted.
     normal = surface.normals[index] @ pose.R.mT
     target = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
     gap = cloud - target
     residual_m = (normal * gap).sum(-1)
     # Tukey's weight of the whole gap: a point beyond an edge is near the plane, not the surface.
-    weight = (1 - gap.square().sum(-1) / limit_m**2).clamp(min=0).square()
+    square = gap.square().sum(-1)
+    if how == ON_RAY:  # along the ray it is the residual that counts
+        along = (gap * cloud).sum(-1).square() / cloud.square().sum(-1)
+        square = square - along + residual_m.square()
+    weight = torch.where(index >= 0, (1 - square / limit_m**2).clamp(min=0).square(), 0.0)
     arm = target - _middle(cloud)
     # Moving the model by (w, v) moves its point by w x arm + v, and lowers the residual.
     J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
@@ -306,7 +328,7 @@ def _normal_equations(
     # A direction that no point constrains stays where it was.
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
     H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
-    return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight
+    return H, (weighted @ residual_m[..., None]).squeeze(-1), residual_m, weight, J
 
 
 def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Rigid:
@@ -320,18 +342,17 @@ def _moved(pose: Rigid, motion: Float[Tensor, "*batch 6"], middle: Tensor) -> Ri
     return Rigid(turned.R, turned.t_m + middle)
 
 
-def _shift(middle: Float[Tensor, "3"]) -> Float[Tensor, "6 6"]:
-    # w x (p - c) + v = w x p + (v + c x w)
-    eye, zero = torch.eye(3, dtype=middle.dtype), torch.zeros(3, 3, dtype=middle.dtype)
-    return torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle), eye], 1)])
-
-
 def _result(
-    points_m: Tensor, pose: Rigid, equations: tuple[Tensor, ...], middle: Tensor
+    points_m: Tensor, cloud: Tensor, pose: Rigid, equations: tuple[Tensor, ...], diameter_m: float
 ) -> Refined:
-    H, _, residual_m, weight = equations
+    H, _, residual_m, weight, J = equations
     variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
-    shift = _shift(middle)
+    variance = variance * _inflation(cloud, H, (weight * residual_m)[..., None] * J, diameter_m)
+    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+    # w x (p - c) + v = w x p + (v + c x w)
+    shift = torch.cat(
+        [torch.cat([eye, zero], 1), torch.cat([cross_matrix(_middle(cloud)), eye], 1)]
+    )
     covariance = shift @ (variance[..., None, None] * torch.linalg.inv(H)) @ shift.mT
     return Refined(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
@@ -339,6 +360,29 @@ def _result(
         residual_m=_spread_m(residual_m, weight).to(points_m),
         inlier_share=(weight > 0).to(points_m).mean(-1),
     )
+
+
+def _inflation(
+    cloud: Float64[Tensor, "n 3"], H: Tensor, pulls: Tensor, diameter_m: float
+) -> Float64[Tensor, "*batch"]:
+    """Say by how much neighbours that err alike raise the variance.
+
+    Independent errors pull a block of the view as much as its points, squares added (Liang and
+    Zeger 1986). Of several sizes of blocks the largest ratio counts: nobody knows how far errors
+    reach. The fit has taken up a part of what they share; hence the power.
+    """
+    inverse = torch.linalg.inv(H)
+    flat_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
+    own = (pulls @ inverse * pulls).sum((-2, -1)).clamp(min=1e-30)
+    most = torch.ones_like(own)
+    for side in _BLOCKS:
+        cells = (flat_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
+        _, block = cells.unique(return_inverse=True)
+        count = int(block.max()) + 1
+        sums = pulls.new_zeros(*pulls.shape[:-2], count, 6).index_add_(-2, block, pulls)
+        shared = (sums @ inverse * sums).sum((-2, -1)) * (count / max(count - 1, 1))
+        most = torch.maximum(most, shared / own)
+    return most**_TAKEN_UP
 
 
 def _spread_m(

@@ -15,6 +15,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import serves
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.sampling import fibonacci_directions
+from depthpose.pose.mesh.sides import across_walls, cell_of, outward_normals
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05
@@ -68,6 +69,8 @@ class Surface:
     Attributes:
         points_m: of the surface, in the model frame.
         normals: theirs; their side does not matter.
+        outward: normals on the outer side, 0 where none is known.
+        across: number of the sample on the other side of a wall, or -1.
         diameter_m: of the object.
         copies: what leaves the object as it is, ``model_from_model``, the identity first.
         tree: finds the nearest of the points.
@@ -76,6 +79,8 @@ class Surface:
 
     points_m: Float64[Tensor, "m 3"]
     normals: Float64[Tensor, "m 3"]
+    outward: Float64[Tensor, "m 3"]
+    across: Int64[Tensor, " m"]
     diameter_m: float
     copies: Rigid
     tree: KDTree
@@ -102,6 +107,12 @@ class Surface:
         return float(np.median(self.tree.query(some_m.numpy(), k=4, workers=1)[0][:, -1]))
 
     @cached_property
+    def ball_m(self) -> Float64[Tensor, "4"]:
+        """Middle and radius of a ball about the surface."""
+        middle_m = (self.points_m.amin(0) + self.points_m.amax(0)) / 2
+        return torch.cat([middle_m, (self.points_m - middle_m).norm(dim=-1).amax()[None]])
+
+    @cached_property
     def least_silhouette_m2(self) -> float:
         """Area of the smallest silhouette among 32 directions, without its border.
 
@@ -125,16 +136,22 @@ class Surface:
 
         boxes = self.boxes
         table = (boxes.low_m.numpy(), boxes.side_m, boxes.counts.numpy(), boxes.nearest.numpy())
-        return target_of(self.points_m.numpy(), self.normals.numpy(), table)
+        sides = (self.outward.numpy(), self.across.numpy(), self.ball_m.numpy())
+        return target_of(self.points_m.numpy(), self.normals.numpy(), table, *sides)
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample a model once for many clouds."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
     tree = KDTree(points_m.numpy())
+    cell_m = cell_of(points_m.numpy(), tree)
+    outward = outward_normals(points_m.numpy(), normals.numpy(), cell_m)
+    across = across_walls(points_m.numpy(), outward, 3 * NEAR * model.diameter_m)
     return Surface(
         points_m=points_m,
         normals=normals,
+        outward=torch.from_numpy(outward),
+        across=torch.from_numpy(across),
         diameter_m=model.diameter_m,
         copies=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
         tree=tree,

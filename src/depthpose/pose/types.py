@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -331,7 +331,8 @@ class PoseEstimate:
         keypoints_m: the found keypoints in the camera frame.
         covariance: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn
             off may have one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it
-            leaves out the motions of ``free_motions``.
+            leaves out the motions of ``free_motions``. Its translation is of the camera's origin:
+            ``origin_std_mm`` and ``rotation_std_deg`` say it of the model.
         free_motions: unit vectors of (rotation, translation) along which a declared continuous
             symmetry makes the variance infinite; no row where there is none.
         inlier_share: share of the votes that agree, 0..1.
@@ -378,6 +379,42 @@ class PoseEstimate:
     def is_posed(self) -> bool:
         """Whether there is a pose, ok or ambiguous."""
         return self.status in POSED
+
+    @property
+    def origin_std_mm(self) -> Float64[Tensor, "3"] | None:
+        """Standard deviation of where the model's origin is, along the camera's x, y and z [mm].
+
+        A turn about the camera moves an origin at t by ``rotation x t``, beside the translation.
+        Infinite where a declared symmetry moves the origin; None without a covariance.
+        """
+        if self.camera_from_model is None:
+            return None
+        eye, t_m = torch.eye(3, dtype=torch.float64), self.camera_from_model.t_m.double()
+        turned = torch.linalg.cross(eye, t_m.expand(3, 3)).mT
+        std_m = self._std_along(torch.cat([turned, eye], 1), 1e-3)
+        return None if std_m is None else 1000 * std_m
+
+    @property
+    def rotation_std_deg(self) -> Float64[Tensor, "3"] | None:
+        """Standard deviation of the rotation about the model's own x, y and z axes [degrees].
+
+        Infinite about an axis about which a declared symmetry turns; None without a covariance.
+        """
+        if self.camera_from_model is None:
+            return None
+        R = self.camera_from_model.R.double()
+        std = self._std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
+        return None if std is None else std.rad2deg()
+
+    def _std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
+        """Standard deviations of linear functions of the motion; free is what moves as much."""
+        if self.covariance is None:
+            return None
+        std = (rows @ self.covariance.double() @ rows.mT).diagonal().clamp(min=0).sqrt()
+        if self.free_motions is None or len(self.free_motions) == 0:
+            return std
+        is_free = (rows @ self.free_motions.double().mT).abs().amax(-1) > least
+        return std.masked_fill(is_free, torch.inf)
 
     def __repr__(self) -> str:
         """Say it in one line."""

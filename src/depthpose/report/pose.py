@@ -144,32 +144,23 @@ def pose_tables(found: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
         rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
         tables["camera_from_model: R | t [m]"] = [[f"{v:.5f}" for v in row] for row in rows]
     if pose is not None and found.covariance is not None:
-        turn_deg, origin_mm = standard_deviations(pose, found.covariance)
-        tables["standard deviations along the camera's axes, about this answer alone"] = [
+        assert found.origin_std_mm is not None
+        assert found.rotation_std_deg is not None
+        stds = {
+            "place of the model's origin along the camera's axes [mm]": found.origin_std_mm,
+            "rotation about the model's axes [deg]": found.rotation_std_deg,
+        }
+        tables["standard deviations about this answer alone"] = [
             ["", "x", "y", "z"],
-            ["rotation [deg]", *(f"{v:.3f}" for v in turn_deg)],
-            ["place of the model's origin [mm]", *(f"{v:.3f}" for v in origin_mm)],
+            *(
+                [what, *(f"{v:.3f}" if math.isfinite(v) else "free" for v in std.tolist())]
+                for what, std in stds.items()
+            ),
         ]
-        tables["covariance of rotation vector [rad] and translation [m], as poses.json has it"] = [
+        tables["covariance at the camera's origin, of rotation [rad] and translation [m]"] = [
             [f"{v:.2e}" for v in row] for row in found.covariance.tolist()
         ]
     return tables
-
-
-def standard_deviations(
-    pose: Rigid, covariance: Float[Tensor, "6 6"]
-) -> tuple[list[float], list[float]]:
-    """Give the standard deviations of the rotation [deg] and of the model's origin [mm].
-
-    The perturbation is a left one: a rotation about the camera moves an origin at t by
-    ``rotation x t``, beside the translation.
-    """
-    t, spread = pose.t_m.double(), covariance.double()
-    turned = torch.linalg.cross(torch.eye(3, dtype=torch.float64), t.expand(3, 3)).mT
-    by = torch.cat([turned, torch.eye(3, dtype=torch.float64)], 1)
-    origin = (by @ spread @ by.mT).diagonal().clamp(min=0).sqrt() * 1000
-    turn = spread.diagonal()[:3].clamp(min=0).sqrt() * 180 / math.pi
-    return turn.tolist(), origin.tolist()
 
 
 def pose_scene(

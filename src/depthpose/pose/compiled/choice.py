@@ -18,6 +18,12 @@ from torch import Tensor
 
 from depthpose.core.errors import Notice
 
+LOOKED_UP, SEARCHED, ON_RAY = 0, 1, 2
+"""How the sample of a surface that a point shows is found."""
+SLACK = 0.1
+"""Sine of the angle by which a surface may face away from the camera and still be seen."""
+GRAZING = 0.1
+"""Sine of the angle between a ray and a plane below which they meet nowhere near."""
 _SWITCH = "DEPTHPOSE_COMPILED"
 """Environment variable; 0 keeps to torch."""
 

@@ -118,7 +118,9 @@ def _select(points, order, low, high, wanted, axis):
 
 
 @compiled
-def neighbours(x, y, z, points, axes, values, places, squares, stack, bounds):
+def neighbours(
+    x, y, z, points, axes, values, places, squares, stack, bounds, outward=None, eye=None, slack=0.0
+):
     """Find the places of a tree nearest to a point: as many as ``places`` holds, the nearest first.
 
     Args:
@@ -132,6 +134,9 @@ def neighbours(x, y, z, points, axes, values, places, squares, stack, bounds):
         squares: (k,), squared distances of ``places``, ascending: beyond them nothing is wanted.
         stack: (64, 3) whole numbers, memory.
         bounds: (64, 4), memory.
+        outward: (m, 3), normals of the places.
+        eye: (3,), a camera that a place must face; None: all count.
+        slack: of :func:`faces`, which is true from there.
     """
     inner, last, top = len(axes), len(places) - 1, 0
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, len(points)
@@ -160,8 +165,17 @@ def neighbours(x, y, z, points, axes, values, places, squares, stack, bounds):
         for place in range(low, high):
             a, b, c = points[place, 0] - x, points[place, 1] - y, points[place, 2] - z
             square = a * a + b * b + c * c
-            if square < squares[last]:
+            if square < squares[last] and (
+                eye is None or faces(place, points, outward, eye, slack)
+            ):
                 _insert(places, squares, last, place, square)
+
+
+@compiled
+def faces(place, points, outward, eye, least):
+    """Whether a surface point shows its outer side to a camera, or nearly."""
+    x, y, z = eye[0] - points[place, 0], eye[1] - points[place, 1], eye[2] - points[place, 2]
+    return outward[place, 0] * x + outward[place, 1] * y + outward[place, 2] * z >= least
 
 
 @compiled

@@ -149,7 +149,7 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
     starts = _starts(last)
     scene_m = scene_about(given, starts, surface)
     near = _is_near(scene_m, starts, surface, MARGIN)
-    is_support = _is_support(scene_m, near)
+    is_support = _is_support(scene_m, near, last.pose.apply(surface.points_m))
     cloud_m = scene_m[near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
@@ -160,12 +160,14 @@ def _follow(given: AnyInput, last: _Last, known: TrackedObject) -> PoseEstimate 
     return _accepted(refined, scene_m, is_support, known, last)
 
 
-def _is_support(scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
+def _is_support(
+    scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
+) -> Bool[Tensor, " n"]:
     """Whether points are of a table or wall that goes on beside the object.
 
     ICP would pull the surface onto them: they lie within its limit all around what rests there.
     """
-    is_support = torch.zeros_like(near)
+    is_support, is_flat = torch.zeros_like(near), torch.zeros(len(posed_m), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     for _ in range(_SUPPORTS):
         beside_m = take_evenly(scene_m[~near & ~is_support], _BESIDE)
@@ -178,9 +180,10 @@ def _is_support(scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"]) -> Bo
             break
         limit_m = _ON * gap_m.square().mean().sqrt()
         is_support |= (scene_m @ normal - offset).abs() < limit_m
-    # What is as flat as the noise cannot be parted from what it lies on.
+        is_flat |= (posed_m @ normal - offset).abs() < limit_m
+    # What is as flat as the noise cannot be parted from what it lies on; else it was taken away.
     few = int((near & ~is_support).sum()) < max(_LEAST_POINTS, 0.2 * int(near.sum()))
-    return torch.zeros_like(near) if few else is_support
+    return torch.zeros_like(near) if few and float(is_flat.double().mean()) > 0.9 else is_support
 
 
 def _accepted(

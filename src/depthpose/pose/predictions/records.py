@@ -129,10 +129,12 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
+    for name in ("origin_std_mm", "rotation_std_deg"):
+        values = getattr(estimate, name)
+        row[name] = None if values is None else [_finite(v) for v in values.tolist()]
     for name in ("inlier_share", "residual_m", "certainty"):
         value: float | None = getattr(estimate, name)
-        # JSON has no infinity, and nothing near the surface is no distance.
-        row[name] = value if value is not None and math.isfinite(value) else None
+        row[name] = None if value is None else _finite(value)
     for name in ("fit", "identity"):
         answer = getattr(estimate, name)
         row[name] = None if answer is None else asdict(answer)
@@ -147,6 +149,11 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     if estimate.tracking is not None:
         row["tracking"] = estimate.tracking
     return row | {"signals": dict(estimate.signals), "seconds": dict(estimate.seconds)}
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: a free axis has no deviation, nothing near the surface no distance."""
+    return value if math.isfinite(value) else None
 
 
 def _matrix(pose: Rigid) -> list[list[float]]:
