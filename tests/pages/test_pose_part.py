@@ -25,7 +25,7 @@ FOUND_HERE = PoseEstimate(
     camera_from_model=POSE,
     covariance=torch.eye(6).double() * 1e-6,
     inlier_share=0.5,
-    risk=0.125,
+    certainty=0.875,
 )
 REFUSED = PoseEstimate(
     name="one", object="bracket", status="doubtful", reason="the votes <do not> meet"
@@ -56,7 +56,7 @@ def test_the_numbers_are_those_of_the_estimate() -> None:
         assert std is not None
         assert [float(cell) for cell in row[1:]] == pytest.approx(std.tolist(), abs=1e-3)
     assert [float(row[k]) for k, row in enumerate(covariance)] == [1e-6] * 6
-    assert dict(section.facts)["risk that no named pose is right"] == "0.125"
+    assert dict(section.facts)["certainty of this pose"] == "0.875"
     x, y, z = POSE.t_m.tolist()
     assert (
         section.text
