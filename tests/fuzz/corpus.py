@@ -428,6 +428,7 @@ def _kitti() -> dict[str, Kind]:
             beside=files, is_folder=True,
         )
         for name, good in files.items()
+        if name.endswith(tuple(hurt))
     }  # fmt: skip
     lines = b"a 640 480 500 320 240 0.5\nb 640 480 500 320 240 0.5\n"
     of_object = (

@@ -35,7 +35,6 @@ from depthpose.pose.train import (
     PointNetTraining,
     SegmentationTraining,
 )
-from depthpose.pose.train.config import CalibrationConfig
 from depthpose.pose.train.depth_image import TrainingCrops, surface_points, symmetric_copies
 from depthpose.pose.train.images import (
     AnnotatedImages,
@@ -62,7 +61,7 @@ def pointnet_config(folder: Path) -> PointNetTraining:
     network = PointNetConfig(local=(4, 4), pooled=(4, 4, 8), head=(8, 8, 8), with_transforms=False)
     return PointNetTraining(
         models=ModelsConfig(bop=str(folder)), objects=VIEWS, network=network, held_out=HELD_OUT,
-        cloud=CloudConfig(max_points=50), loop=LOOP, calibration=CalibrationConfig(number=0),
+        cloud=CloudConfig(max_points=50), loop=LOOP,
     )  # fmt: skip
 
 
