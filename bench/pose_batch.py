@@ -21,14 +21,14 @@ from real_poses import real_cases
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.pose.types import CloudInput
+from depthpose.pose.types import CloudInput, ViewInput
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.tables import markdown_table
 
 NUMBER = 20
 
 
-def inputs_of(folder: Path, net: GeoPoseNet) -> list[CloudInput]:
+def inputs_of(folder: Path, net: GeoPoseNet) -> list[CloudInput | ViewInput]:
     """Take the instances that a network knows in turn, until there are twenty."""
     known = [c.sample.input for c in real_cases(folder) if c.sample.input.object in net.objects]
     return [known[k % len(known)] for k in range(NUMBER)]

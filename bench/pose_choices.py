@@ -25,7 +25,7 @@ from depthpose.core.files import write_json
 from depthpose.core.loop import Run
 from depthpose.pose.baselines.config import PointNetConfig
 from depthpose.pose.train import STAGES, PoseTraining
-from depthpose.pose.train.config import CalibrationConfig, HeldOutConfig, ModelsConfig
+from depthpose.pose.train.config import HeldOutConfig, ModelsConfig
 from depthpose.report.tables import markdown_table, write_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml"
@@ -53,7 +53,6 @@ def config_of(arm: str, cad: Path, steps: int, seed: int) -> tuple[str, PoseTrai
         "models": ModelsConfig(cad=(str(cad),), unit="mm"),
         "start": None,
         "held_out": HeldOutConfig(number=200),
-        "calibration": CalibrationConfig(number=0),
         "loop": replace(base.loop, steps=steps, validate_every_steps=steps, seed=seed),
         part: change if stage == "pointnet" else replace(settings[part], **change),
     }

@@ -219,7 +219,7 @@ def _picture_name(scene: int, image: int) -> str:
 def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
     picture = picture_of(instance)
     for estimate in estimates:
-        assert estimate.is_posed
+        assert estimate.camera_from_model is not None
         model = _model(method, estimate.object)
         picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
     return picture
