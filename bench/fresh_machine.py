@@ -62,8 +62,9 @@ class Machine:
 
 
 def readme_commands() -> list[str]:
-    """Commands of the README's shell blocks, shortened where they would take hours."""
-    text = (PROJECT / "README.md").read_text()
+    """Commands of README, quick start and weights, shortened where they would take hours."""
+    pages = ("README.md", "docs/quickstart.md", "docs/weights.md")
+    text = "\n".join((PROJECT / page).read_text() for page in pages)
     blocks = re.findall(r"^```bash\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     for long, short in SHORTER.items():
@@ -82,7 +83,7 @@ def main() -> None:
         machine = Machine(Path(name), words.data)
         work = machine.folder / "work"
         work.mkdir()
-        machine.run(f"git clone --quiet {PROJECT} depthpose", machine.folder)
+        machine.run(f"git clone --quiet --depth 1 file://{PROJECT} depthpose", machine.folder)
         for target in ("demo", *(("check", "test") if words.with_tests else ())):
             machine.run(f"make {target}", machine.clone)
         machine.run("pip wheel --quiet --no-deps --wheel-dir wheels depthpose/", machine.folder)
