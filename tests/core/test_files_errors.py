@@ -240,7 +240,6 @@ BAD_WRITES: list[tuple[Callable[[Path], None], str]] = [
     (lambda p: write_cloud(p / "x.ply", Cloud(points=torch.ones(1, 3) / 0)), "NaN or infinity"),
     (lambda p: write_json(p / "x.json", float("nan")), "cannot be written as JSON: .*; use null"),
     (lambda p: write_json(p / "x.json", {"a": {1, 2}}), "cannot be written as JSON: .* set"),
-    (lambda p: write_json(p / "x.json", "\ud800"), "cannot be written as JSON: .*surrogates"),
     (lambda _: write_json("/proc/none/x.json", {}), r"/proc/none/x\.json: cannot be written"),
 ]
 
