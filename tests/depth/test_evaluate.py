@@ -271,7 +271,7 @@ def test_a_prediction_of_which_a_file_is_damaged_is_made_again(
     readers = {name: lambda i=i: pairs.read_input(i) for i, name in enumerate(sources)}
     list(predict(net, readers, tmp_path, {}, sources))
     files = {path: path.read_bytes() for path in sorted(tmp_path.glob("a.*"))}
-    assert len(files) == 4
+    assert len(files) == 5, list(files)
     for path, good in files.items():
         for damaged in (None, good[: len(good) // 2], b"", good[:-1] + b"?"):
             path.unlink() if damaged is None else path.write_bytes(damaged)

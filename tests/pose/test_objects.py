@@ -22,6 +22,7 @@ _CLEAN = {
     "occluded_share": 0.0,
     "with_background": False,
     "mask_error_px": 0,
+    "mask_shift_px": 0,
     "sensor": SensorConfig(kinds=("none",)),
 }
 

@@ -141,7 +141,9 @@ def test_what_the_network_doubts_is_registered_where_wanted() -> None:
         assert one.camera_from_model is not None
         error_m = add_m(one.camera_from_model, sample.truth.camera_from_model, points_m)
         assert float(error_m) < 0.05 * model.diameter_m
-        assert {"network", "registration"} <= one.seconds.keys()
+        assert "network" in one.seconds
+    # Where everything agrees, nothing is left to doubt.
+    assert sum("registration" in one.seconds for one, _ in answered) >= 1
 
 
 def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:

@@ -76,7 +76,7 @@ class Done:
         shard: name of the shard, with its suffix.
         entries: name and "" or the reason of its failure, for each input.
         endings: that the files of a result may have.
-        stamp: size, time and checksum of the shard (:func:`depthpose.core.results.file_stamp`).
+        stamp: size, time and checksum of the shard (``file_stamp`` of core.results).
         block: checksum of the inputs.
     """
 

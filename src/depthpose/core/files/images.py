@@ -53,7 +53,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Read a picture as RGB in [0, 1].
 
     Greyscale becomes three equal channels, a palette its colours; alpha is dropped, the EXIF
-    orientation applied, and 16 bits a channel scaled by :func:`from_16_bit`.
+    orientation applied, and 16 bits a channel scaled by ``from_16_bit``.
 
     Raises:
         InputError: the file is missing, damaged, too large or not a picture.
