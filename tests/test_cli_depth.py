@@ -411,7 +411,7 @@ def test_the_page_shows_some_of_many_and_the_numbers_of_their_files(
     for name, scene, said in zip(names, page.scenes, facts, strict=True):
         depth_m = read_map(out / f"{name}.depth_m.npy")
         known_m = depth_m[depth_m.isfinite()]
-        numbers = [float(f(known_m)) for f in (torch.min, torch.median, torch.max)]
+        numbers = np.percentile(known_m.numpy(), (1, 50, 99))
         assert said == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
         assert scene["layers"][0]["count"] == int((known_m <= 80).sum())
 

@@ -155,7 +155,7 @@ class KnowsPose:
 
     def find(self, depth_m: np.ndarray, camera: Camera, objects: object) -> list[Any]:  # noqa: ARG002
         self.asked = (depth_m.shape, objects)
-        return [SimpleNamespace(object="cup", camera_from_model=self.pose)]
+        return [SimpleNamespace(object="cup", camera_from_model=self.pose, is_ok=True)]
 
     def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401
         is_ok = bool(mask.any())

@@ -53,7 +53,7 @@ PAGE = "report.html"
 _MOST_SHOWN = 20
 """Of the answers, on the terminal; poses.json holds all."""
 _FRAME = """camera_from_model: x right, y down, z forward
-certainty: the chance that the pose is right; risk: that neither it nor an alternative is"""
+certainty: the chance that the pose is right and not one of its alternatives"""
 _SAID = 5
 """Of so many inputs the alternatives are printed; of all they are in poses.json."""
 
