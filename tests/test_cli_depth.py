@@ -12,6 +12,7 @@ import warnings
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 from tests.core.test_camera_rectified import pair, texture
