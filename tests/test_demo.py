@@ -73,7 +73,7 @@ def test_the_demo_leaves_a_page_a_table_and_a_usable_pair(tmp_path: Path) -> Non
     assert headings[0] == "Parts on a table", "poses lead, one image comes last"
     assert headings[1] == "The motorcycle"
     assert headings[-1].endswith("one image")
-    assert all(0 < row["abs_rel"] < 0.35 for row in rows if row["input"] == "both images"), rows
+    assert all(0 < row["abs_rel"] < 0.2 for row in rows if row["input"] == "both images"), rows
     assert 0 < rows[-1]["abs_rel"] < 0.6
     assert rows[-1]["coverage"] == 1.0
     camera = read_camera(tmp_path / "street/camera.json")

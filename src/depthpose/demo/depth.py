@@ -64,8 +64,12 @@ def show_depth(
 
 def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
     """Methods of a scene; the generator knows streets alone, so it draws no motorcycle."""
-    # The nearest surfaces of both scenes; OpenCV leaves that many columns unmatched.
-    columns = 16 * math.ceil(sample.input.left.shape[2] / 16 / 10)
+    # The nearest surfaces of both scenes, in views moved by the distance of the principal points;
+    # OpenCV leaves that many columns unmatched.
+    rig = sample.input.camera
+    assert isinstance(rig, StereoRig)
+    nearest_px = sample.input.left.shape[2] / 10 + max(rig.cx_right_minus_left_px, 0.0)
+    columns = 16 * math.ceil(nearest_px / 16)
     sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
     matched = {} if network.matcher is None else {"stereo network": (_FROM_PAIR, network)}
     filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
