@@ -347,7 +347,7 @@ def test_a_data_set_of_poses_gives_the_files_of_the_plain_command(
     assert main(big) == 0
     again = [row["status"] for row in without_seconds(tmp_path / "big")]
     assert len(again) == 4
-    assert set(again) == {"ok", "ambiguous"}
+    assert "unreadable" not in again
     assert (tmp_path / "big" / "shards" / "000000.json").stat().st_mtime_ns != before
 
 
