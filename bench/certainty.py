@@ -25,7 +25,7 @@ from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.estimator.alternatives import find_copies
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 SEED = 0xCE47
 NOISES = (1.0, 1.0, 3.0)

@@ -23,7 +23,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import StereoInput
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 DISPARITIES = 192
 FOCAL_PX = 721.5

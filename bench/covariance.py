@@ -27,7 +27,7 @@ from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import SensorConfig, SensorKind
 from depthpose.pose.refine import refine_pose
 from depthpose.pose.surface import prepare_surface
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
 WIDTH, HEIGHT, FOCAL_PX, AWAY_M, BEHIND_M = 640, 480, 600.0, 0.7, 0.9

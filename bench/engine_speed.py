@@ -17,7 +17,7 @@ import torch
 
 from depthpose.core.files import write_image
 from depthpose.core.run import environment
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 
 def main() -> None:

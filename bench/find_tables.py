@@ -28,7 +28,7 @@ from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 0x7AB1E
 Row = dict[str, Any]

@@ -16,12 +16,12 @@ import torch
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import StereoRig
-from depthpose.demo.depth import read_motorcycle
+from depthpose.demo import read_motorcycle
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import StereoSample
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SGBM = "SGBM, holes filled"
 LIMITS_PX = (1.0, 2.0, 3.0)

@@ -29,7 +29,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import MATCHERS, NetworkMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
 

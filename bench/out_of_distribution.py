@@ -24,13 +24,13 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.files import read_image
-from depthpose.demo.depth import read_motorcycle
+from depthpose.demo import read_motorcycle
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import is_road
 from depthpose.depth.types import StereoInput
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 PAIRS = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
          "street_pairs/kitti_single", "street_pairs/kitti2015_eval_drives", "more/kitti_road",

@@ -25,7 +25,7 @@ from depthpose.pose.metrics import is_within_diameter
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.train.held_out import held_out_objects, pose_error
 from depthpose.pose.weights import PoseWeights, read_pose_weights
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 CONFIG = Path(__file__).parents[1] / "configs/pose/own-part.yaml"
 

@@ -23,7 +23,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.pose.estimator import GeoPoseNet
 from depthpose.pose.types import CloudInput, ViewInput
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 NUMBER = 20
 

@@ -26,7 +26,7 @@ from depthpose.pose.estimator.evidence import log_signal
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import PoseEstimate
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 0xCA5E
 BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.01))

@@ -26,7 +26,7 @@ from depthpose.core.loop import Run
 from depthpose.pose.baselines.config import PointNetConfig
 from depthpose.pose.train import STAGES, PoseTraining
 from depthpose.pose.train.config import HeldOutConfig, ModelsConfig
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "pose" / "own-part.yaml"
 WIDE = {"encoder": (32, 64, 128, 256), "decoder": (64, 64, 64, 128)}

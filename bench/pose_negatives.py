@@ -34,7 +34,7 @@ from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
 from depthpose.pose.train.held_out import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 0x0DD
 TOGETHER = 32

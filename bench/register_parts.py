@@ -28,7 +28,7 @@ from depthpose.pose.synthetic import Objects, random_part, random_simple_part
 from depthpose.pose.synthetic.negatives import NegativeKind, negative_kinds, negative_of
 from depthpose.pose.train.held_out import pose_error
 from depthpose.pose.types import ObjectModel
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 0x9A27
 VIEWS = 8

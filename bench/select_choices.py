@@ -42,7 +42,7 @@ from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import SelectTraining, ViewTraining
 from depthpose.depth.weights import read_generator, read_matcher, write_depth_weights
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 FOCAL_PX = 186.0
 """A quarter of KITTI's resolution: an arm takes minutes on one core."""

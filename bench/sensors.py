@@ -22,7 +22,7 @@ from torch import Tensor
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.augment import measure
 from depthpose.pose.config import SensorConfig, SensorKind
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 _BASELINE_M = 0.075
 _LAGS = (1, 2, 4, 8)

@@ -14,7 +14,7 @@ from depthpose import FakestereoNet
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 90
 """No weights were trained on streets of this seed."""

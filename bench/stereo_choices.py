@@ -25,7 +25,7 @@ from depthpose.core.loop import Run
 from depthpose.depth.config import AugmentConfig, PairsConfig, StreetsConfig
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import StereoTraining
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 RECIPE = Path(__file__).parents[1] / "configs/depth/light-stereo.yaml"
 FOCAL_PX = 558.0

@@ -37,7 +37,7 @@ from depthpose.pose.metrics import add_m, adds_m, risk_coverage
 from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 SEED = 0x7E57ED
 POINTS = 1000

@@ -38,7 +38,7 @@ from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_share
 from depthpose.pose.synthetic import drawn_triangles
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 SEED = 0x7AC4
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 572.0

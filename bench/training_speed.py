@@ -24,7 +24,7 @@ from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import FinetuneTask, StereoTask, TrainingPairs, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 

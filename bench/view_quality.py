@@ -20,7 +20,7 @@ from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthetic import StreetFrame, draw_street
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 
 def mean(values: Tensor, mask: Tensor) -> float:

@@ -17,9 +17,8 @@ from depthpose.core.camera import (
     Rectifier,
     StereoRig,
     back_project,
-    epipolar_residual,
+    check_rectified,
     make_rectifier,
-    match_features,
     project,
     read_rig,
 )
@@ -62,11 +61,12 @@ def rectifier_of(drawn: DrawnPair) -> Rectifier:
 
 
 def test_rows_agree_after_and_not_before(drawn: DrawnPair) -> None:
-    raw = epipolar_residual(match_features(drawn.left, drawn.right))
-    assert raw.median_px > 1
-    after = epipolar_residual(match_features(*rectifier_of(drawn).rectify(drawn.left, drawn.right)))
+    assert check_rectified(drawn.left, drawn.right).is_rectified is False
+    rectifier = rectifier_of(drawn)
+    after = check_rectified(*rectifier.rectify(drawn.left, drawn.right))
     assert after.matches > 50
-    assert after.median_px < 0.3
+    assert abs(after.vertical_offset_px) < 0.3
+    assert after.is_rectified
     assert not after.is_swapped
 
 
@@ -99,7 +99,7 @@ def test_the_folder_is_what_match_and_check_take(
 ) -> None:
     assert rectify(home) == 0
     shown = capsys.readouterr().out
-    assert "epipolar residual: median 0." in shown
+    assert "rows of 1 pairs: they differ by 0." in shown
     out = home / "out"
     rig = read_rig(out / "camera.json")
     assert rig.baseline_m == pytest.approx(0.54)
@@ -195,7 +195,7 @@ def test_another_rigs_calibration_is_refused_or_warned_of(
     assert rectify(home, "--no-check", camera=camera) == 0
     assert "this is not the calibration" in capsys.readouterr().err
     assert rectify(home, camera=other_calibration(home, 0.002), out="near") == 0
-    assert "the median is above 0.5 px" in capsys.readouterr().err
+    assert "that is above 0.5 px" in capsys.readouterr().err
 
 
 def test_a_bare_scene_cannot_be_checked(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,7 +203,7 @@ def test_a_bare_scene_cannot_be_checked(home: Path, capsys: pytest.CaptureFixtur
     for side in ("left", "right"):
         write_image(home / f"raw/{side}.png", grey)
     assert rectify(home) == 0
-    assert "only 0 features match" in capsys.readouterr().err
+    assert "the rows cannot be checked: the left image shows nothing" in capsys.readouterr().err
 
 
 def test_images_of_another_size_are_refused(

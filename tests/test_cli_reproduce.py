@@ -23,7 +23,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.evaluate import DecileRow, Evaluation
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.thesis.depth_tables import find_table
+from depthpose.thesis.depth import find_table
 
 CAMERA_Z = ("--protocol", "eigen-raw-camera")
 

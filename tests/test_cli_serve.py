@@ -6,7 +6,7 @@ import pytest
 
 from depthpose.cli import main
 from depthpose.web import Limits, known_names, taken_address
-from depthpose.web.guard import LOOPBACK
+from depthpose.web.app import LOOPBACK
 
 
 def _has_ipv6() -> bool:

@@ -12,9 +12,7 @@ from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
 from depthpose.core.run import read_settings
-from depthpose.demo import make_demo
-from depthpose.demo.depth import _nets, read_motorcycle
-from depthpose.demo.pose import show_poses
+from depthpose.demo import _nets, make_demo, read_motorcycle, show_poses
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import make_synthesiser

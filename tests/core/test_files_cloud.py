@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import Cloud, read_cloud, read_points_bin, write_cloud
-from depthpose.core.files.pcd import decompress_lzf
+from depthpose.core.files.points import decompress_lzf
 
 POINTS = torch.tensor([[0.0, 1.5, -2.0], [3.25, 4.0, 5.0]])
 COLOR = torch.tensor([[255.0, 0, 7], [1, 2, 3]]) / 255

@@ -134,13 +134,13 @@ from onnx import helper, numpy_helper
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
-from depthpose.core.export.freeze import Export, freeze
+from depthpose.core.export import Export, freeze
 from depthpose.core.files import (
     Cloud, write_cloud, write_depth_png, write_image, write_map, write_video
 )
 from depthpose.core.loop import Journal
 from depthpose.core.loop.folder import write_state
-from depthpose.report.tables import Section, write_page, write_table
+from depthpose.report.page import Section, write_page, write_table
 from depthpose.core.run import claim_folder
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from depthpose.core.files import (
     write_disparity_png,
     write_image,
 )
-from depthpose.core.files.names import find_partners
+from depthpose.core.files.disk import find_partners
 from depthpose.core.files.store import list_files
 
 

@@ -13,9 +13,16 @@ import pytest
 from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
-from depthpose.core.lock import held_folders, lock_folder, release_folders, write_once
 from depthpose.core.loop import LoopConfig, Run, releases_folder
-from depthpose.core.run import RECORD, claim_folder, read_settings
+from depthpose.core.run import (
+    RECORD,
+    claim_folder,
+    held_folders,
+    lock_folder,
+    read_settings,
+    release_folders,
+    write_once,
+)
 
 HOLDER = """
 import sys, time
@@ -132,7 +139,7 @@ def test_a_record_that_cannot_be_opened_is_refused(
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     (tmp_path / RECORD).write_text("{}")
-    monkeypatch.setattr("depthpose.core.lock.os.open", refuse)
+    monkeypatch.setattr("depthpose.core.run.os.open", refuse)
     with pytest.raises(InputError, match="cannot be written: Read-only file system"):
         lock_folder(tmp_path / RECORD, is_shared=False)
 

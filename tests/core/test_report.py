@@ -10,10 +10,11 @@ from PIL import Image
 
 from depthpose.core.draw import rising_scale
 from depthpose.core.files import Cloud, write_image
-from depthpose.report.scene import Layer, Scene
-from depthpose.report.tables import (
+from depthpose.report.page import (
     Drawing,
+    Layer,
     Picture,
+    Scene,
     Section,
     csv_table,
     markdown_table,

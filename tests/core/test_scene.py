@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from depthpose.core.files import Cloud
-from depthpose.report import scene as scenes
-from depthpose.report.scene import Layer, Lines, Scene, colored_lines, frame_axes, page_file
+from depthpose.report import page as scenes
+from depthpose.report.page import Layer, Lines, Scene, colored_lines, frame_axes, page_file
 
 
 def decoded(layer: dict) -> tuple[np.ndarray, np.ndarray]:

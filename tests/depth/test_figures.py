@@ -4,8 +4,8 @@ import torch
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.tables import Drawing
-from depthpose.thesis.depth_figures import arrange, draw_figure_2_1, draw_figure_2_5
+from depthpose.report.page import Drawing
+from depthpose.thesis.depth import arrange, draw_figure_2_1, draw_figure_2_5
 
 H, W = 20, 60
 

@@ -4,7 +4,7 @@ import pytest
 
 from depthpose.core.errors import InputError
 from depthpose.depth.evaluate import MeanRow
-from depthpose.thesis.depth_tables import TABLES, find_table, join_published
+from depthpose.thesis.depth import TABLES, find_table, join_published
 
 OURS = MeanRow(
     method="net",

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-from depthpose.report.tables import Drawing, Section
+from depthpose.report.page import Drawing, Section
 
 _TEXT = {"h1", "h2", "p", "td", "dd", "dt", "figcaption"}
 

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from depthpose.report.choose import (
+from depthpose.report.page import (
     MOST_VIEWS,
     choose_answers,
     choose_ranked,

@@ -13,9 +13,8 @@ from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.predictions import Prediction, prediction_row
 from depthpose.pose.types import Axis, CloudInput, PoseEstimate, ViewInput
 from depthpose.pose.voting import free_motions
-from depthpose.report.overlay import FOUND, TRUE
-from depthpose.report.pose import PoseShown, pose_section
-from depthpose.report.tables import Section
+from depthpose.report.page import Section
+from depthpose.report.pose import FOUND, TRUE, PoseShown, pose_section
 
 POSE = pose_at(seed=1)
 FOUND_HERE = PoseEstimate(

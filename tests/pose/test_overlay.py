@@ -6,8 +6,8 @@ from tests.pose.synthetic_objects import Oracle, box_faces, bracket, cloud_of, p
 from depthpose.core.files import Cloud
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
-from depthpose.report.overlay import TRUE, crease_edges, keypoint_layers, pose_layers, vote_layer
-from depthpose.report.scene import Lines
+from depthpose.report.page import Lines
+from depthpose.report.pose import TRUE, crease_edges, keypoint_layers, pose_layers, vote_layer
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:

@@ -17,8 +17,7 @@ from tests.web.samples import PART, write_street, write_view
 
 from depthpose.cli import main
 from depthpose.core.files import Cloud
-from depthpose.report.scene import Layer, Scene, colored_lines
-from depthpose.report.tables import Section, write_page
+from depthpose.report.page import Layer, Scene, Section, colored_lines, write_page
 
 pytestmark = pytest.mark.slow
 

@@ -12,9 +12,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.camera.facts import CameraFacts, camera_from_facts
-from depthpose.core.camera.storage import named
-from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair
+from depthpose.core.camera.pinhole import CameraFacts, camera_from_facts
+from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair, named
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files.images import from_16_bit
 from depthpose.core.rigid import Rigid

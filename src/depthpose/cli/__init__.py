@@ -173,7 +173,7 @@ def _command(given: list[str]) -> int:
     name, rest = _split_command(given)
     if name is None:
         return _explain(given)
-    lock = sys.modules.get("depthpose.core.lock")  # not imported for --help
+    lock = sys.modules.get("depthpose.core.run")  # not imported for --help
     before = lock.held_folders() if lock is not None else ()
     try:
         with _notices_in_a_line():
@@ -187,7 +187,7 @@ def _command(given: list[str]) -> int:
             raise
         return _fail(f"error: {said}")
     finally:
-        if (lock := sys.modules.get("depthpose.core.lock")) is not None:
+        if (lock := sys.modules.get("depthpose.core.run")) is not None:
             lock.release_folders(but=before)
 
 

@@ -24,7 +24,7 @@ def demo(
     from functools import partial
 
     from depthpose.demo import make_demo
-    from depthpose.report.tables import plain_table
+    from depthpose.report.page import plain_table
 
     result = make_demo(out, weights, pose_weights, on_message=partial(print, flush=True))
     print(plain_table(result.poses, _OF_POSES))

@@ -67,7 +67,7 @@ def _facts(weights: str, path: Path, card: Any) -> dict[str, Any]:  # noqa: ANN4
 
 def _say(out: Path, rows: Any) -> int:  # noqa: ANN401
     from depthpose.core.export import proof_path
-    from depthpose.report.tables import markdown_table
+    from depthpose.report.page import markdown_table
 
     shown = [{k: f"{v:.1e}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     print(markdown_table(shown), end="")

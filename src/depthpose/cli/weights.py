@@ -17,7 +17,7 @@ def list_weights(folder: Path | None = None) -> int:
         folder: list the weights in this folder instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-    from depthpose.report.tables import plain_table
+    from depthpose.report.page import plain_table
 
     home = folder or SHIPPED
     found = sorted(home.glob("*.safetensors"))

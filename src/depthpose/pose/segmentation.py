@@ -27,8 +27,7 @@ from depthpose.core.checkpoint import (
     save_checkpoint,
     warn_of_terms,
 )
-from depthpose.core.config import config_from_dict, config_to_dict
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings, config_from_dict, config_to_dict
 from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 from depthpose.pose.resnet import ResNet18, normalise_colors

@@ -19,8 +19,7 @@ from depthpose.core.draw import (
 )
 from depthpose.depth.predictions import COLOR_RANGE_M, estimate_cloud
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.scene import Layer, Scene, colored_points
-from depthpose.report.tables import Drawing, Section
+from depthpose.report.page import Drawing, Layer, Scene, Section, colored_points
 
 WORST_PX = 4.0
 """Of disparity: the brightest colour of an error."""

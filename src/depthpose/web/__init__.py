@@ -1,8 +1,8 @@
 """The browser page of ``depthpose serve``: depth and pose by a form."""
 
 from depthpose.web.app import Limits as Limits
+from depthpose.web.app import known_names as known_names
 from depthpose.web.app import make_app as make_app
-from depthpose.web.server import known_names as known_names
-from depthpose.web.server import open_socket as open_socket
-from depthpose.web.server import run as run
-from depthpose.web.server import taken_address as taken_address
+from depthpose.web.app import open_socket as open_socket
+from depthpose.web.app import run as run
+from depthpose.web.app import taken_address as taken_address

@@ -2,6 +2,7 @@
 
 import math
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from depthpose.core.files import DEPTH_SUFFIXES, cloud_suffixes, image_size, wri
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.mesh import mesh_suffixes
-from depthpose.report.scene import Scene
+from depthpose.report.page import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -198,3 +199,16 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
     kept = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
     write_bytes(kept, data)
     return kept
+
+
+EXAMPLE_SEED = 9
+"""No weights were trained on streets or views of this seed."""
+
+
+def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:
+    """Give the content of a form as the page takes it; each file is named after its field."""
+    files = [
+        {"field": p.stem, "name": f"example-{p.name}", "data": b64encode(p.read_bytes()).decode()}
+        for p in sorted(folder.iterdir())
+    ]
+    return {"files": files, "fields": fields}

@@ -1,43 +1,275 @@
-"""The web application: routes, limits, one computation at a time, nothing kept on the disk."""
+"""The web application: checks of requests, a queue for one computation, routes, the server.
 
+Host and origin, sizes and files are checked; uploads that are too slow are ended. Nothing is kept
+on the disk.
+"""
+
+import io
 import secrets
+import socket
+import time
+import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import cache, partial
 from io import BytesIO
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
+import anyio
+import uvicorn
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from depthpose import __version__
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.estimator import GeoPoseNet
-from depthpose.report.scene import page_file
-from depthpose.web.answer import KINDS, Answer, Form, Shown, without_paths
-from depthpose.web.depth import answer_depth
-from depthpose.web.examples import depth_example, pose_example
-from depthpose.web.guard import (
-    LOOPBACK,
-    AdaptationCheck,
-    crash_response,
-    error_response,
-    read_form,
-    refuse_size,
-    zip_files,
-)
-from depthpose.web.pose import answer_pose
-from depthpose.web.queue import Queue, has_gone, paced
+from depthpose.report.page import page_file
+from depthpose.web.answer import KINDS, Answer, Form, Shown, keep_file, without_paths
+from depthpose.web.depth import answer_depth, depth_example
+from depthpose.web.pose import answer_pose, pose_example
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_SAFE = {
+    # Nothing is loaded from elsewhere, and nobody else may show the page in a frame.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+_MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
+
+
+class AdaptationCheck:
+    """Refuses requests from other pages, and tells the browser what this page may load.
+
+    Args:
+        app: what answers all other requests.
+        hosts: host names under which the page may be requested; None: any.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: tuple[str, ...] | None) -> None:
+        self._app, self._hosts = app, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def send_safely(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_SAFE)
+            await send(message)
+
+        is_request = scope["type"] == "http"
+        refusal = refuse_other_host(Request(scope), self._hosts) if is_request else None
+        await (refusal or self._app)(scope, receive, send_safely)
+
+
+def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
+    """Refuse a request under another name than ours, or sent by another web page."""
+    host = request.headers.get("host", "")
+    name = _host_name(host)
+    if hosts is not None and name not in hosts:
+        return _sentence(
+            403, f"this page answers to {', '.join(hosts)}, not to {host!r}; start "
+            "'depthpose serve' with --host to name another"
+        )  # fmt: skip
+    origin = request.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != host:
+        return _sentence(403, f"the request comes from another page, {origin}; open this one")
+    return None
+
+
+def _host_name(host: str) -> str | None:
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:  # such as half of a bracket
+        return None
+
+
+def refuse_size(request: Request, most: int) -> None:
+    """Refuse what is too large before it is read.
+
+    A server reads no more than the announced size, except of a body in chunks.
+
+    Raises:
+        HTTPException: no size, or too large a one.
+    """
+    text = request.headers.get("content-length", "")
+    if not text.isdecimal() or "transfer-encoding" in request.headers:
+        raise HTTPException(
+            411,
+            "the request has no Content-Length, or comes in chunks; send it whole, with its size",
+        )
+    if int(text) > most:
+        raise HTTPException(
+            413,
+            f"the files are {int(text) / 1e6:.1f} MB together, more than the {most / 1e6:.0f} MB "
+            "allowed; send smaller ones, or start 'depthpose serve' with a larger --max-upload-mb",
+        )
+
+
+async def read_form(request: Request, folder: Path) -> Form:
+    """Read the fields, and put the files into the folder.
+
+    Raises:
+        InputError: a file of a type that its field does not take.
+        HTTPException: more files or fields than the page has, or no form at all.
+    """
+    fields: dict[str, str] = {}
+    files: dict[str, Path] = {}
+    async with request.form(
+        max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
+    ) as form:
+        for name, value in form.multi_items():
+            if not isinstance(value, UploadFile):
+                fields[name] = value
+            elif name in files:
+                raise InputError(f"{name}: two files; choose one")
+            elif value.filename:
+                files[name] = keep_file(folder, name, value.filename, await value.read())
+    return Form(folder=folder, fields=fields, files=files)
+
+
+def zip_files(files: Mapping[str, bytes]) -> bytes:
+    """Put files into one ZIP, as they are: most are compressed already."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return packed.getvalue()
+
+
+async def error_response(_: Request, error: Exception) -> Response:
+    """Answer a refusal with its message."""
+    assert isinstance(error, HTTPException)
+    return _sentence(error.status_code, error.detail, error.headers)
+
+
+async def crash_response(_: Request, error: Exception) -> Response:
+    """Answer an unexpected error; the trace is on the server's terminal."""
+    kind = type(error).__name__
+    return _sentence(500, f"depthpose failed ({kind}: {error}); see the server's terminal")
+
+
+def _sentence(status: int, said: str, headers: Mapping[str, str] | None = None) -> Response:
+    return JSONResponse({"error": said}, status_code=status, headers=headers)
+
+
+Result = TypeVar("Result")
+
+GRACE_S, LEAST_BYTES_S = 10.0, 20_000
+"""An upload with fewer bytes a second, after so many seconds, is ended: it keeps others waiting."""
+MOMENT_S = 0.02
+_FULL = "too many requests wait for one computation; try again later"
+
+
+class Queue:
+    """Computations, one at a time.
+
+    Args:
+        most: requests that may wait for the one that is computed.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._one = anyio.CapacityLimiter(1)
+        self._tickets: list[str] = []
+
+    def refuse_full(self) -> None:
+        """Refuse one more.
+
+        Raises:
+            HTTPException: too many wait.
+        """
+        if len(self._tickets) > self._most:  # one of them is at work
+            raise HTTPException(503, _FULL)
+
+    def before(self, ticket: str) -> int | None:
+        """Count the computations that end before that of a ticket; None: it does not wait here."""
+        return self._tickets.index(ticket) if ticket in self._tickets else None
+
+    async def compute(
+        self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
+    ) -> Result | None:
+        """Compute in a thread once all earlier computations are done.
+
+        Args:
+            ticket: name by which the client asks for its place in the queue.
+            work: what is computed.
+            is_gone: whether the client has left.
+
+        Returns:
+            The result; None where the client has left: then nothing was computed.
+
+        Raises:
+            HTTPException: too many wait.
+        """
+        self.refuse_full()
+        self._tickets.append(ticket)
+        try:
+            async with self._one:
+                if await is_gone():
+                    return None
+                return await anyio.to_thread.run_sync(work)
+        finally:
+            self._tickets.remove(ticket)
+
+
+async def has_gone(receive: Receive) -> bool:
+    """Whether the client of a request that was read whole has closed its connection.
+
+    What is still to come of the request is read first, and the server gets a moment to see the
+    end of a connection from which it had stopped reading.
+    """
+    with anyio.move_on_after(MOMENT_S):
+        while (await receive())["type"] != "http.disconnect":
+            pass
+        return True
+    return False
+
+
+def paced(receive: Receive) -> Receive:
+    """Give a request's body as long as it keeps a pace.
+
+    Raises:
+        HTTPException: when it is awaited: the client sends too slowly.
+    """
+    start, size = time.monotonic(), 0
+
+    async def receive_in_time() -> MutableMapping[str, Any]:
+        nonlocal size
+        left_s = start + GRACE_S + size / LEAST_BYTES_S - time.monotonic()
+        try:
+            with anyio.fail_after(max(left_s, 0.0)):
+                message = await receive()
+        except TimeoutError as error:
+            raise HTTPException(
+                408,
+                f"the upload came too slowly ({size} bytes in {time.monotonic() - start:.0f} s, "
+                f"less than {LEAST_BYTES_S} a second); send smaller files",
+                # What is still to come is not waited for.
+                headers={"Connection": "close"},
+            ) from error
+        size += len(message.get("body", b""))
+        return message
+
+    return receive_in_time
+
 
 TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its place in the queue."""
@@ -220,3 +452,58 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
         middleware=[Middleware(AdaptationCheck, hosts=limits.hosts)],
         exception_handlers={HTTPException: error_response, Exception: crash_response},
     )
+
+
+_CONNECTIONS = 400
+"""At once; beyond, a connection is answered with 503 before anything of it is read."""
+_LEAVE_S = 2
+"""Seconds that open connections have to finish after Ctrl+C."""
+
+
+def open_socket(host: str, port: int) -> socket.socket:
+    """Take a port before anything heavy is loaded; port 0 takes a free one.
+
+    Raises:
+        InputError: there is no such address here, or the port is in use.
+    """
+    if not 0 <= port < 2**16:
+        raise InputError(f"port {port}: there are 0 (any that is free) to 65535; 8000 is usual")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        # It listens at once: a browser that comes while weights are loaded waits.
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise InputError(
+            f"{host}:{port} cannot be used: {error}; choose another --port (0: any that is free) "
+            "or --host (127.0.0.1: this machine alone)"
+        ) from error
+
+
+def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
+    """Give the address that was taken, however it was written."""
+    found = ip_address(taken.getsockname()[0])
+    return found.ipv4_mapped or found if isinstance(found, IPv6Address) else found
+
+
+def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:
+    """Give the host names under which a page may be requested; None: any, it is open to all.
+
+    Args:
+        host: the address as the user wrote it. '', '0', '0x0' and '::0' mean all addresses too, so
+            it does not say whether the page is open.
+        address: what was taken for it.
+    """
+    return None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
+
+
+def run(app: Starlette, taken: socket.socket) -> None:
+    """Answer requests until the process is stopped; only errors are logged."""
+    config = uvicorn.Config(
+        app,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=_CONNECTIONS,
+        timeout_graceful_shutdown=_LEAVE_S,
+    )
+    uvicorn.Server(config).run(sockets=[taken])

@@ -2,18 +2,31 @@
 
 import math
 import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from depthpose.core.camera import Camera, StereoRig
+from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
+from depthpose.depth.config import StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.rig import square_camera
 from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
 from depthpose.depth.stereo import CameraMatcher
+from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.depth import depth_facts, depth_scene, grey_caption
-from depthpose.web.answer import Answer, Form, Shown, read_files, small_size
+from depthpose.web.answer import (
+    EXAMPLE_SEED,
+    Answer,
+    Form,
+    Shown,
+    example_form,
+    read_files,
+    small_size,
+)
 
 _MOST_WORK_PIXELS = 8_000_000
 """Of the image as networks get it, resized to the focal length that they were trained at."""
@@ -201,3 +214,20 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
         f"{warning}Depth from {given} for {share:.0%} of the pixels; half of these are nearer than "
         f"{middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
     )
+
+
+_SCALE = 0.5
+"""Of the example's street, as a share of KITTI's size."""
+
+
+def depth_example() -> dict[str, Any]:
+    """Render a street: left and right image, and their rig."""
+    pair = Streets(StreetsConfig(seed=EXAMPLE_SEED, scale=_SCALE))[1].input
+    assert pair.right is not None
+    assert pair.camera is not None
+    with TemporaryDirectory(prefix="depthpose-") as name:
+        folder = Path(name)
+        write_image(folder / "image.png", pair.left)
+        write_image(folder / "right.png", pair.right)
+        write_camera(folder / "camera.json", pair.camera)
+        return example_form(folder, {})

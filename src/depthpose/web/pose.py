@@ -2,16 +2,25 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from jaxtyping import Float
 from torch import Tensor
 
+from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.files import MAP_SUFFIXES, read_stored_depth, write_cloud, write_image
+from depthpose.core.files import (
+    MAP_SUFFIXES,
+    read_stored_depth,
+    write_cloud,
+    write_depth_png,
+    write_image,
+)
 from depthpose.core.units import METRES, Unit
 from depthpose.pose.cloud import object_points
-from depthpose.pose.config import EstimateConfig
+from depthpose.pose.config import EstimateConfig, ObjectsConfig
+from depthpose.pose.datasets.write import write_mask
 from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import explained_mask, nothing_found
@@ -24,11 +33,29 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
+from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.overlay import draw_pose, grey_depth, posed_cloud, vote_layer
-from depthpose.report.pose import pose_facts, pose_scene, pose_sentence, pose_tables
-from depthpose.report.scene import Scene
-from depthpose.web.answer import Answer, Form, Shown, read_files, refuse_large, small_size
+from depthpose.report.page import Scene
+from depthpose.report.pose import (
+    draw_pose,
+    grey_depth,
+    pose_facts,
+    pose_scene,
+    pose_sentence,
+    pose_tables,
+    posed_cloud,
+    vote_layer,
+)
+from depthpose.web.answer import (
+    EXAMPLE_SEED,
+    Answer,
+    Form,
+    Shown,
+    example_form,
+    read_files,
+    refuse_large,
+    small_size,
+)
 
 OWN_CAD = "cad"
 """The value of the field ``object`` that means the CAD file."""
@@ -209,3 +236,31 @@ def _scene(
         return scene
     votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], found.keypoints_m)
     return replace(scene, layers=[*scene.layers, votes])
+
+
+_UNIT_M = 0.0001
+
+
+def pose_example(net: GeoPoseNet) -> dict[str, Any]:
+    """Render a frame of the first object that the weights know, on a table: depth, mask, camera.
+
+    Raises:
+        InputError: weights without meshes.
+    """
+    model = net.weights.models[0]
+    near_m = 4 * model.diameter_m
+    config = ObjectsConfig(
+        seed=EXAMPLE_SEED,
+        distance_m=(near_m, 1.5 * near_m),
+        frame_objects=(1, 1),
+        frame_clutter=(0, 0),
+    )
+    frame = next(make_frames((model,), config, 1))
+    height, width = frame.depth_m.shape
+    camera = Camera(width=width, height=height, K=frame.K.double(), depth_unit_m=_UNIT_M)
+    with TemporaryDirectory(prefix="depthpose-") as name:
+        folder = Path(name)
+        write_depth_png(folder / "depth.png", frame.depth_m, _UNIT_M)
+        write_mask(folder / "mask.png", frame.objects[0].visible)
+        write_camera(folder / "camera.json", camera)
+        return example_form(folder, {"object": model.name})

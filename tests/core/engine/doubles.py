@@ -6,8 +6,7 @@ from pathlib import Path
 
 from depthpose.core.engine import Done, Files, Function, Sample, read_results, shard_results
 from depthpose.core.engine.plan import Block
-from depthpose.core.engine.shard import ShardFormat
-from depthpose.core.engine.work import Runner, Work
+from depthpose.core.engine.work import Runner, ShardFormat, Work
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 

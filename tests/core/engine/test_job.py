@@ -19,8 +19,7 @@ from depthpose.core.engine import (
     run_job,
 )
 from depthpose.core.engine.plan import Block
-from depthpose.core.engine.shard import ShardFormat, read_shard
-from depthpose.core.engine.work import Work
+from depthpose.core.engine.work import ShardFormat, Work, read_shard
 from depthpose.core.errors import InputError
 
 

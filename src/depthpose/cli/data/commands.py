@@ -181,7 +181,7 @@ def duplicates(
 
     from depthpose.core.run import claim_folder
     from depthpose.depth.datasets import find_duplicates, open_dataset
-    from depthpose.report.tables import table_files
+    from depthpose.report.page import table_files
 
     if not -1 <= at_least <= 1:
         raise InputError(f"--at-least {at_least:g}: a similarity is -1 .. 1; take 0.3")
@@ -200,7 +200,7 @@ def duplicates(
 
 def _list_duplicates(pairs: "list[Duplicate]", out: Path | None) -> int:
     """Print pairs, and write them; give their number."""
-    from depthpose.report.tables import markdown_table, write_table
+    from depthpose.report.page import markdown_table, write_table
 
     rows = [asdict(pair) for pair in pairs]
     if rows:

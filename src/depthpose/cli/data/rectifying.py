@@ -13,11 +13,11 @@ from depthpose.core.units import Unit, metres_of
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from depthpose.core.camera import EpipolarResidual, RawCamera, RawPair, Rectifier
+    from depthpose.core.camera import RawCamera, RawPair, RectificationReport, Rectifier
 
 _LOOKED_AT = 8
 """Pairs that are checked before anything is written."""
-_WARN_PX, _REFUSE_PX = 0.5, 1.0
+_WARN_PX = 0.5
 _SIDES = ("left", "right")
 _ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
 
@@ -56,9 +56,9 @@ def rectify(
     """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
 
     Writes left/NAME.png, right/NAME.png and camera.json, the camera of the rectified pairs: OUT is
-    input for 'depth match' and 'data check'. First, features of up to 8 pairs are
-    matched and the differences of their rows printed (median and 95 %): a warning above 0.5 px,
-    an error above 1 px. Needs the extra 'opencv'.
+    input for 'depth match' and 'data check'. First, corners of up to 8 pairs are
+    matched and the differences of their rows printed: a warning above 0.5 px, an error where most
+    of these pairs are not rectified. Needs the extra 'opencv'.
 
         depthpose data rectify left.png right.png --camera stereo.yaml --out rectified
         depthpose data rectify 'raw/cam0/*.png' 'raw/cam1/*.png' --camera camchain.yaml --out out
@@ -83,7 +83,7 @@ def rectify(
     _refuse_own_results(out, [*lefts, *rights])
     rectifier = make_rectifier(calibration, image_size(lefts[0]), rectifying.keep)
     pairs = list(zip(lefts, rights, strict=True))
-    _say_residual(_measure(rectifier, pairs), rectifier, is_refused=rectifying.check)
+    _check_rows(rectifier, pairs, is_refused=rectifying.check)
     claim_folder(out, _settings(calibration, rectifying.keep), [*_SIDES, "camera.json"])
     claim_names(out, {first.stem: (first, second) for first, second in pairs})
     _write_rectified(rectifier, pairs, out)
@@ -103,19 +103,6 @@ def _write_rectified(rectifier: "Rectifier", pairs: list[tuple[Path, Path]], out
     write_camera(out / "camera.json", rectifier.rig)
 
 
-def _measure(rectifier: "Rectifier", pairs: list[tuple[Path, Path]]) -> "EpipolarResidual":
-    """Match features of some pairs, spread over all."""
-    import numpy as np
-
-    from depthpose.core.camera import epipolar_residual, match_features
-
-    count = min(_LOOKED_AT, len(pairs))
-    some = [pairs[k * len(pairs) // count] for k in range(count)]
-    return epipolar_residual(
-        np.concatenate([match_features(*_rectified(rectifier, *pair)) for pair in some])
-    )
-
-
 def _rectified(rectifier: "Rectifier", first: Path, second: Path) -> tuple["Tensor", "Tensor"]:
     from depthpose.core.files import read_image
 
@@ -125,34 +112,51 @@ def _rectified(rectifier: "Rectifier", first: Path, second: Path) -> tuple["Tens
     return rectifier.rectify(*images)
 
 
-def _say_residual(found: "EpipolarResidual", rectifier: "Rectifier", *, is_refused: bool) -> None:
+def _check_rows(
+    rectifier: "Rectifier", pairs: list[tuple[Path, Path]], *, is_refused: bool
+) -> None:
+    """Check some rectified pairs, spread over all, and say by how much their rows differ."""
+    from statistics import median
+
+    from depthpose.core.camera import check_rectified
+
     rig = rectifier.rig
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
         f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
     )
-    if not found.is_known:
-        _warn(f"only {found.matches} features match, too few to check the rows")
+    count = min(_LOOKED_AT, len(pairs))
+    some = [pairs[k * len(pairs) // count] for k in range(count)]
+    reports = [
+        check_rectified(*_rectified(rectifier, *pair), rig.cx_right_minus_left_px) for pair in some
+    ]
+    known = [report for report in reports if report.is_rectified is not None]
+    if not known:
+        _warn(f"the rows cannot be checked: {reports[0].message}")
         return
+    measured = [report for report in known if report.matches] or known
+    offset_px = median(abs(report.vertical_offset_px) for report in measured)
     said = (
-        f"epipolar residual: median {found.median_px:.2f} px, 95 % {found.p95_px:.2f} px "
-        f"({found.matches} matches)"
+        f"rows of {len(known)} pairs: they differ by {offset_px:.2f} px, with a spread of "
+        f"{median(report.vertical_spread_px for report in measured):.2f} px "
+        f"({sum(report.matches for report in known)} matches)"
     )
-    wrong = _what_is_wrong(found)
+    wrong = _what_is_wrong(known)
     if wrong and is_refused:
         raise InputError(f"{said}: {wrong}. Nothing was written (--no-check writes all the same)")
     print(said)
-    if wrong or found.median_px > _WARN_PX:
-        _warn(wrong or f"the median is above {_WARN_PX:g} px, which costs depth far away; {_ASK}")
+    if wrong or offset_px > _WARN_PX:
+        _warn(wrong or f"that is above {_WARN_PX:g} px, which costs depth far away; {_ASK}")
 
 
-def _what_is_wrong(found: "EpipolarResidual") -> str | None:
-    if found.is_swapped:
+def _what_is_wrong(known: "list[RectificationReport]") -> str | None:
+    """Say what is wrong with more than half of the pairs."""
+    if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
         return "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
-    if found.median_px > _REFUSE_PX:
+    if 2 * sum(report.is_wrong for report in known) > len(known):
         return (
-            f"rows differ by more than {_REFUSE_PX:g} px, so this is not the calibration of these "
-            f"images, or LEFT and RIGHT are exchanged; {_ASK}"
+            "they are not rectified by it, so this is not the calibration of these images, or "
+            f"LEFT and RIGHT are exchanged; {_ASK}"
         )
     return None
 

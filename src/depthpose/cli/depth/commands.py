@@ -213,7 +213,7 @@ def evaluate(
     from depthpose.core.engine import is_job
     from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
-    from depthpose.report.tables import table_files
+    from depthpose.report.page import table_files
 
     predictions = methods.predictions
     methods.refuse_none()

@@ -29,7 +29,7 @@ from depthpose.depth.evaluate import (
 from depthpose.depth.metrics import METRICS
 from depthpose.depth.predictions import is_finished, predict
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.tables import Section, plain_table, write_page, write_table
+from depthpose.report.page import Section, plain_table, write_page, write_table
 
 
 def printed_columns() -> list[str]:

@@ -13,7 +13,7 @@ from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
-from depthpose.core.files.names import find_partners
+from depthpose.core.files.disk import find_partners
 from depthpose.core.results import note_result
 from depthpose.core.run import claim_folder, claim_names, find_rank
 from depthpose.depth.estimator import FakestereoNet

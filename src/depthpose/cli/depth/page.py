@@ -10,9 +10,15 @@ from depthpose.depth.datasets import Dataset
 from depthpose.depth.evaluate import PROTOCOLS, FrameRow, frame_result, ranking_metric
 from depthpose.depth.predictions import COLOR_RANGE_M, read_estimate
 from depthpose.depth.types import StereoInput
-from depthpose.report.choose import MOST_VIEWS, choose_ranked, share_views, spread_evenly
 from depthpose.report.depth import DepthError, DepthShown, depth_section
-from depthpose.report.tables import Section, write_page
+from depthpose.report.page import (
+    MOST_VIEWS,
+    Section,
+    choose_ranked,
+    share_views,
+    spread_evenly,
+    write_page,
+)
 
 PAGE = "report.html"
 _SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")

@@ -18,7 +18,7 @@ from depthpose.cli.depth.methods import Method
 from depthpose.cli.depth.options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.cli.depth.page import PAGE, write_depth_page
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
-from depthpose.core.camera.facts import camera_keys
+from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.core.files import (

@@ -157,7 +157,7 @@ def evaluate(
     from depthpose.cli.pose.methods import pose_methods, predict_all
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
-    from depthpose.report.tables import table_files
+    from depthpose.report.page import table_files
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")

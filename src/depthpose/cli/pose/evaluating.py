@@ -27,7 +27,7 @@ from depthpose.pose.evaluate import (
     of_targets,
     read_any,
 )
-from depthpose.report.tables import Section, plain_table, write_page, write_table
+from depthpose.report.page import Section, plain_table, write_page, write_table
 
 HOW = (
     "Success: ADD (ADD-S of a symmetric object) below 10 % of the diameter. Refused: no answer, or "

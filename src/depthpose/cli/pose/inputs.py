@@ -17,7 +17,7 @@ from depthpose.cli.pose.methods import PoseMethod, match_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, list_images
-from depthpose.core.files.names import natural_order
+from depthpose.core.files.disk import natural_order
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import refuse_among_inputs
 from depthpose.pose.config import Unit

@@ -15,14 +15,15 @@ from depthpose.pose.evaluate import InstanceRow, match, nearest_copy, read_any
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import Job, Prediction, is_finished
 from depthpose.pose.types import PoseEstimate
-from depthpose.report.choose import (
+from depthpose.report.page import (
+    Section,
     choose_answers,
     choose_ranked,
     share_views,
     spread_evenly,
+    write_page,
 )
 from depthpose.report.pose import PoseShown, alternative_lines, pose_section
-from depthpose.report.tables import Section, write_page
 
 _MOST_ROWS = 1000
 _OF_TRUTH = (

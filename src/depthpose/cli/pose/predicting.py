@@ -44,9 +44,8 @@ from depthpose.pose.predictions import (
     write_predictions,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.overlay import draw_pose, grey_depth, picture_of, posed_cloud
-from depthpose.report.pose import alternative_lines
-from depthpose.report.tables import plain_table
+from depthpose.report.page import plain_table
+from depthpose.report.pose import alternative_lines, draw_pose, grey_depth, picture_of, posed_cloud
 from depthpose.report.viewer import Viewer, open_viewer
 
 PAGE = "report.html"

@@ -14,7 +14,7 @@ from depthpose.depth.config import MatcherConfig
 if TYPE_CHECKING:
     from depthpose.cli.depth.methods import Method
     from depthpose.depth.datasets import Dataset
-    from depthpose.thesis.depth_tables import PublishedTable
+    from depthpose.thesis.depth import PublishedTable
 
 
 @group
@@ -123,7 +123,7 @@ def reproduce(
     from depthpose.cli.depth.evaluating import open_frames
     from depthpose.cli.thesis.depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
-    from depthpose.thesis.depth_tables import find_table
+    from depthpose.thesis.depth import find_table
 
     published = find_table(table)
     if find_protocol(comparison.protocol).truth == "disparity":

@@ -18,25 +18,26 @@ from depthpose.core.run import claim_folder, environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
-from depthpose.report.choose import spread_evenly
-from depthpose.report.tables import (
+from depthpose.report.page import (
     Drawing,
     Picture,
     Section,
     markdown_table,
+    spread_evenly,
     table_files,
     write_markdown,
     write_page,
     write_table,
 )
-from depthpose.thesis.depth_figures import (
+from depthpose.thesis.depth import (
     DEPTH_SCALE,
+    PublishedTable,
     arrange,
     draw_figure_2_1,
     draw_figure_2_5,
+    join_published,
     shrink_to_width,
 )
-from depthpose.thesis.depth_tables import PublishedTable, join_published
 
 _PICTURE_WIDTH_PX = 621
 

@@ -28,19 +28,18 @@ from depthpose.pose.predictions import read_predictions
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import ViewSample
 from depthpose.pose.voting import vote_ransac
-from depthpose.report.choose import spread_evenly
-from depthpose.report.overlay import grey_depth, picture_of
-from depthpose.report.pose import close_up, draw_boxes
-from depthpose.report.tables import (
+from depthpose.report.page import (
     Drawing,
     Picture,
     Section,
     markdown_table,
+    spread_evenly,
     table_files,
     write_markdown,
     write_page,
     write_table,
 )
+from depthpose.report.pose import close_up, draw_boxes, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
 _SYNTHETIC_SEED = 3303

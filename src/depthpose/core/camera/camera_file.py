@@ -1,6 +1,7 @@
 """Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written.
 
-What a caller has in place of a file, a matrix, a mapping or a focal length, becomes a camera too.
+Text and JSON (KITTI, Middlebury, TUM RGB-D, COLMAP, BOP, bare matrices, our own) are read here.
+What a caller has in place of a file, a matrix, a mapping or a focal length, is a camera too.
 """
 
 import math
@@ -12,24 +13,381 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from depthpose.core.camera.camera_text import facts_from_json, facts_from_text
-from depthpose.core.camera.facts import (
+from depthpose.core.camera.pinhole import (
     KNOWN_FILES,
+    MAX_SIDE_PX,
     OPTIONAL_KEYS,
+    SAME_DIFFERENCE_PX,
+    Camera,
     CameraFacts,
     Size,
+    StereoRig,
     camera_from_facts,
     camera_keys,
+    check_intrinsics,
+    facts_from_projections,
+    refuse_apart,
 )
-from depthpose.core.camera.pinhole import Camera, StereoRig, check_intrinsics
-from depthpose.core.camera.storage import Names, named, read_storage, scalar
-from depthpose.core.camera.stored_camera import facts_from_names, is_ros, read_folder
-from depthpose.core.errors import InputError
-from depthpose.core.files import AnyPath, read_json, read_text, write_json
+from depthpose.core.camera.stored_camera import (
+    Names,
+    facts_from_names,
+    is_ros,
+    lens_of,
+    named,
+    read_folder,
+    read_storage,
+    scalar,
+)
+from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
 from depthpose.core.files.text import MAX_LIST_BYTES
+
+Matrix = Float64[np.ndarray, "rows columns"]
+
+_KITTI_NAMES = (("P2", "P3"), ("P_rect_02", "P_rect_03"), ("P0", "P1"), ("P_rect_00", "P_rect_01"))
+_KITTI = re.compile(r"^(?:P|P_rect_0)[0-3]\s*:\s*[-+.\d]", re.MULTILINE)
+_MIDDLEBURY = re.compile(r"^cam0\s*=", re.MULTILINE)
+_PLAIN = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
+_COLMAP = re.compile(r"^\d+ ([A-Z_]{3,}) (\d{1,7}) (\d{1,7}) ([-+.\deE ]+)$", re.MULTILINE)
+_FOREIGN = {
+    r"^\[(LEFT|RIGHT)_CAM_": "the factory calibration of a ZED, which is that of its raw images: "
+    "take fx, fy, cx, cy and the baseline of the rectified ones from its SDK "
+    "(calibration_parameters)",
+    r"^\s*Intrinsic of ": "a list of a RealSense's cameras: take that of your stream and size",
+}
+"""Signs of camera files that are not read."""
+_WRITE = (
+    'Write {"width": .., "height": .., "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}, and '
+    '"baseline_m" (metres) of a pair'
+)
+_TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
+"""Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
+_TUM_SIZE, _TUM_UNIT_M = (640, 480), 1 / 5000
+
+
+def facts_from_text(path: AnyPath, text: str) -> CameraFacts | None:
+    """Take the camera of a text file; None where it is none that is known.
+
+    Raises:
+        InputError: it is one, and damaged.
+    """
+    if _MIDDLEBURY.search(text):
+        return middlebury_facts(path, text)
+    if _KITTI.search(text):
+        return _kitti_facts(path)
+    if _PLAIN.search(text):
+        return plain_facts(path, read_key_values(path))
+    if _COLMAP.search(text):
+        return _colmap_facts(text)
+    for sign, what in _FOREIGN.items():
+        if re.search(sign, text, re.MULTILINE):
+            raise InputError(f"{what}. {_WRITE}")
+    return _bare_facts(text)
+
+
+def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
+    """Take Middlebury 2014's ``calib.txt``: cam0, doffs, baseline in millimetres, size.
+
+    Raises:
+        InputError: a value missing or not a number, or ``cam1`` contradicts the others.
+    """
+    found = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
+    try:
+        K, right = (
+            np.array(re.sub(r"[\[\];,]", " ", text).split(), np.float64).reshape(3, 3)
+            for text in (found["cam0"], found.get("cam1", found["cam0"]))
+        )
+        size = (
+            _whole({"width": float(found["width"])}, "width"),
+            _whole({"height": float(found["height"])}, "height"),
+        )
+        baseline_mm, difference_px = float(found["baseline"]), float(found["doffs"])
+    except KeyError as error:
+        raise InputError(
+            f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
+            "baseline, width and height."
+        ) from error
+    except (ValueError, OverflowError) as error:  # no 9 numbers have no 3x3
+        raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
+    refuse_apart(K, right)
+    apart_px = right[0, 2] - K[0, 2]
+    if "cam1" in found and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
+        raise InputError(
+            f"{path}: doffs is {difference_px:g}, but cx of cam1 less that of cam0 is {apart_px:g}"
+            "; write the true one of the two"
+        )
+    if 0 < baseline_mm < 1:
+        raise InputError(
+            f"{path}: baseline is {baseline_mm:g}, and Middlebury's is in millimetres; where it is "
+            f"in metres, write {1000 * baseline_mm:g}"
+        )
+    return CameraFacts(
+        kind="a Middlebury calibration",
+        K=torch.from_numpy(K),
+        size=size,
+        baseline_m=baseline_mm / 1000,
+        cx_right_minus_left_px=difference_px,
+        is_metric=True,
+    )
+
+
+def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
+    """Take ``focal_px``, ``cx``, ``cy`` and ``baseline_m``, a line each.
+
+    Also ``width`` and ``height``, ``focal_y_px`` and ``cx_right_minus_left_px`` if given.
+
+    Raises:
+        InputError: a value is missing.
+    """
+    focal_px, cx, cy, baseline_m = (
+        _number(path, keys, key) for key in ("focal_px", "cx", "cy", "baseline_m")
+    )
+    has_size = {"width", "height"} <= keys.keys()
+    focal_y_px = _number(path, keys, "focal_y_px") if "focal_y_px" in keys else focal_px
+    shift = "cx_right_minus_left_px"
+    return CameraFacts(
+        kind="a calibration",
+        K=_intrinsics(focal_px, focal_y_px, cx, cy),
+        size=(int(_number(path, keys, "width")), int(_number(path, keys, "height")))
+        if has_size
+        else None,
+        baseline_m=baseline_m,
+        cx_right_minus_left_px=_number(path, keys, shift) if shift in keys else 0.0,
+        is_metric=True,
+    )
+
+
+def kitti_matrix(
+    path: AnyPath, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
+) -> Matrix:
+    """Take a matrix of a KITTI calibration.
+
+    Raises:
+        InputError: it is missing, or of another size.
+    """
+    if name not in keys:
+        raise InputError(f"{path}: has no line '{name}:', which a KITTI calibration holds.")
+    if len(keys[name]) != shape[0] * shape[1]:
+        raise InputError(
+            f"{path}: {name} holds {len(keys[name])} numbers instead of {shape[0] * shape[1]}. "
+            "Copy the file anew."
+        )
+    return np.array(keys[name], dtype=np.float64).reshape(shape)
+
+
+def kitti_size(keys: Mapping[str, list[float]], camera: str = "02") -> Size | None:
+    """Size of the rectified images, where a calibration has it (``S_rect_02``)."""
+    said = keys.get(f"S_rect_{camera}", [])
+    return (int(said[0]), int(said[1])) if len(said) == 2 else None
+
+
+def _kitti_facts(path: AnyPath) -> CameraFacts:
+    """Take the colour pair (cameras 2 and 3) of a KITTI text, or the grey one; or one camera."""
+    keys = read_key_values(path)
+    left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
+    return facts_from_projections(
+        "a KITTI calibration",
+        kitti_matrix(path, keys, left, (3, 4)),
+        kitti_matrix(path, keys, right, (3, 4)) if right in keys else None,
+        kitti_size(keys, left[-2:]),
+    )
+
+
+def _colmap_facts(text: str) -> CameraFacts:
+    """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
+    found = {match.groups() for match in _COLMAP.finditer(text)}
+    if len(found) > 1:
+        raise InputError(
+            f"a cameras.txt of COLMAP with {len(found)} different cameras; keep the line of one"
+        )
+    model, width, height, listed = found.pop()
+    values = [float(word) for word in listed.split()]
+    if model.startswith(("SIMPLE_", "RADIAL")):
+        values.insert(0, values[0])
+    if len(values) < 4:
+        raise InputError(f"a camera of COLMAP with {len(values)} parameters; copy it anew")
+    fx, fy, cx, cy = values[:4]
+    return CameraFacts(
+        kind=f"a {model} camera of COLMAP",
+        K=_intrinsics(fx, fy, cx - 0.5, cy - 0.5),
+        size=(int(width), int(height)),
+        distortion=tuple(values[4:]),
+        undistort="colmap image_undistorter",
+    )
+
+
+def _bare_facts(text: str) -> CameraFacts | None:
+    """Take bare numbers: ``fx fy cx cy``, with distortion behind, or K, with a baseline behind."""
+    lines = (line.partition("#")[0] for line in text.splitlines())
+    words = " ".join(lines).replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words[:20]]
+    except ValueError:
+        return None
+    if len(numbers) in (9, 10) and numbers[6:9] == [0, 0, 1]:
+        return CameraFacts(
+            kind="a matrix",
+            K=torch.tensor(numbers[:9], dtype=torch.float64).reshape(3, 3),
+            baseline_m=numbers[9] if len(numbers) == 10 else None,
+        )
+    if len(numbers) not in (4, 8, 9, 12):
+        return None
+    is_tum = tuple(numbers[:4]) in _TUM
+    return CameraFacts(
+        kind="a camera of TUM RGB-D" if is_tum else "fx fy cx cy",
+        K=_intrinsics(*numbers[:4]),
+        size=_TUM_SIZE if is_tum else None,
+        depth_unit_m=_TUM_UNIT_M if is_tum else None,
+        distortion=tuple(numbers[4:]),
+    )
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
+    if len(keys.get(name, [])) != 1:
+        raise InputError(f"{path}: '{name}: NUMBER' is missing or holds several numbers.")
+    return keys[name][0]
+
+
+_NEEDED = ("width", "height", "K")
+_RIG = ("baseline_m", "cx_right_minus_left_px")
+_KEYS = (*_NEEDED, *_RIG, *OPTIONAL_KEYS)
+_BOP = ("fx", "fy", "cx", "cy")
+_MM = 0.001
+
+
+def facts_from_json(content: object) -> CameraFacts:
+    """Take the camera of a JSON file: ours, BOP's ``camera.json`` or its ``scene_camera.json``.
+
+    Raises:
+        InputError: it is none of them, or a value is wrong.
+    """
+    if isinstance(content, list) and len(content) in (3, 9):
+        return CameraFacts(kind="a matrix", K=_matrix(content))
+    if isinstance(content, dict) and "K" not in content:
+        inner = content.get("intrinsic", content)
+        if isinstance(inner, dict) and "intrinsic_matrix" in inner:
+            K = _matrix(inner["intrinsic_matrix"])
+            is_by_columns = isinstance(inner["intrinsic_matrix"][0], int | float)
+            size = _size(inner) if {"width", "height"} <= inner.keys() else None
+            return CameraFacts(
+                kind="a camera of Open3D", K=K.T.contiguous() if is_by_columns else K, size=size
+            )
+        if content.keys() >= set(_BOP):
+            return _from_bop(content)
+        if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
+            return _from_scene(content)
+    return _from_keys(_check_keys(content))
+
+
+def _from_keys(keys: dict[str, Any]) -> CameraFacts:
+    optional: dict[str, Any] = {k: _json_number(keys, k) for k in OPTIONAL_KEYS if k in keys}
+    return CameraFacts(
+        kind="a camera",
+        K=_matrix(keys["K"]),
+        size=_size(keys),
+        baseline_m=_json_number(keys, "baseline_m") if "baseline_m" in keys else None,
+        cx_right_minus_left_px=_json_number({_RIG[1]: 0, **keys}, _RIG[1]),
+        is_metric=True,
+        **optional,
+    )
+
+
+def _from_bop(keys: dict[str, Any]) -> CameraFacts:
+    """BOP: ``fx``, ``fy``, ``cx``, ``cy``, ``width``, ``height``; ``depth_scale`` in mm a unit."""
+    fx, fy, cx, cy = (_json_number(keys, key) for key in _BOP)
+    return CameraFacts(
+        kind="a camera of BOP",
+        K=_intrinsics(fx, fy, cx, cy),
+        size=_size(keys) if {"width", "height"} <= keys.keys() else None,
+        depth_unit_m=_bop_unit_m(keys),
+        distortion=lens_of(named(keys)),
+    )
+
+
+def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
+    entries = list(images.values())
+    first = entries[0]
+    if any(e["cam_K"] != first["cam_K"] or _bop_unit_m(e) != _bop_unit_m(first) for e in entries):
+        raise InputError(
+            f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; write "
+            "that of one image into a file, or open the data set by --bop"
+        )
+    flat = first["cam_K"]
+    if not isinstance(flat, list) or len(flat) != 9:
+        raise InputError(f"'cam_K' is {flat!r:.80}, where 9 numbers belong")
+    return CameraFacts(
+        kind="a scene_camera.json of BOP",
+        K=_matrix(flat),
+        depth_unit_m=_bop_unit_m(first),
+    )
+
+
+def _bop_unit_m(keys: dict[str, Any]) -> float | None:
+    return _MM * _json_number(keys, "depth_scale") if "depth_scale" in keys else None
+
+
+def _check_keys(content: object) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise InputError(
+            f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
+            f"not a {type(content).__name__}"
+        )
+    if not content.keys() & set(_KEYS):
+        keys = ", ".join(map(repr, content))
+        raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
+    for key in content:
+        if key not in _KEYS:
+            raise InputError(f"unknown key {key!r}; {nearest_name(key, _KEYS)}")
+    missing = [key for key in _NEEDED if key not in content]
+    if missing:
+        raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
+    if "cx_right_minus_left_px" in content and "baseline_m" not in content:
+        raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
+    return content
+
+
+def _size(keys: dict[str, Any]) -> Size:
+    return _whole(keys, "width"), _whole(keys, "height")
+
+
+def _whole(keys: dict[str, Any], key: str) -> int:
+    value = keys[key]
+    if not _is_number(value) or value != int(value) or abs(value) > MAX_SIDE_PX:
+        raise InputError(f"{key!r} is {repr(value)[:80]}; give a whole number of pixels")
+    return int(value)
+
+
+def _json_number(keys: dict[str, Any], key: str) -> float:
+    value = keys[key]
+    if not _is_number(value):
+        raise InputError(f"{key!r} is {repr(value)[:80]}; give a number")
+    return float(value)
+
+
+def _matrix(value: object) -> Float[Tensor, "3 3"]:
+    rows = value if isinstance(value, list) else []
+    if len(rows) == 9:
+        rows = [rows[k : k + 3] for k in (0, 3, 6)]
+    is_square = len(rows) == 3 and all(isinstance(row, list) and len(row) == 3 for row in rows)
+    if not is_square or not all(_is_number(x) for row in rows for x in row):
+        shown = repr(value)[:80]
+        raise InputError(f"'K' is {shown}; write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
+    return torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)
+
+
+def _is_number(value: object) -> bool:
+    # A whole number beyond 1e300 has no float.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300
+
 
 _DOFFS = "cx_right_minus_left_px"
 

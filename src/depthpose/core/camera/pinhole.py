@@ -1,15 +1,17 @@
-"""The two cameras, a pinhole and the left one of a rectified pair, and their geometry.
+"""Cameras, a pinhole and the left one of a rectified pair: their geometry, and what is refused.
 
-Projection, back-projection, and what cropping, scaling and padding do to a camera; fundamental and
-essential matrices of a rectified rig (Hartley and Zisserman 2004, chapters 9 and 11).
+Projection, back-projection, and what cropping and scaling do to a camera. Values of a camera file,
+checked: from any format to one :class:`Camera`.
 """
 
+import json
 import math
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -225,3 +227,347 @@ def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:
     if isinstance(resized, StereoRig):
         return replace(resized, cx_right_minus_left_px=resized.cx_right_minus_left_px * sx)
     return resized
+
+
+Size = tuple[int, int]
+"""Width and height [px]."""
+
+KNOWN_FILES = (
+    "our JSON (width, height, K), BOP's camera.json, KITTI's calibration (P2 or P_rect_02), "
+    "Middlebury's calib.txt, TUM's 'fx fy cx cy', a matrix of 9 numbers, focal_px lines, "
+    "camera_info of ROS, FileStorage of OpenCV (YAML, XML, JSON), settings of ORB-SLAM, intrinsics "
+    "of RealSense and Open3D (JSON), COLMAP's cameras.txt"
+)
+"""Formats of camera files, for errors."""
+
+OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")
+"""What any camera may have beside its matrix."""
+
+_NORMALISED_FX = 2
+_MM_FX_SHARE = 0.1
+"""A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
+_MAX_FX_SHARE = 200
+_LEAST_UNIT_M = 1e-6
+"""At a smaller one 16 bits of depth end before 7 cm."""
+_FILE_BASELINE_M = 5.0
+"""Common rigs in millimetres or centimetres (50 to 120 mm) pass as a plane's, never in a file."""
+WIDE_BASELINE_M = 2.0
+"""Wider than cars' rigs; centimetres, or squares of a board, in a file that names no unit."""
+_LEAST_FILE_BASELINE_M = 1e-3
+_MAX_CM = 30
+"""A longer baseline, less the unit, is in millimetres."""
+_SAME_FOCAL = 1e-3
+_SAME_ROW_PX = 0.5
+SAME_DIFFERENCE_PX = 1.0
+_MAX_SQUEEZE = 1.8
+"""Of fx to fy, or inverse: a picture of KITTI squeezed to 512x256 has 1.66."""
+_NO_DISTORTION = 1e-8
+_OFF_CENTRE = 0.1
+"""Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
+_SAME_SHARE = 0.05
+"""By how much it may leave the centre differently in the two directions, at K's own resolution."""
+_QUARTER = 0.25
+"""Share of the size beyond which a point off the centre is doubted, whatever its direction."""
+_CORNER = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFacts:
+    """Values of a camera file, before it is a camera: the image's size may be missing.
+
+    Attributes:
+        kind: what the file is, for errors.
+        K: intrinsic matrix of the undistorted image [px].
+        size: of the image, where the file has it.
+        baseline_m: where there is a rig.
+        cx_right_minus_left_px: difference of the principal points of a rig.
+        is_metric: whether the format says the unit of the baseline.
+        depth_unit_m: metres per unit of the depth images, where the file has it.
+        mount_height_m: height of the camera above the road, where the file has it.
+        tilt_deg: of the camera, positive upwards, where the file has it.
+        distortion: coefficients of the lens; none, or zeros, for a pinhole.
+        undistort: what takes the distortion out of an image.
+    """
+
+    kind: str
+    K: Float[Tensor, "3 3"]
+    size: Size | None = None
+    baseline_m: float | None = None
+    cx_right_minus_left_px: float = 0.0
+    is_metric: bool = False
+    depth_unit_m: float | None = None
+    mount_height_m: float | None = None
+    tilt_deg: float | None = None
+    distortion: tuple[float, ...] = ()
+    undistort: str = "cv2.undistort(image, K, distortion)"
+
+
+def facts_from_projections(
+    kind: str,
+    left: Float64[np.ndarray, "3 4"],
+    right: Float64[np.ndarray, "3 4"] | None,
+    size: Size | None = None,
+) -> CameraFacts:
+    """Take the rectified projections of a pair, or of one camera, apart.
+
+    A rectified camera at x = b has ``P[0, 3] = -fx b``. KITTI counts both from camera 0, ROS and
+    OpenCV from the left one.
+
+    Raises:
+        InputError: a focal length is not positive, the two are not those of one rectified pair, or
+            the pair stands one above the other.
+    """
+    K = torch.from_numpy(left[:, :3].copy())
+    if right is None:
+        return CameraFacts(kind=kind, K=K, size=size)
+    if not (left[0, 0] > 0 and right[0, 0] > 0):
+        raise InputError("the focal lengths of the two projections are not positive; copy it anew")
+    refuse_apart(left, right)
+    with np.errstate(all="ignore"):  # what overflows is refused as a baseline
+        baseline_m = left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]
+        down_m = left[1, 3] / left[1, 1] - right[1, 3] / right[1, 1]
+        difference_px = right[0, 2] - left[0, 2]
+    if abs(down_m) > abs(baseline_m):
+        raise InputError("its cameras stand one above the other; turn the images by 90 degrees")
+    return CameraFacts(
+        kind=kind,
+        K=K,
+        size=size,
+        baseline_m=float(baseline_m),
+        cx_right_minus_left_px=float(difference_px),
+    )
+
+
+def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
+    """Refuse two matrices that are not those of one rectified pair: only cx may differ.
+
+    Raises:
+        InputError: fx, fy or cy differ.
+    """
+    within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
+              "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
+    for name, (at, most) in within.items():
+        if abs(left[at] - right[at]) > most:
+            raise InputError(
+                f"{name} of the left camera is {left[at]:g} and of the right one {right[at]:g}, "
+                "but a rectified pair shares fx, fy and cy; are they of two calibrations, "
+                "or of raw images ('depthpose data rectify')? Copy both of one rectification"
+            )
+
+
+def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
+    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels.
+
+    Args:
+        facts: values of the file.
+        size: of the image, for files that do not say it.
+
+    Raises:
+        InputError: distortion, an unknown size, or a value in another unit or of another image.
+    """
+    if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
+        raise _distorted(facts, size)
+    camera = make_camera(facts, size)
+    _refuse_units(camera, is_metric=facts.is_metric)
+    if facts.size is None:
+        refuse_other_resolution(camera.K, camera.width, camera.height)
+    return camera
+
+
+def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
+    """Make a camera, or a rig where there is a baseline, without asking whether it is likely.
+
+    Raises:
+        InputError: the size is missing, or a value is impossible for a camera.
+    """
+    known = facts.size or size
+    if known is None:
+        raise InputError(
+            f"{facts.kind} without the image's size; give it beside the image, or write a camera "
+            "of ours (width, height, K)"
+        )
+    common: dict[str, Any] = {"width": known[0], "height": known[1], "K": facts.K}
+    common |= {key: getattr(facts, key) for key in OPTIONAL_KEYS}
+    if facts.baseline_m is None:
+        return Camera(**common)
+    doffs_px = facts.cx_right_minus_left_px
+    return StereoRig(**common, baseline_m=facts.baseline_m, cx_right_minus_left_px=doffs_px)
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Give what our JSON holds of a camera."""
+    keys: dict[str, Any] = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
+    if isinstance(camera, StereoRig):
+        keys["baseline_m"] = camera.baseline_m
+        if camera.cx_right_minus_left_px:
+            keys["cx_right_minus_left_px"] = camera.cx_right_minus_left_px
+    known = {key: getattr(camera, key) for key in OPTIONAL_KEYS}
+    return keys | {key: value for key, value in known.items() if value is not None}
+
+
+def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    """Refuse a K whose principal point is that of the same picture at another resolution.
+
+    The point of a lens lies near the centre; scaled with another resolution it leaves the centre
+    by the same share in both directions. A crop seldom does that, and has a file that says its
+    size.
+
+    Raises:
+        InputError: that is so, or the point lies outside the image.
+    """
+    _refuse_normalised(K, width, height)
+    refuse_outside(K, width, height)
+    cx, cy = float(K[0, 2]), float(K[1, 2])
+    across, down = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
+    scale = 1 + across + down
+    is_alike = abs(across - down) <= _SAME_SHARE * max(scale, 1)
+    if min(abs(across), abs(down)) < _OFF_CENTRE or not is_alike:
+        return
+    if scale < _CORNER:
+        raise InputError(
+            f"the principal point ({cx:g}, {cy:g}) lies in the corner of the image; where nobody "
+            f"measured it, take the centre, ({(width - 1) / 2:g}, {(height - 1) / 2:g})"
+        )
+    raise InputError(
+        f"the principal point ({cx:g}, {cy:g}) lies far off the centre of the image of "
+        f"{width}x{height}: K looks like that of about {width * scale:.0f}x{height * scale:.0f}. "
+        f"Multiply fx, fy, cx and cy by {1 / scale:.3g}, or take the image of that size"
+    )
+
+
+def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    """Refuse a K whose principal point lies outside the image.
+
+    Raises:
+        InputError: that is so.
+    """
+    cx, cy = float(K[0, 2]), float(K[1, 2])
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        raise InputError(
+            f"the principal point ({cx:g}, {cy:g}) lies outside the image of {width}x{height}; do "
+            "K and the size belong together?"
+        )
+
+
+def suspicious_centre(camera: Camera) -> str | None:
+    """Say that a camera which names its size looks like one of another; None where it does not.
+
+    A point more than a quarter of the size off the centre is doubted too.
+    """
+    try:
+        refuse_other_resolution(camera.K, camera.width, camera.height)
+    except InputError as error:
+        return str(error)
+    cx, cy = float(camera.K[0, 2]), float(camera.K[1, 2])
+    across, down = (cx + 0.5) / camera.width, (cy + 0.5) / camera.height
+    if max(abs(across - 0.5), abs(down - 0.5)) <= _QUARTER:
+        return None
+    return (
+        f"the principal point ({cx:g}, {cy:g}) lies at {across:.0%} of the width and {down:.0%} of "
+        f"the height of {camera.width}x{camera.height}, more than a quarter off the centre: is K "
+        "of another size? Scale fx, fy, cx and cy as the image was; a crop may be so"
+    )
+
+
+def _distorted(facts: CameraFacts, size: Size | None) -> InputError:
+    shown = ", ".join(f"{k:g}" for k in facts.distortion)
+    known = facts.size or size
+    after = "and give the camera of the result"
+    if known is not None:
+        after += f": {json.dumps(camera_keys(make_camera(facts, known)))}"
+    return InputError(
+        f"{facts.kind} with lens distortion ({shown}), and only images without are understood; "
+        f"undistort them by {facts.undistort}, {after}"
+    )
+
+
+def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    if K[0, 0] <= _NORMALISED_FX < width / 10:
+        raise InputError(
+            f"K has fx {float(K[0, 0]):g} for {width}x{height} pixels, so it looks normalised; "
+            "multiply its first row by the width and its second by the height"
+        )
+
+
+def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M) -> None:
+    """Refuse a distance between two cameras that no rig has.
+
+    Args:
+        length: what was taken for metres.
+        remedy: how to correct it, where ``most_m`` allows more than what is common.
+        most_m: from which on it is too long.
+
+    Raises:
+        InputError: it is too short, or too long: the likely unit is said.
+    """
+    if length < _LEAST_FILE_BASELINE_M:
+        raise InputError(
+            f"baseline_m is {length:g}, less than two lenses can stand apart; write metres, once "
+            f"({length * 1000:g} if it was divided by 1000 without need)"
+        )
+    if length < most_m:
+        return
+    unit = "millimetres; divide by 1000"
+    if length < _MAX_CM:
+        unit = (
+            f"centimetres; divide by 100 ({length / 100:g}). If it is in millimetres, divide by "
+            "1000; if in squares of the calibration board, multiply by the side of one in metres"
+        )
+    raise InputError(f"baseline_m is {length:g}, which looks like {unit} ({remedy})")
+
+
+def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
+    """Refuse a K whose two focal lengths are not those of one lens.
+
+    Raises:
+        InputError: that is so.
+    """
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
+        raise InputError(
+            f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
+            "longer than wide; multiply both by what its direction was scaled by. Where pixels "
+            "truly are so, scale the image, and K with it, until they are square"
+        )
+
+
+def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
+    fx = float(camera.K[0, 0])
+    size = f"{camera.width}x{camera.height}"
+    _refuse_normalised(camera.K, camera.width, camera.height)
+    if fx < _MM_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {size} pixels, so it looks like millimetres; divide by the "
+            "width of a pixel in mm"
+        )
+    if fx > _MAX_FX_SHARE * camera.width:
+        raise InputError(
+            f"K has fx {fx:g} for {size} pixels, which sees less than 0.3 degrees; give it in "
+            "pixels of this image"
+        )
+    refuse_squeezed(camera.K)
+    refuse_outside(camera.K, camera.width, camera.height)
+    if isinstance(camera, StereoRig):
+        if is_metric:
+            said = "a rig that is truly this wide is made in Python, as a StereoRig"
+            refuse_baseline(camera.baseline_m, said, _FILE_BASELINE_M)
+        else:
+            said = (
+                'a rig that is truly this wide is written as ours: width, height, K, "baseline_m"'
+            )
+            refuse_baseline(camera.baseline_m, said)
+        if abs(camera.cx_right_minus_left_px) >= camera.width:
+            raise InputError(
+                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
+                f"the image of {size} is wide; are both cameras of one size? Copy them anew"
+            )
+    if camera.depth_unit_m is not None and camera.depth_unit_m < _LEAST_UNIT_M:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, finer than any sensor's; it is metres a "
+            "unit: 0.001 means millimetres"
+        )
+    if camera.depth_unit_m is not None and camera.depth_unit_m > 1:
+        raise InputError(
+            f"depth_unit_m is {camera.depth_unit_m:g}, which looks like units a metre; it is "
+            f"metres a unit: write {1 / camera.depth_unit_m:g}"
+        )

@@ -1,26 +1,303 @@
-"""Rectify a pair with OpenCV, and measure what rows still differ by."""
+"""Two cameras as they were calibrated (ROS, OpenCV, Kalibr), and their rectification by OpenCV."""
 
-import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from depthpose.core.arrays import grey_of
-from depthpose.core.camera.facts import Size, camera_from_facts, facts_from_projections
-from depthpose.core.camera.pinhole import StereoRig
-from depthpose.core.camera.raw_pair import RawCamera, RawPair
+from depthpose.core.camera.pinhole import (
+    WIDE_BASELINE_M,
+    Size,
+    StereoRig,
+    camera_from_facts,
+    check_intrinsics,
+    facts_from_projections,
+    refuse_baseline,
+    refuse_squeezed,
+)
+from depthpose.core.camera.stored_camera import (
+    Names,
+    is_ros,
+    matrix,
+    named,
+    numbers,
+    read_storage,
+    read_two_files,
+    size_of,
+)
 from depthpose.core.errors import InputError, import_opencv
+from depthpose.core.files import AnyPath, read_json, read_text
+from depthpose.core.files.text import MAX_LIST_BYTES
 from depthpose.core.rigid import Rigid
 
-_FEATURES = 4000
-_RATIO = 0.75  # Lowe 2004, section 7.1, says 0.8
-_RANSAC_PX = 1.0
-_MIN_MATCHES = 25
-_MAX_SWAPPED_SHARE = 0.2
+_K = {
+    "left": ("k1", "m1", "cameramatrix1", "cameramatrixleft", "leftcameramatrix"),
+    "right": ("k2", "m2", "cameramatrix2", "cameramatrixright", "rightcameramatrix"),
+}
+_D = {
+    "left": ("d1", "distcoeffs1", "distcoefs1", "distcoef1", "distortion1", "distcoeffsleft",
+             "distortioncoefficients1", "distortioncoefficientsleft"),
+    "right": ("d2", "distcoeffs2", "distcoefs2", "distcoef2", "distortion2", "distcoeffsright",
+              "distortioncoefficients2", "distortioncoefficientsright"),
+}  # fmt: skip
+_R, _T = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector")
+_MODELS = {
+    "plumbbob": False, "rationalpolynomial": False, "radtan": False, "pinhole": False,
+    "radialtangential": False, "brownconrady": False, "none": False,
+    "equidistant": True, "fisheye": True, "kannalabrandt": True, "kannalabrandt4": True,
+}  # fmt: skip
+"""Models of distortion by name: whether it is that of a fisheye lens."""
+_COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
+_MAX_BASELINE_M = 10.0
+_MOST_UNLIKE = 1.5
+_KNOWN = (
+    "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
+    "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawCamera:
+    """A camera with its lens distortion.
+
+    Attributes:
+        K: intrinsic matrix [px].
+        distortion: coefficients in OpenCV's order: k1, k2, p1, p2, k3, ... of a pinhole; k1 to k4
+            of a fisheye lens.
+        is_fisheye: whether the angle from the axis is what is distorted (Kannala and Brandt 2006).
+    """
+
+    K: Float64[Tensor, "3 3"]
+    distortion: tuple[float, ...]
+    is_fisheye: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawPair:
+    """The calibration of two cameras whose images are not rectified.
+
+    Attributes:
+        left: the left camera.
+        right: the right one.
+        right_from_left: carries points from the left camera's frame to the right one's [m].
+        size: width and height of both images [px]; None where the file does not say it.
+    """
+
+    left: RawCamera
+    right: RawCamera
+    right_from_left: Rigid
+    size: Size | None
+
+
+def read_raw_pair(
+    path: AnyPath, *, unit_m: float | None = None, is_fisheye: bool | None = None
+) -> RawPair:
+    """Read the calibration of a pair: of OpenCV, ROS or Kalibr, recognised by its content.
+
+    Args:
+        path: the file, or the folder of the pair's two files.
+        unit_m: metres a unit of the translation between the cameras; None: metres, unless the
+            cameras would then stand farther apart than those of common rigs.
+        is_fisheye: the kind of the lenses, for files that do not name it (OpenCV's); pinholes by
+            default.
+
+    Raises:
+        InputError: the file is missing or damaged, describes no two cameras, is of a lens of
+            another model, or a value cannot be right: the rotation, the distance, the order.
+    """
+    try:
+        pair = _read(Path(path), unit_m or 1.0, is_fisheye)
+        said = "--unit cm or mm scales it, and --unit m says that it is in metres"
+        length = float(pair.right_from_left.t_m.norm())
+        if length:
+            refuse_baseline(length, said, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
+        _refuse_unlikely(pair)
+    except InputError as error:
+        said = str(error)
+        raise InputError(said if said.startswith(f"{path}") else f"{path}: {said}") from error
+    return pair
+
+
+def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    if path.is_dir():
+        first, second = read_two_files(path)
+        if is_ros(first) and is_ros(second) and "p2" not in first | second:
+            return _from_ros(first, second, unit_m, is_fisheye)
+        return _from_opencv(first | second, unit_m, is_fisheye)
+    text = read_text(path, MAX_LIST_BYTES)
+    content = read_json(path) if text.lstrip()[:1] == "{" else None
+    names = named(content) if isinstance(content, Mapping) else read_storage(path, text)
+    if names is None:
+        raise InputError(f"no calibration of two cameras; known are {_KNOWN}")
+    if "cam0" in names:
+        return _from_kalibr(names, unit_m, is_fisheye)
+    return _from_opencv(names, unit_m, is_fisheye)
+
+
+def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """OpenCV's ``stereoCalibrate``: points of camera 1 to camera 2 by R and T."""
+    if not any(name in names for both in _K.values() for name in both):
+        one = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
+        raise InputError(f"{one}, not two as they were calibrated; known are {_KNOWN}")
+    kind = _kind(names.get("distortionmodel") or names.get("cameramodel"), is_fisheye)
+    left, right = (
+        _camera(matrix(names, _K[side], 9), _first(names, _D[side]), kind, f"the {side} camera")
+        for side in ("left", "right")
+    )
+    R, T = matrix(names, _R, 9), _first(names, _T)
+    if R is None or T is None or len(T) != 3:
+        raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
+    return _pair(left, right, (R, unit_m * np.array(T)), size_of(names))
+
+
+def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Two ``camera_info``: the rotations to the rectified frame and the right one's ``Tx``."""
+    shifts = [_ros_shift(names) for names in (first, second)]
+    if (shifts[0] == 0) == (shifts[1] == 0):
+        raise InputError(
+            f"the projections of the two camera_info have Tx / fx {shifts[0]:g} and {shifts[1]:g}, "
+            "where that of the left one is 0 and that of the right one less the baseline; "
+            "calibrate as a pair"
+        )
+    if size_of(first) != size_of(second):
+        raise InputError("the two camera_info are of images of two sizes; a pair has one")
+    both = (first, second) if shifts[0] == 0 else (second, first)
+    cameras, turns = [], []
+    for side, names in zip(("left", "right"), both, strict=True):
+        K, D = (
+            matrix(names, ("cameramatrix", "k"), 9),
+            _first(names, ("distortioncoefficients", "d")),
+        )
+        kind = _kind(names.get("distortionmodel"), is_fisheye)
+        cameras.append(_camera(K, D, kind, f"the {side} camera"))
+        turn = matrix(names, ("rectificationmatrix", "r"), 9)
+        if turn is None:
+            raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
+        turns.append(turn)
+    along = np.array([unit_m * (shifts[0] or shifts[1]), 0, 0])
+    motion = (turns[1].T @ turns[0], turns[1].T @ along)
+    return _pair(cameras[0], cameras[1], motion, size_of(first))
+
+
+def _ros_shift(names: Names) -> float:
+    """Give ``Tx / fx`` of a projection: less the camera's x in the rectified frame."""
+    P = matrix(names, ("projectionmatrix", "p"), 12)
+    if P is None or P[0, 0] <= 0:
+        raise InputError("no projection_matrix with a focal length; calibrate as a pair")
+    return float(P[0, 3] / P[0, 0])
+
+
+def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Kalibr's camchain: ``T_cn_cnm1`` carries points of cam0 to cam1."""
+    if not all(isinstance(names.get(who), Mapping) for who in ("cam0", "cam1")):
+        raise InputError("a camchain without cam0 and cam1; calibrate both cameras together")
+    first, second = named(names["cam0"]), named(names["cam1"])
+    motion = matrix(second, ("tcncnm1",), 16)
+    if motion is None:
+        raise InputError("cam1 has no T_cn_cnm1 of 16 numbers; calibrate both cameras together")
+    sizes = [numbers(one.get("resolution")) for one in (first, second)]
+    if sizes[0] != sizes[1]:
+        raise InputError("cam0 and cam1 have images of two sizes; a pair has one")
+    size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
+    left, right = (
+        _kalibr_camera(one, who, is_fisheye) for one, who in ((first, "cam0"), (second, "cam1"))
+    )
+    return _pair(left, right, (motion[:3, :3], unit_m * motion[:3, 3]), size)
+
+
+def _kalibr_camera(names: Names, who: str, is_fisheye: bool | None) -> RawCamera:
+    if names.get("cameramodel", "pinhole") != "pinhole":
+        raise InputError(
+            f"{who} has camera_model {names['cameramodel']!r}; calibrate it as pinhole-radtan, or "
+            "as pinhole-equi where it is a fisheye lens"
+        )
+    values = numbers(names.get("intrinsics"))
+    if values is None or len(values) != 4:
+        raise InputError(f"{who} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
+    fx, fy, cx, cy = values
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    kind = _kind(names.get("distortionmodel"), is_fisheye)
+    return _camera(K, numbers(names.get("distortioncoeffs")), kind, who)
+
+
+def _first(names: Names, known: tuple[str, ...]) -> list[float] | None:
+    return next((found for name in known if (found := numbers(names.get(name)))), None)
+
+
+def _kind(model: object, is_fisheye: bool | None) -> bool:
+    """Say whether a lens is a fisheye: what the file names, else what is given."""
+    if model is None:
+        return bool(is_fisheye)
+    word = re.sub(r"[^a-z0-9]", "", str(model).lower())
+    if word not in _MODELS:
+        raise InputError(
+            f"its distortion model is {model!r}; known are radtan (plumb_bob), rational_polynomial "
+            "and equidistant (fisheye). Calibrate with one of them"
+        )
+    if is_fisheye and not _MODELS[word]:
+        raise InputError(f"its distortion model is {model!r}, no fisheye; omit --fisheye")
+    return _MODELS[word]
+
+
+def _camera(
+    K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, who: str
+) -> RawCamera:
+    if K is None:
+        raise InputError(f"no camera matrix of 9 numbers of {who}; write K1 and K2")
+    if distortion is None:
+        raise InputError(f"no distortion of {who}; write D1 and D2, zeros where a lens has none")
+    counts = _COUNTS[is_fisheye]
+    if len(distortion) not in counts:
+        model = "a fisheye lens" if is_fisheye else "a pinhole with distortion"
+        raise InputError(
+            f"{who} has {len(distortion)} coefficients of distortion, and {model} has "
+            f"{' or '.join(map(str, counts))}; look at its model"
+        )
+    intrinsics = torch.from_numpy(np.ascontiguousarray(K, np.float64))
+    check_intrinsics(intrinsics)
+    refuse_squeezed(intrinsics)
+    return RawCamera(K=intrinsics, distortion=tuple(distortion), is_fisheye=is_fisheye)
+
+
+def _pair(
+    left: RawCamera, right: RawCamera, motion: tuple[np.ndarray, np.ndarray], size: Size | None
+) -> RawPair:
+    if left.is_fisheye != right.is_fisheye:
+        raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
+    one, other = float(left.K[0, 0]), float(right.K[0, 0])
+    if not 1 / _MOST_UNLIKE < one / other < _MOST_UNLIKE:
+        raise InputError(
+            f"fx is {one:g} on the left and {other:g} on the right, as of images of two sizes; "
+            "scale one camera matrix and its images to those of the other"
+        )
+    R, t_m = (torch.from_numpy(np.array(part, np.float64)) for part in motion)
+    return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
+
+
+def _refuse_unlikely(pair: RawPair) -> None:
+    R = pair.right_from_left.R
+    if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
+        raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
+    x, y, z = pair.right_from_left.inverse().t_m.tolist()
+    if not pair.right_from_left.t_m.any():
+        raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
+    if abs(x) < max(abs(y), abs(z)):
+        raise InputError(
+            f"the second camera stands at ({x:g}, {y:g}, {z:g}) m of the first, above or before it "
+            "more than beside it; turn the images by 90 degrees and calibrate those"
+        )
+    if x < 0:
+        raise InputError(
+            "its second camera stands to the left of its first; exchange the two in the file: "
+            "R becomes its transpose, T becomes -R^T T"
+        )
+
 
 Maps = tuple[np.ndarray, np.ndarray]
 
@@ -101,76 +378,14 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         )
     else:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*lenses, size, R, t, flags=flags, alpha=keep)
+    rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
+    assert isinstance(rig, StereoRig), "two projections have a baseline"
     return Rectifier(
-        rig=_rig(P1, P2, size),
+        rig=rig,
         rectified_from_raw=Rigid(torch.from_numpy(R1), torch.zeros(3).double()),
         left_maps=_maps(pair.left, R1, P1, size),
         right_maps=_maps(pair.right, R2, P2, size),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class EpipolarResidual:
-    """By how much the rows of matched features differ.
-
-    Attributes:
-        median_px: half of the matches differ by less; NaN without matches.
-        p95_px: 95 % differ by less; NaN without matches.
-        matches: how many there are.
-        is_swapped: whether the left image looks like the right one.
-    """
-
-    median_px: float
-    p95_px: float
-    matches: int
-    is_swapped: bool
-
-    @property
-    def is_known(self) -> bool:
-        """Whether enough features matched to tell."""
-        return self.matches >= _MIN_MATCHES
-
-
-def epipolar_residual(shift_px: Float[np.ndarray, "n 2"]) -> EpipolarResidual:
-    """Sum up the shifts of matched features (:func:`match_features`), of one pair or of many."""
-    if not len(shift_px):
-        return EpipolarResidual(median_px=math.nan, p95_px=math.nan, matches=0, is_swapped=False)
-    rows_px, columns_px = np.abs(shift_px[:, 1]), shift_px[:, 0]
-    clear = columns_px[np.abs(columns_px) > 1]
-    is_swapped = len(clear) >= _MIN_MATCHES and (clear < 0).mean() <= _MAX_SWAPPED_SHARE
-    return EpipolarResidual(
-        median_px=float(np.median(rows_px)),
-        p95_px=float(np.quantile(rows_px, 0.95)),
-        matches=len(shift_px),
-        is_swapped=bool(is_swapped),
-    )
-
-
-def match_features(
-    left: Float32[Tensor, "3 h w"], right: Float32[Tensor, "3 h w"]
-) -> Float[np.ndarray, "n 2"]:
-    """Match SIFT features; give column and row of the right one less those of the left one [px].
-
-    A match is each other's best by Lowe's ratio. Outliers are those that agree with no epipolar
-    geometry (RANSAC); which one it is, rectified or not, is left open, so that a wrong
-    rectification is seen.
-    """
-    cv2 = import_opencv("matching features")
-    sift, matcher = cv2.SIFT_create(_FEATURES), cv2.BFMatcher()
-    (one, first), (two, second) = (sift.detectAndCompute(_grey(i), None) for i in (left, right))
-    if first is None or second is None or min(len(one), len(two)) < 2:
-        return np.zeros((0, 2))
-    there, back = (
-        {m.queryIdx: m.trainIdx for m, n in found if m.distance < _RATIO * n.distance}
-        for found in (matcher.knnMatch(first, second, k=2), matcher.knnMatch(second, first, k=2))
-    )
-    mutual = [(i, j) for i, j in there.items() if back.get(j) == i]
-    if len(mutual) < 8:
-        return np.zeros((0, 2))
-    a, b = np.array([one[i].pt for i, _ in mutual]), np.array([two[j].pt for _, j in mutual])
-    cv2.setRNGSeed(0)
-    _, inlier = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, _RANSAC_PX, 0.999, 2000)
-    return (b - a) if inlier is None else (b - a)[inlier.ravel() > 0]
 
 
 def _warp(image: Float32[Tensor, "3 h w"], maps: Maps) -> Float32[Tensor, "3 h w"]:
@@ -178,12 +393,6 @@ def _warp(image: Float32[Tensor, "3 h w"], maps: Maps) -> Float32[Tensor, "3 h w
     pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
     warped = cv2.remap(pixels, *maps, cv2.INTER_CUBIC)
     return torch.from_numpy(warped).permute(2, 0, 1).clamp(0, 1).contiguous()
-
-
-def _rig(P1: np.ndarray, P2: np.ndarray, size: Size) -> StereoRig:
-    rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
-    assert isinstance(rig, StereoRig), "two projections have a baseline"
-    return rig
 
 
 def _maps(camera: RawCamera, R: np.ndarray, P: np.ndarray, size: Size) -> Maps:
@@ -194,7 +403,3 @@ def _maps(camera: RawCamera, R: np.ndarray, P: np.ndarray, size: Size) -> Maps:
 
 def _numbers(camera: RawCamera) -> tuple[np.ndarray, np.ndarray]:
     return camera.K.numpy(), np.array(camera.distortion)
-
-
-def _grey(image: Float32[Tensor, "3 h w"]) -> np.ndarray:
-    return np.ascontiguousarray((255 * grey_of(image)).round().clamp(0, 255).byte().numpy())

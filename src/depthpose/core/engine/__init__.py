@@ -4,25 +4,25 @@ The engine knows files and names; what a worker does with them is a function tha
 """
 
 from depthpose.core.engine.job import Job as Job
+from depthpose.core.engine.job import RayEngine as RayEngine
 from depthpose.core.engine.job import is_job as is_job
 from depthpose.core.engine.job import read_job_settings as read_job_settings
 from depthpose.core.engine.job import read_results as read_results
 from depthpose.core.engine.job import result_items as result_items
 from depthpose.core.engine.job import run_job as run_job
 from depthpose.core.engine.job import shard_results as shard_results
-from depthpose.core.engine.on_ray import RayEngine as RayEngine
 from depthpose.core.engine.plan import Files as Files
 from depthpose.core.engine.plan import Item as Item
 from depthpose.core.engine.plan import find_items as find_items
 from depthpose.core.engine.plan import find_tars as find_tars
 from depthpose.core.engine.plan import is_tar as is_tar
 from depthpose.core.engine.plan import stem as stem
-from depthpose.core.engine.shard import ShardFormat as ShardFormat
-from depthpose.core.engine.shard import read_shard as read_shard
 from depthpose.core.engine.work import Done as Done
 from depthpose.core.engine.work import Function as Function
 from depthpose.core.engine.work import Sample as Sample
+from depthpose.core.engine.work import ShardFormat as ShardFormat
 from depthpose.core.engine.work import first_sample as first_sample
+from depthpose.core.engine.work import read_shard as read_shard
 from depthpose.core.engine.work import run_here as run_here
 from depthpose.core.files.store import absolute as absolute
 from depthpose.core.files.store import is_url as is_url

@@ -15,7 +15,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.files.names import find_partners
+from depthpose.core.files.disk import find_partners
 from depthpose.core.files.store import (
     absolute,
     exists,

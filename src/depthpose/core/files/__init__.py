@@ -14,11 +14,11 @@ from depthpose.core.files.disk import atomic_write as atomic_write
 from depthpose.core.files.disk import cache_folder as cache_folder
 from depthpose.core.files.disk import refused_as as refused_as
 from depthpose.core.files.disk import remove_parts as remove_parts
-from depthpose.core.files.exif import read_exif_focal as read_exif_focal
 from depthpose.core.files.images import encode_image as encode_image
 from depthpose.core.files.images import image_size as image_size
 from depthpose.core.files.images import list_images as list_images
 from depthpose.core.files.images import picture_tensor as picture_tensor
+from depthpose.core.files.images import read_exif_focal as read_exif_focal
 from depthpose.core.files.images import read_image as read_image
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.maps import DEPTH_SUFFIXES as DEPTH_SUFFIXES
@@ -30,7 +30,7 @@ from depthpose.core.files.maps import read_stored_depth as read_stored_depth
 from depthpose.core.files.maps import write_depth_png as write_depth_png
 from depthpose.core.files.maps import write_disparity_png as write_disparity_png
 from depthpose.core.files.maps import write_map as write_map
-from depthpose.core.files.shards import read_bytes as read_bytes
+from depthpose.core.files.store import read_bytes as read_bytes
 from depthpose.core.files.text import read_json as read_json
 from depthpose.core.files.text import read_key_values as read_key_values
 from depthpose.core.files.text import read_text as read_text

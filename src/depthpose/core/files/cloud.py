@@ -16,15 +16,17 @@ from torch import Tensor
 from depthpose.core.errors import InputError, import_open3d
 from depthpose.core.files.disk import AnyPath, refused_as, refused_suffix, write_bytes
 from depthpose.core.files.maps import read_npy, to_float32
-from depthpose.core.files.pcd import encode_pcd, read_pcd, unpack_rgb
 from depthpose.core.files.points import (
     Columns,
+    encode_pcd,
     encode_ply,
     parse_rows,
     plain_numbers,
+    read_pcd,
     read_ply,
+    unpack_rgb,
 )
-from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import MAX_TEXT_BYTES
 
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}

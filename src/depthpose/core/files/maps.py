@@ -19,7 +19,7 @@ from depthpose.core.files.disk import (
     write_bytes,
 )
 from depthpose.core.files.images import FAST_PNG, opened_image
-from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.store import read_bytes
 
 MAP_SUFFIXES = (".npy", ".pfm")
 """Of files that hold a map of floats."""

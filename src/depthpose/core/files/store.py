@@ -1,21 +1,82 @@
-"""Files on a local disk or in an object store, by path or fsspec URL, published whole."""
+"""Files in tar shards, and in object stores: by path or fsspec URL, published whole.
 
+A path that leads through a tar shard, ``000000.tar/a.left.png``, is read as through a folder.
+"""
+
+import json
 import shutil
+import tarfile
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from fsspec.core import url_to_fs
-
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import atomic_write, read_file
-from depthpose.core.files.names import natural_order
+from depthpose.core.files.disk import (
+    MAX_FILE_BYTES,
+    AnyPath,
+    atomic_write,
+    natural_order,
+    read_file,
+    refused_read,
+)
 
-_DISK = "file"
+SOURCE = "source.json"
+"""Beside shards that are fetched when they are first read: ``{"url": ...}``, where from."""
 _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 """Stores in which an upload appears whole or not at all."""
+
+
+def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file whole, or one in a shard; more than ``most`` bytes are refused unread.
+
+    A shard that is not here yet is fetched first, from where its folder's ``source.json`` says.
+
+    Raises:
+        InputError: there is no such file, or it is none that can be read; the shard is damaged, or
+            the store that it comes from does not answer.
+    """
+    inside = Path(path)
+    with refused_read(path):
+        is_in_shard = ".tar/" in inside.as_posix()
+        shards = (p for p in inside.parents if is_in_shard and p.suffix == ".tar")
+        shard = next((p for p in shards if not p.is_dir()), None)
+        if shard is not None:
+            return _read_member(shard, inside.relative_to(shard).as_posix(), most)
+    return read_file(path, most)
+
+
+def _read_member(shard: Path, name: str, most: int) -> bytes:
+    if not shard.exists():
+        source = shard.parent / SOURCE
+        if not source.is_file():
+            raise InputError(f"{shard}: no such file; check the path")
+        fetch(join(json.loads(source.read_text())["url"], shard.name), shard)
+    status = shard.stat()
+    place = _places(shard, status.st_mtime_ns, status.st_size).get(name)
+    if place is None:
+        raise InputError(f"{shard}: holds no file {name!r}; pack the data set again")
+    offset, size = place
+    if size > most:
+        raise InputError(f"{shard}/{name}: {size} bytes, more than the {most} that are read of it")
+    with shard.open("rb") as file:
+        file.seek(offset)
+        data = file.read(size)
+    if len(data) < size:
+        raise InputError(f"{shard}: ends within {name!r}; pack or fetch it again")
+    return data
+
+
+@lru_cache(maxsize=4096)
+def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
+    """Say where each file of a shard begins, and how many bytes it has."""
+    try:
+        with tarfile.open(shard, "r:") as tar:
+            return {m.name: (m.offset_data, m.size) for m in tar if m.isfile() and not m.sparse}
+    except (tarfile.TarError, OSError, EOFError) as error:
+        raise InputError(f"{shard}: not a readable tar shard ({error}); pack it again") from error
 
 
 def is_url(path: str) -> bool:
@@ -28,7 +89,7 @@ def local_path(url: str) -> Path | None:
     if not is_url(url):
         return Path(url)
     protocol, _, rest = url.partition("://")
-    return Path(rest) if protocol in (_DISK, "local") else None
+    return Path(rest) if protocol in ("file", "local") else None
 
 
 def join(folder: str, *names: str) -> str:
@@ -51,8 +112,7 @@ def read_from(url: str) -> bytes:
     path = local_path(url)
     if path is not None:
         return read_file(path)
-    with _refused(url, "read"):
-        fs, inner = url_to_fs(url)
+    with _file_system(url, "read") as (fs, inner):
         return fs.cat_file(inner)
 
 
@@ -65,9 +125,7 @@ def exists(url: str) -> bool:
     path = local_path(url)
     if path is not None:
         return path.is_file()
-    with _refused(url, "looked for"):
-        fs, inner = url_to_fs(url)
-        fs.invalidate_cache()
+    with _file_system(url, "looked for") as (fs, inner):
         return bool(fs.isfile(inner))
 
 
@@ -80,10 +138,8 @@ def read_all(folder: str, suffix: str) -> dict[str, bytes]:
     path = local_path(folder)
     if path is not None:
         return {p.name: read_file(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
-    with _refused(folder, "listed"):
-        fs, inner = url_to_fs(folder)
-        fs.invalidate_cache()
-        found = [p for p in _entries(fs, inner) if p.endswith(suffix)]
+    with _file_system(folder, "listed") as (fs, inner):
+        found = [e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix)]
         contents = fs.cat(found) if found else {}
         return {PurePosixPath(p).name: contents[p] for p in sorted(contents)}
 
@@ -103,8 +159,7 @@ def publish(file: Path, url: str) -> None:
             shutil.copyfile(file, part)
         return
     refuse_unsafe(url)
-    with _refused(url, "written"):
-        fs, inner = url_to_fs(url)
+    with _file_system(url, "written") as (fs, inner):
         fs.put_file(str(file), inner)
 
 
@@ -144,7 +199,8 @@ def local_copy(url: str, scratch: Path) -> Iterator[Path]:
         yield path
         return
     copy = Path(tempfile.mkdtemp(dir=scratch)) / PurePosixPath(url).name
-    _get(url, copy)
+    with _file_system(url, "read") as (fs, inner):
+        fs.get_file(inner, str(copy))
     try:
         yield copy
     except InputError as error:
@@ -159,14 +215,8 @@ def fetch(url: str, path: Path) -> None:
     Raises:
         InputError: it is not there or cannot be read, or the disk refuses.
     """
-    with atomic_write(path) as part:
-        _get(url, part)
-
-
-def _get(url: str, path: Path) -> None:
-    with _refused(url, "read"):
-        fs, inner = url_to_fs(url)
-        fs.get_file(inner, str(path))
+    with atomic_write(path) as part, _file_system(url, "read") as (fs, inner):
+        fs.get_file(inner, str(part))
 
 
 @contextmanager
@@ -176,8 +226,7 @@ def opened(url: str) -> Iterator[Any]:
     Raises:
         InputError: it is not there.
     """
-    with _refused(url, "read"):
-        fs, inner = url_to_fs(url)
+    with _file_system(url, "read") as (fs, inner):
         file = fs.open(inner, "rb")
     with file:
         yield file
@@ -196,15 +245,18 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
     Raises:
         InputError: nothing was found.
     """
-    with _refused(path, "listed"):
-        fs, inner = url_to_fs(path)
-        fs.invalidate_cache()
+    with _file_system(path, "listed") as (fs, inner):
         if fs.isfile(inner):
             found = [inner]
         elif fs.isdir(inner) or not any(mark in inner for mark in "*?["):
-            found = _entries(fs, inner)
+            found = [entry["name"] for entry in _details(fs, inner)]
         else:
-            found = fs.glob(_with_plain_folders(fs, inner))
+            # Brackets in the name of a folder that is there stand for themselves.
+            home, _, rest = inner.rpartition("/")
+            while "[" in home and not fs.isdir(home):
+                home, _, last = home.rpartition("/")
+                rest = f"{last}/{rest}"
+            found = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
     kept = [p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
     kept.sort(key=lambda p: natural_order(Path(p)))
     if not kept:
@@ -221,9 +273,7 @@ def list_sizes(folder: str) -> dict[str, int]:
     Raises:
         InputError: the store does not answer.
     """
-    with _refused(folder, "listed"):
-        fs, inner = url_to_fs(folder)
-        fs.invalidate_cache()
+    with _file_system(folder, "listed") as (fs, inner):
         return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
 
 
@@ -233,8 +283,7 @@ def remove(url: str) -> None:
     Raises:
         InputError: it cannot be.
     """
-    with _refused(url, "removed"):
-        fs, inner = url_to_fs(url)
+    with _file_system(url, "removed") as (fs, inner):
         fs.rm_file(inner)
 
 
@@ -244,28 +293,13 @@ def list_tree(url: str) -> dict[str, str]:
     Raises:
         InputError: the store does not answer.
     """
-    with _refused(url, "listed"):
-        fs, inner = url_to_fs(url)
-        fs.invalidate_cache()
+    with _file_system(url, "listed") as (fs, inner):
         root = inner.rstrip("/")
         names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]
     return {name: join(url, name) for name in sorted(names)}
 
 
-def _with_plain_folders(fs: Any, pattern: str) -> str:  # noqa: ANN401  fsspec carries no types
-    """Take brackets in the name of a folder that is there as themselves."""
-    home, _, rest = pattern.rpartition("/")
-    while "[" in home and not fs.isdir(home):
-        home, _, last = home.rpartition("/")
-        rest = f"{last}/{rest}"
-    return f"{home.replace('[', '[[]')}/{rest}" if "[" in home else pattern
-
-
-def _entries(fs: Any, folder: str) -> list[str]:  # noqa: ANN401  fsspec carries no types
-    return [entry["name"] for entry in _details(fs, folder)]
-
-
-def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401
+def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401  fsspec has no types
     try:
         return [entry for entry in fs.ls(folder, detail=True) if entry["type"] == "file"]
     except FileNotFoundError:
@@ -277,10 +311,14 @@ def _shown(path: str) -> bool:
 
 
 @contextmanager
-def _refused(url: str, done: str) -> Iterator[None]:
-    """Turn what a file system raises into an :class:`InputError`."""
+def _file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
+    """Give the file system of a URL and the path there; its errors become :class:`InputError`."""
     try:
-        yield
+        from fsspec.core import url_to_fs  # takes time to load
+
+        fs, inner = url_to_fs(url)
+        fs.invalidate_cache()
+        yield fs, inner
     except InputError:
         raise
     except FileNotFoundError as error:

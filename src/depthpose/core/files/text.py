@@ -11,7 +11,7 @@ import yaml
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import AnyPath, refused_as, write_bytes
-from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.store import read_bytes
 
 MAX_TEXT_BYTES = 2**26
 """Of text and tables in it: a million points, ten thousand images of annotations."""

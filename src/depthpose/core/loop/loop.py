@@ -26,10 +26,9 @@ from torch.utils.data import DataLoader
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.lock import held_folders, release_folders
 from depthpose.core.loop.folder import STATE, Journal, Parts, restore_last, run_files, saved_states
 from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
-from depthpose.core.run import claim_folder, find_rank
+from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
 SECOND_CTRL_C_S = 3.0
 """Between the first Ctrl-C, which stops, and the second, which finishes."""

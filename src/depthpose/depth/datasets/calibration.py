@@ -16,13 +16,18 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.camera.camera_text import (
+from depthpose.core.camera.camera_file import (
     Matrix,
     kitti_matrix,
     kitti_size,
     plain_facts,
 )
-from depthpose.core.camera.facts import CameraFacts, Size, camera_from_facts, facts_from_projections
+from depthpose.core.camera.pinhole import (
+    CameraFacts,
+    Size,
+    camera_from_facts,
+    facts_from_projections,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_key_values, read_text
 

@@ -13,7 +13,7 @@ from typing import Any
 from depthpose.core.errors import InputError
 from depthpose.core.files import atomic_write, cache_folder, read_bytes, read_json, write_json
 from depthpose.core.files.disk import write_bytes
-from depthpose.core.files.shards import SOURCE
+from depthpose.core.files.store import SOURCE
 from depthpose.depth.datasets.frames import Frame
 
 INDEX = "index.json"

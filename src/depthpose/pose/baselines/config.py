@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings
 
 
 @dataclass(frozen=True, kw_only=True)

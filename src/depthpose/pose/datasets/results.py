@@ -9,7 +9,7 @@ from pathlib import Path
 
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_as, write_bytes
-from depthpose.core.files.shards import read_bytes
+from depthpose.core.files.store import read_bytes
 from depthpose.core.files.text import refuse_heavy
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets.parse import MOST, make_pose

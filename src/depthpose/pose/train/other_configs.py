@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.pose.baselines.config import DepthImageConfig, PointNetConfig

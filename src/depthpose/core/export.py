@@ -1,0 +1,409 @@
+"""A network to an ONNX file that runs without torch, and the proof that both answer alike.
+
+Operators are those of opset 18 (https://onnx.ai/onnx/operators), the first whose Resize averages
+where it shrinks. The proof: largest and mean difference to PyTorch's answers, and their limit.
+"""
+
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from depthpose.core.checkpoint import file_sha256
+from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.files import atomic_write, write_json
+from depthpose.core.run import environment, refuse_to_replace
+
+OPSET = 18
+Shape = Sequence[int | str]
+"""Sides of a tensor; text names a side that is known only when the graph runs."""
+
+
+class Value:
+    """A tensor of a graph; arithmetic on it adds nodes."""
+
+    def __init__(self, graph: "Graph", name: str) -> None:
+        self.graph = graph
+        self.name = name
+
+    def op(self, kind: str, *others: Any, **attributes: Any) -> "Value":  # noqa: ANN401
+        """Feed it to an operator, first of its inputs."""
+        return self.graph.op(kind, self, *others, **attributes)
+
+    def cast(self, dtype: type) -> "Value":
+        """Give the same numbers in another type."""
+        return self.op("Cast", to=_onnx_type(dtype))
+
+    def slice(self, starts: Any, ends: Any, axes: Sequence[int]) -> "Value":  # noqa: ANN401
+        """Cut out a part; numbers are lists, or values of int64."""
+        return self.op("Slice", starts, ends, list(axes))
+
+    def __add__(self, other: Any) -> "Value":  # noqa: ANN401
+        return self.op("Add", other)
+
+    def __sub__(self, other: Any) -> "Value":  # noqa: ANN401
+        return self.op("Sub", other)
+
+    def __mul__(self, other: Any) -> "Value":  # noqa: ANN401
+        return self.op("Mul", other)
+
+    def __truediv__(self, other: Any) -> "Value":  # noqa: ANN401
+        return self.op("Div", other)
+
+    def __mod__(self, other: Any) -> "Value":  # noqa: ANN401
+        return self.op("Mod", other)
+
+
+class Graph:
+    """Nodes in the order in which they are written.
+
+    Inputs of an operator are values, arrays, or numbers: an int becomes int64, a float float64.
+
+    Raises:
+        MissingExtraError: the extra ``export`` is not installed.
+    """
+
+    def __init__(self) -> None:
+        self._onnx = import_export()
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+        self._inputs: list[Any] = []
+        self._outputs: list[Any] = []
+        self._number = 0
+
+    def input(self, name: str, dtype: type, shape: Shape) -> Value:
+        """Add an input of the graph."""
+        self._inputs.append(self._described(name, dtype, shape))
+        return Value(self, name)
+
+    def output(self, name: str, value: Value, dtype: type, shape: Shape) -> None:
+        """Make a value an output of the graph."""
+        self._nodes.append(self._onnx.helper.make_node("Identity", [value.name], [name]))
+        self._outputs.append(self._described(name, dtype, shape))
+
+    def op(self, kind: str, *inputs: Any, **attributes: Any) -> Value:  # noqa: ANN401
+        """Add an operator and give its first output; None leaves an optional input out."""
+        out = self._new_name(kind)
+        names = ["" if given is None else self._name_of(given) for given in inputs]
+        self._nodes.append(self._onnx.helper.make_node(kind, names, [out], **attributes))
+        return Value(self, out)
+
+    def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
+        """Put a whole model's nodes here and give its outputs.
+
+        Args:
+            network: an ONNX model, from :func:`depthpose.core.export.network_model`.
+            inputs: in the order of the model's own.
+        """
+        prefix = self._new_name("network") + "/"
+        inner = self._onnx.compose.add_prefix(network, prefix).graph
+        for given, wanted in zip(inputs, inner.input, strict=True):
+            node = self._onnx.helper.make_node("Identity", [given.name], [wanted.name])
+            self._nodes.append(node)
+        self._nodes += inner.node
+        self._constants += inner.initializer
+        return tuple(Value(self, output.name) for output in inner.output)
+
+    def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
+        """Close the graph.
+
+        Args:
+            facts: for users of the file, each in its metadata, as text or JSON.
+        """
+        helper = self._onnx.helper
+        graph = helper.make_graph(
+            self._nodes, "depthpose", self._inputs, self._outputs, self._constants
+        )
+        opsets = [helper.make_opsetid("", OPSET)]
+        model = helper.make_model(graph, opset_imports=opsets, producer_name="depthpose")
+        model.ir_version = 10  # of onnx 1.16: younger ones would shut out older runtimes
+        texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()}
+        helper.set_model_props(model, texts)
+        self._onnx.checker.check_model(model, full_check=True)
+        return model
+
+    def _name_of(self, given: Any) -> str:  # noqa: ANN401
+        if isinstance(given, Value):
+            return given.name
+        name = self._new_name("constant")
+        self._constants.append(self._onnx.numpy_helper.from_array(np.asarray(given), name))
+        return name
+
+    def _new_name(self, kind: str) -> str:
+        self._number += 1
+        return f"{kind}_{self._number}"
+
+    def _described(self, name: str, dtype: type, shape: Shape) -> Any:  # noqa: ANN401
+        return self._onnx.helper.make_tensor_value_info(name, _onnx_type(dtype), list(shape))
+
+
+def _onnx_type(dtype: type) -> int:
+    return import_export().helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+
+
+_PACKAGES = (
+    "onnxruntime",
+    "onnxscript",
+    "onnx.compose",
+    "onnx.inliner",
+    "onnx.numpy_helper",
+    "onnx",
+)
+
+
+def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
+    """Import ONNX, and make sure that what goes with it is there too.
+
+    Raises:
+        MissingExtraError: one of the three is not installed.
+    """
+    try:
+        return [import_module(name) for name in _PACKAGES][-1]
+    except ImportError as error:
+        raise MissingExtraError("onnx, onnxruntime and onnxscript", "export", "export") from error
+
+
+Row = dict[str, str | float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Case:
+    """One input and what PyTorch answers.
+
+    Attributes:
+        name: its size, for the table.
+        inputs: by the names of the graph's inputs.
+        expected: by the names of its outputs; what is not named is not compared.
+        where: the part of an output that is compared, where it is not all of it.
+    """
+
+    name: str
+    inputs: Mapping[str, np.ndarray]
+    expected: Mapping[str, np.ndarray]
+    where: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """How far an output may be off.
+
+    Attributes:
+        value: the limit, in the output's unit.
+        of: the largest difference, or the mean one where the output is discontinuous.
+        is_relative: differences are shares of what PyTorch answers.
+        flips: share of the numbers that may be off by more, or be NaN in one answer alone, and are
+            left out of the differences: where a decision is at its limit.
+    """
+
+    value: float
+    of: Literal["largest", "mean"] = "largest"
+    is_relative: bool = False
+    flips: float = 0.0
+
+
+def measure_differences(
+    path: Path, cases: Iterable[Case], limits: Mapping[str, Limit]
+) -> list[Row]:
+    """Run a file with onnxruntime on each case, on the CPU, and give a row for each output.
+
+    Raises:
+        InputError: an output is NaN where PyTorch's is not, or the other way round, or off by
+            more than its limit, on more pixels than may flip; or there is no number to compare.
+    """
+    session = import_module("onnxruntime").InferenceSession(
+        str(path), providers=["CPUExecutionProvider"]
+    )
+    rows: list[Row] = []
+    for case in cases:
+        answers = session.run(list(case.expected), dict(case.inputs))
+        for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
+            if name in case.where and answer.shape == expected.shape:
+                answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
+            rows.append(_row(case.name, name, (answer, expected), limits[name]))
+    if not rows:
+        raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
+    return rows
+
+
+def refuse_beyond(rows: Iterable[Row]) -> None:
+    """Raise where a difference is beyond its limit.
+
+    Raises:
+        InputError: the first such row.
+    """
+    for row in rows:
+        found, limit = row[f"{row['limited']} difference"], row["limit"]
+        if not found <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
+            raise InputError(
+                f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
+                f"{found:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is written. "
+                "Install other versions of onnxscript and onnxruntime, and report this."
+            )
+
+
+def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> Row:
+    answer, expected = (np.asarray(values, np.float64) for values in pair)
+    is_nan = np.isnan(answer), np.isnan(expected)
+    is_other = answer.shape != expected.shape
+    if is_other or ((is_nan[0] != is_nan[1]).any() and not limit.flips):
+        raise InputError(
+            f"{output} of {case}: onnxruntime answers {answer.shape} with "
+            f"{is_nan[0].sum()} NaN, PyTorch {expected.shape} with "
+            f"{is_nan[1].sum()}; nothing is written."
+        )
+    difference = np.abs(answer - expected)
+    if limit.is_relative:
+        difference /= np.abs(expected)
+    difference = np.where(is_nan[0] != is_nan[1], np.inf, difference)
+    difference = difference[~np.isnan(difference)]
+    flipped: Row = {}
+    if limit.flips:
+        difference, share = _without_flips(difference, limit)
+        if share > limit.flips:
+            raise InputError(
+                f"{output} of {case}: PyTorch and onnxruntime differ by more than {limit.value:g} "
+                f"on {share:.3%} of the numbers, {limit.flips:.3%} may; nothing is written."
+            )
+        flipped = {"flipped": share}
+    if not difference.size:
+        raise InputError(
+            f"{output} of {case}: PyTorch gives not one number that could be compared, and what is "
+            "not compared is not proven; nothing is written. Are these the weights of a training "
+            "that went well?"
+        )
+    return {
+        "input": case,
+        "output": output,
+        "largest difference": float(difference.max()),
+        "mean difference": float(difference.mean()),
+        "limited": limit.of,
+        "limit": limit.value,
+        "unit": "share" if limit.is_relative else "as the output",
+        **flipped,
+    }
+
+
+def _without_flips(difference: np.ndarray, limit: Limit) -> tuple[np.ndarray, float]:
+    """Give the differences within the limit, and the share of those beyond it."""
+    is_kept = difference <= limit.value
+    return difference[is_kept], 1.0 - float(is_kept.mean()) if is_kept.size else 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Export:
+    """What is written, and what it is compared with.
+
+    Attributes:
+        graph: writes the graph.
+        cases: makes the inputs and PyTorch's answers.
+        limits: how far each output may be off.
+        facts: for users of the file, in its metadata.
+    """
+
+    graph: Callable[[], Graph]
+    cases: Callable[[], Iterable[Case]]
+    limits: Mapping[str, Limit]
+    facts: Mapping[str, Any]
+
+
+def freeze(path: Path, export: Export) -> list[Row]:
+    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it.
+
+    Returns:
+        The differences, a row for each input and output.
+
+    Raises:
+        InputError: another suffix, a file that is there already, a place that cannot be written,
+            or answers that differ.
+        MissingExtraError: the extra ``export`` is not installed.
+    """
+    if path.suffix != ".onnx":
+        raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
+    for file in (path, proof_path(path)):
+        refuse_to_replace(file)
+    onnx = import_export()
+    with atomic_write(path) as part:
+        part.touch()  # a place that cannot be written is refused before the work
+        facts = {**export.facts, "depthpose": version("depthpose")}
+        onnx.save(export.graph().model(facts), str(part))
+        rows = measure_differences(part, export.cases(), export.limits)
+        refuse_beyond(rows)
+        runtimes = {name: version(name) for name in ("onnx", "onnxscript", "onnxruntime")}
+        record = {
+            "file": path.name,
+            "sha256": file_sha256(part),
+            "opset": OPSET,
+            "environment": environment() | runtimes,
+            "facts": facts,
+            "differences": rows,
+        }
+        write_json(proof_path(path), record)
+    return rows
+
+
+def proof_path(path: Path) -> Path:
+    """Give the path of a graph's proof; NAME.json may be a camera."""
+    return path.with_suffix(".proof.json")
+
+
+MOST = 1 << 10
+"""Largest multiple of a side that is given to the exporter; the graph itself has no bound."""
+
+
+def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
+    """Turn a module of images into an ONNX model whose batch, rows and columns are free.
+
+    Args:
+        module: in eval mode; takes tensors (b, c, h, w) of one size.
+        images: an example of each; more than one image, sides of more than one ``multiple``, so
+            that no size of the example is taken for a law.
+        multiple: both sides are multiples of it.
+    """
+    onnx = import_export()
+    batch = torch.export.Dim("batch", min=1, max=MOST)
+    rows, columns = (torch.export.Dim(name, min=1, max=MOST) for name in ("rows", "columns"))
+    free = {0: batch, 2: multiple * rows, 3: multiple * columns}
+    with _quiet(), torch.no_grad():
+        program = torch.onnx.export(
+            module,
+            tuple(images),
+            dynamo=True,
+            opset_version=OPSET,
+            dynamic_shapes=tuple(free for _ in images),
+            verbose=False,
+        )
+    assert program is not None
+    return _bare(onnx.inliner.inline_local_functions(program.model_proto))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress the exporter's internal messages; the proof decides."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _bare(model: Any) -> Any:  # noqa: ANN401
+    """Drop what identifies the exporting machine: stack traces, paths, names of lines."""
+    for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    del model.graph.value_info[:]
+    return model

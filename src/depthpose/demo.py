@@ -1,0 +1,318 @@
+"""The page of ``depthpose demo``: synthetic parts posed, a street and a real pair matched."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
+from depthpose.core.draw import depth_scale, draw_depth
+from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.run import claim_folder, environment
+from depthpose.depth.config import SGBMConfig, StreetsConfig
+from depthpose.depth.disparity import depth_from_disparity
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.evaluate import clamped_depth
+from depthpose.depth.metrics import depth_errors, disparity_errors
+from depthpose.depth.predictions import CLOUD_M, write_estimate
+from depthpose.depth.synthetic import Streets
+from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
+from depthpose.pose.config import ObjectsConfig
+from depthpose.pose.datasets import open_bop, write_bop_models, write_bop_scene
+from depthpose.pose.datasets.write import write_mask
+from depthpose.pose.estimator import GeoPoseNet
+from depthpose.pose.evaluate import evaluate
+from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
+from depthpose.pose.synthetic import make_frames
+from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.page import (
+    Layer,
+    Picture,
+    Scene,
+    Section,
+    table_files,
+    write_page,
+    write_table,
+)
+from depthpose.report.pose import draw_pose, grey_depth, pose_layers, posed_cloud
+
+_STREETS_SEED = 9
+"""No weights were trained on streets of this seed."""
+_STREET = 1
+_CAP_M = 80.0
+_FROM_ONE, _FROM_PAIR = "one image", "both images"
+Nets = Mapping[str, tuple[str, FakestereoNet]]
+
+_STREET_TEXT = (
+    "A synthetic street of a seed that no training used; its depth is known exactly. Distances "
+    "from 3 m (bright) to 80 m (dark); the sky is grey. epe_px and d1_all measure disparity, the "
+    "other columns depth, over all pixels nearer than 80 m, occluded ones too. Depth from one "
+    "image is an estimate from what streets usually look like: good for road, cars and house "
+    "fronts at a usual camera's height, too near far away, and for streets alone."
+)
+_MOTORCYCLE_TEXT = (
+    "A real pair: Motorcycle of the Middlebury 2014 benchmark (Scharstein et al., GCPR 2014), as "
+    "scikit-image ships it. Distances from 1.5 m to 8 m. The shipped matcher was trained on "
+    "synthetic scenes alone."
+)
+
+
+def show_depth(
+    out: Path, weights: str | Path, scale: float
+) -> tuple[list[dict[str, Any]], list[Section]]:
+    """Estimate depth of both scenes; give a row for each method, and the parts of the page."""
+    street = Streets(StreetsConfig(seed=_STREETS_SEED, scale=scale))[_STREET]
+    street = replace(street, input=replace(street.input, name="street"))
+    network = FakestereoNet.load(weights)
+    scenes = [(street, _STREET_TEXT, (3.0, 80.0))]
+    if (motorcycle := read_motorcycle()) is not None:
+        scenes.insert(0, (motorcycle, _MOTORCYCLE_TEXT, (1.5, 8.0)))
+    rows, sections = [], []
+    for sample, text, range_m in scenes:
+        more, shown = _show_scene(out, sample, _nets(network, sample), text, range_m)
+        rows += more
+        sections += shown
+    return rows, sections
+
+
+def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
+    """Methods of a scene; the generator knows streets alone, so it draws no motorcycle."""
+    # The nearest surfaces of both scenes, in views moved by the distance of the principal points;
+    # OpenCV leaves that many columns unmatched.
+    rig = sample.input.camera
+    assert isinstance(rig, StereoRig)
+    nearest_px = sample.input.left.shape[2] / 10 + max(rig.cx_right_minus_left_px, 0.0)
+    columns = 16 * math.ceil(nearest_px / 16)
+    sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
+    matched = {} if network.matcher is None else {"stereo network": (_FROM_PAIR, network)}
+    filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
+    pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
+    is_street = sample.input.name == "street"
+    return {**pairs, "selecting generator": (_FROM_ONE, network)} if is_street else pairs
+
+
+def _show_scene(
+    out: Path, sample: StereoSample, nets: Nets, text: str, range_m: tuple[float, float]
+) -> tuple[list[dict[str, Any]], list[Section]]:
+    """Write the pair as files that commands take; estimate by each method; rows and sections."""
+    pair, truth, folder = sample.input, sample.truth, out / sample.input.name
+    assert pair.right is not None
+    assert pair.camera is not None
+    assert truth.depth_m is not None
+    assert truth.disparity_px is not None
+    write_image(folder / "left.png", pair.left)
+    write_image(folder / "right.png", pair.right)
+    write_camera(folder / "camera.json", pair.camera)
+    write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *range_m))
+    rows, sections = [], []
+    homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
+    for method, (given, net) in nets.items():
+        seen = pair if given == _FROM_PAIR else replace(pair, right=None)
+        estimate = net.estimate_pair(seen, with_check=False)
+        measured = _measure(sample, estimate)
+        rows.append({"scene": pair.name, "method": method, "input": given, **measured})
+        write_estimate(homes[method], seen, estimate, range_m, CLOUD_M)
+        error_px = (estimate.disparity_px - truth.disparity_px).abs()
+        error = DepthError(error=error_px, is_disparity=True)
+        shown = DepthShown(pair=seen, estimate=estimate, range_m=range_m, error=error)
+        title = f"{pair.name}: {method}, {given}"
+        sections.append(depth_section(title, shown, with_image=False))
+    best, scale = next(iter(nets)), depth_scale(*range_m)
+    pictures = [
+        Picture(path=folder / "left.png", caption="left image"),
+        Picture(path=folder / "right.png", caption="right image"),
+        Picture(
+            path=homes[best] / f"{pair.name}.color.png",
+            caption=f"depth from both: {best}",
+            scale=scale,
+        ),
+        Picture(path=folder / "depth.color.png", caption="true depth; grey: none", scale=scale),
+    ]
+    opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
+    return rows, [opening, *sections]
+
+
+def _measure(sample: StereoSample, estimate: DepthEstimate) -> dict[str, Any]:
+    """Every measure over the pixels that have truth within the cap and a prediction."""
+    rig, true_px, true_m = sample.input.camera, sample.truth.disparity_px, sample.truth.depth_m
+    assert isinstance(rig, StereoRig)
+    assert true_px is not None
+    assert true_m is not None
+    predicted_m = clamped_depth(estimate.disparity_px, rig, _CAP_M)
+    counts = true_m < _CAP_M
+    mask = counts & torch.isfinite(estimate.disparity_px)
+    row = {"coverage": float(mask.sum() / counts.sum())}
+    row |= asdict(disparity_errors(estimate.disparity_px[mask], true_px[mask]))
+    return row | asdict(depth_errors(predicted_m[mask], true_m[mask]))
+
+
+def read_motorcycle() -> StereoSample | None:
+    """Read the pair with its true disparity, or None where scikit-image is not installed.
+
+    Calibration is that of scikit-image's documentation: images a quarter of the original size,
+    principal points 31.086 px apart, baseline 193.001 mm.
+    """
+    try:
+        from skimage.data import stereo_motorcycle
+    except ImportError:
+        return None
+    left, right, disparity = stereo_motorcycle()
+    K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
+    rig = StereoRig(
+        width=left.shape[1],
+        height=left.shape[0],
+        K=K,
+        baseline_m=0.193001,
+        cx_right_minus_left_px=31.086,
+    )
+    disparity_px = torch.from_numpy(np.array(disparity, np.float32))
+    disparity_px[~torch.isfinite(disparity_px)] = torch.nan
+    truth = StereoTruth(disparity_px=disparity_px, depth_m=depth_from_disparity(disparity_px, rig))
+    views = [
+        torch.from_numpy(np.array(view)).permute(2, 0, 1).float() / 255 for view in (left, right)
+    ]
+    pair = StereoInput(name="motorcycle", left=views[0], right=views[1], camera=rig)
+    return StereoSample(input=pair, truth=truth)
+
+
+_FRAMES_SEED = 9
+"""No weights were trained on frames of this seed."""
+
+_FRAME = 1
+"""The first that shows every part whole."""
+
+_SAMPLE = "flange"
+"""Whose depth image, mask and camera lie in a folder of their own, for a first command."""
+
+_UNIT_M = 0.0001
+_COLUMNS = ("object", "visible_fraction", "status", "metric", "error_mm", "of_diameter",
+            "rotation_deg", "translation_mm", "ms_network", "ms_total", "reason")  # fmt: skip
+_TEXT = (
+    "Five synthetic parts on a table, with the noise and the shadows of a structured-light sensor. "
+    "The network was trained on synthetic views of these parts alone; the masks are given. Blue: "
+    "the estimated pose, as box and silhouette; green and dashed: the box of the truth. An "
+    "estimate is right below a tenth of the diameter (ADD, or ADD-S where a part is symmetric); "
+    "an uncertain one is refused with a reason. error_mm is that error, of_diameter its share of "
+    "the diameter, visible_fraction the share of a part's pixels that nothing hides; ms_network "
+    "and ms_total are the milliseconds of the network and of the whole estimate."
+)
+
+
+def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
+    """Pose the parts of a synthetic frame; give a row for each, and the sections of the page."""
+    net = GeoPoseNet.load(weights)
+    models = {model.number: model for model in net.weights.models}
+    count = len(models)
+    config = ObjectsConfig(
+        seed=_FRAMES_SEED, distance_m=(0.6, 0.9), frame_objects=(count, count), frame_clutter=(2, 2)
+    )
+    frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
+    assert frame.rgb is not None
+    write_bop_models(out / "parts", net.weights.models)
+    write_bop_scene(out / "parts", "test", 0, [frame])
+    dataset = open_bop(out / "parts", cloud=net.weights.cloud)
+    views = [dataset.view(instance).input for instance in dataset.instances]
+    sample = next(view for view in views if view.object == _SAMPLE)
+    height, width = sample.mask.shape
+    camera = Camera(width=width, height=height, K=sample.K.double(), depth_unit_m=_UNIT_M)
+    write_camera(out / "part/camera.json", camera)
+    write_depth_png(out / "part/depth.png", sample.depth_m, _UNIT_M)
+    write_mask(out / "part/mask.png", sample.mask)
+    net.estimate_many(views)  # prepares the models: times below are those of further estimates
+    estimates = net.estimate_many(views)
+    predictions = [
+        Prediction(estimate=estimate, place=place_of(instance))
+        for estimate, instance in zip(estimates, dataset.instances, strict=True)
+    ]
+    folder = out / "geo-posenet"
+    write_predictions(folder, predictions)
+    rows = [_row(row.columns()) for row in evaluate(dataset, predictions).per_instance]
+    points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
+    is_seen = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
+    color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[is_seen]
+    table = Cloud(points=points_m[is_seen].float(), color=color)
+    picture, layers = frame.rgb, [Layer(name="table, as the sensor sees it", shape=table)]
+    for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
+        model, K = models[instance.object_id], instance.K.double()
+        if (pose := estimate.camera_from_model) is not None:
+            picture = draw_pose(picture, pose, model, K)
+            cloud = posed_cloud(dataset.sample(instance).input.points_m, pose, model)
+            write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
+            layers += pose_layers(pose, model)
+        picture = draw_pose(picture, instance.camera_from_model, model, K, is_true=True)
+        layers += pose_layers(instance.camera_from_model, model, is_true=True)
+    write_image(folder / "poses.png", picture)
+    write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
+    pictures = [
+        Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
+        Picture(path=folder / "poses.png", caption="poses, estimated and true"),
+    ]
+    scenes = [Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)]
+    title = "Parts on a table"
+    return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=scenes)]
+
+
+def _row(measured: dict[str, Any]) -> dict[str, Any]:
+    """The columns that a newcomer reads, in units that parts have."""
+    error_m, moved_m = measured["error_m"], measured["translation_m"]
+    row = measured | {
+        "error_mm": None if error_m is None else 1000 * error_m,
+        "of_diameter": None if error_m is None else error_m / measured["diameter_m"],
+        "translation_mm": None if moved_m is None else 1000 * moved_m,
+        "ms_network": round(measured["ms_network"]),
+        "ms_total": round(measured["ms_total"]),
+    }
+    return {name: row[name] for name in _COLUMNS}
+
+
+_PAGE = "report.html"
+_FOLDERS = (
+    "street", "motorcycle", "selecting-generator", "stereo-network", "sgbm-holes-filled",
+    "part", "parts", "geo-posenet",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """Where the page is, and the rows on it: a depth for each method, a pose for each part."""
+
+    page: Path
+    depths: list[dict[str, Any]]
+    poses: list[dict[str, Any]]
+
+
+def make_demo(
+    out: Path,
+    weights: str | Path = "default",
+    parts: str | Path = "parts",
+    scale: float = 1.0,
+    on_message: Callable[[str], None] | None = None,
+) -> DemoResult:
+    """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
+
+    Args:
+        out: folder for the data, the estimates, the tables and the page ``report.html``.
+        weights: of the depth networks, by name or file.
+        parts: weights of a pose network for the parts, by name or file.
+        scale: size of the street's images as a share of KITTI's.
+        on_message: called with what is done next.
+
+    Raises:
+        InputError: ``out`` holds files that the demo did not write and would replace.
+    """
+    claim_folder(out, {"command": "demo"}, [*_FOLDERS, *table_files("depths", "poses"), _PAGE])
+    on_message = on_message or (lambda _: None)
+    on_message("synthetic parts on a table are posed from a depth image ...")
+    poses, of_pose = show_poses(out, parts)
+    on_message("depth of a real pair and of a synthetic street ...")
+    depths, of_depth = show_depth(out, weights, scale)
+    write_table(out, depths, name="depths")
+    write_table(out, poses, name="poses")
+    page = out / _PAGE
+    title = "depthpose: a depth sensor to poses, images to metric depth"
+    write_page(page, title, [*of_pose, *of_depth], environment())
+    return DemoResult(page, depths, poses)

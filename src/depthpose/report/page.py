@@ -1,0 +1,390 @@
+"""What a page shows: tables (also as Markdown, CSV, JSON), pictures, and clouds in 3D.
+
+``viewer.js`` draws the clouds; the page is one HTML file that needs no other.
+"""
+
+import base64
+import csv
+import io
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int64
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from torch import Tensor
+
+from depthpose.core.draw import Scale, shrink_to_pixels
+from depthpose.core.files import Cloud, encode_image, image_size, read_image, write_json
+from depthpose.core.files.disk import write_bytes
+
+MOST_POINTS = 60_000
+"""Of one cloud on a page: 0.7 MB of text."""
+MOST_LINES = 20_000
+
+_GREY = 0.55
+"""Of points without a colour; it is seen on white and on black."""
+_RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lines:
+    """Straight pieces of line.
+
+    Attributes:
+        ends_m: both ends of each.
+        color: RGB in [0, 1], one for each piece.
+    """
+
+    ends_m: Float[Tensor, "n 2 3"]
+    color: Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layer:
+    """A part of a scene that can be hidden.
+
+    Attributes:
+        name: what the viewer calls it; layers of one name are hidden together.
+        shape: coloured points (NaN left out), or lines; metres, camera frame.
+        is_shown: whether it is seen at first.
+    """
+
+    name: str
+    shape: Cloud | Lines
+    is_shown: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """What one 3D view shows.
+
+    Attributes:
+        caption: stands below it.
+        layers: drawn together.
+    """
+
+    caption: str
+    layers: Sequence[Layer]
+
+    @property
+    def note(self) -> str:
+        """Which layers are shown thinned; empty where none is."""
+        said = [
+            f"{layer.name}: {_most(layer.shape)} of {_count(layer.shape)}, thinned evenly"
+            for layer in self.layers
+            if _count(layer.shape) > _most(layer.shape)
+        ]
+        return "; ".join(said)
+
+    def encoded(self) -> dict[str, Any]:
+        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours."""
+        return {"caption": self.caption, "note": self.note,
+                "layers": [_encoded(layer) for layer in self.layers]}  # fmt: skip
+
+
+def page_file(name: Literal["viewer.js", "page.css"]) -> str:
+    """Read the viewer, which defines ``showScene(element, scene)``, or the style of all pages."""
+    return files("depthpose.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def colored_points(points_m: Float[Tensor, "n 3"], color: tuple[float, float, float]) -> Cloud:
+    """Make points of one colour, RGB in [0, 1]."""
+    return Cloud(points=points_m, color=torch.tensor(color).expand(len(points_m), 3))
+
+
+def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, float]) -> Lines:
+    """Make lines of one colour."""
+    return Lines(ends_m=ends_m, color=torch.tensor(color).expand(len(ends_m), 3))
+
+
+def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
+    """Draw the axes of a frame: x red, y green, z blue.
+
+    Args:
+        origin_m: where it stands, in the camera frame.
+        R: its axes as columns.
+        length_m: of each.
+    """
+    tips_m = origin_m + length_m * R.mT
+    ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
+    return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
+
+
+def _count(shape: Cloud | Lines) -> int:
+    return len(shape.points if isinstance(shape, Cloud) else shape.ends_m)
+
+
+def _most(shape: Cloud | Lines) -> int:
+    return MOST_POINTS if isinstance(shape, Cloud) else MOST_LINES
+
+
+def _encoded(layer: Layer) -> dict[str, Any]:
+    shape = layer.shape
+    if isinstance(shape, Cloud):
+        kind, places, color = "points", shape.points, shape.color
+        color = torch.full_like(places, _GREY) if color is None else color
+    else:
+        kind, places, color = "lines", shape.ends_m, shape.color
+    kept = _spread(len(places), _most(shape))
+    places, color = places[kept], color[kept]
+    bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
+    return {
+        "name": layer.name,
+        "kind": kind,
+        "shown": layer.is_shown,
+        "count": len(places),
+        **_encoded_places(places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)),
+        "colors": _base64(bytes_of_color),
+    }
+
+
+def _encoded_places(places_m: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """Store places as steps of 1/65535 of their extent: half the size of float32.
+
+    A street of 80 m has steps of 1.2 mm, a table of 1.5 m of 0.02 mm.
+    """
+    low = places_m.min(0) if len(places_m) else np.zeros(3)
+    step = (places_m.max(0) - low) / 65535 if len(places_m) else np.zeros(3)
+    steps = np.round((places_m - low) / np.where(step > 0, step, 1))
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "places": _base64(steps.astype("<u2")),
+    }
+
+
+def _spread(count: int, most: int) -> Int64[Tensor, " m"]:
+    """Choose one row of each of ``most`` equal runs, by chance, always the same ones.
+
+    Equal steps through the rows of a depth image would leave lines of points.
+    """
+    if count <= most:
+        return torch.arange(count)
+    chance = torch.rand(most, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return ((torch.arange(most) + chance) * (count / most)).long().clamp(max=count - 1)
+
+
+def _base64(values: np.ndarray) -> str:
+    return b64encode(np.ascontiguousarray(values).tobytes()).decode()
+
+
+MOST_VIEWS = 6
+_REFUSED = 2
+"""Refusals shown at least, where there are so many."""
+
+
+def spread_evenly(total: int, number: int) -> list[int]:
+    """Choose so many of 0 .. total - 1, the middle of each equal part; all where there are fewer.
+
+    None where ``number`` is 0.
+    """
+    number = min(number, total)
+    return [(2 * k + 1) * total // (2 * number) for k in range(number)]
+
+
+def choose_answers(is_ok: Sequence[bool], most: int = MOST_VIEWS) -> list[int]:
+    """Choose answers and some refusals, each spread evenly; give their places in order."""
+    answered = [k for k, ok in enumerate(is_ok) if ok]
+    refused = [k for k, ok in enumerate(is_ok) if not ok]
+    few = min(len(refused), max(_REFUSED, most - len(answered)), most)
+    chosen = [refused[i] for i in spread_evenly(len(refused), few)]
+    chosen += [answered[i] for i in spread_evenly(len(answered), most - few)]
+    return sorted(chosen)
+
+
+def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int]]:
+    """Choose the worst, the median and the best of finite errors; at most so many, each once."""
+    order = sorted(range(len(errors)), key=errors.__getitem__)
+    if len(order) <= 1:
+        return [("only", place) for place in order][:most]
+    places = [("worst", order[-1]), ("median", order[(len(order) - 1) // 2]), ("best", order[0])]
+    if len(order) == 2:
+        del places[1]
+    return places[:most]
+
+
+def share_views(sets: int) -> list[int]:
+    """Give each of several sets of predictions its number of views; the last may get none."""
+    each = max(1, MOST_VIEWS // max(1, sets))
+    return [each if k * each < MOST_VIEWS else 0 for k in range(sets)]
+
+
+Row = Mapping[str, Any]
+
+_MOST_PIXELS = 480_000
+"""Of a drawing on a page of many: a frame of KITTI is whole."""
+_QUALITY = 85
+_MOST_BYTES = 250_000
+"""Of a picture file that goes onto a page as it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture file with a caption, and with the bar of its colours where they are numbers."""
+
+    path: Path
+    caption: str
+    scale: Scale | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]: a page that knows them does not move when the picture comes."""
+        return image_size(self.path)
+
+    @property
+    def data_uri(self) -> str:
+        """The picture as a ``data:`` address, so that the page needs no other file.
+
+        A small file's own bytes; a large one is shrunk to what a page of many takes.
+        """
+        if self.path.stat().st_size > _MOST_BYTES:
+            return Drawing(image=read_image(self.path), caption=self.caption).data_uri
+        kind = "jpeg" if self.path.suffix.lower() in (".jpg", ".jpeg") else "png"
+        return f"data:image/{kind};base64," + base64.b64encode(self.path.read_bytes()).decode()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawing:
+    """A picture without a file of its own, small enough for a page of many."""
+
+    image: Float[Tensor, "3 h w"]
+    caption: str
+    scale: Scale | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.image.shape[2], self.image.shape[1]
+
+    @property
+    def data_uri(self) -> str:
+        """The picture as a ``data:`` address."""
+        encoded = encode_image(shrink_to_pixels(self.image, _MOST_PIXELS), "drawing.jpg", _QUALITY)
+        return "data:image/jpeg;base64," + base64.b64encode(encoded).decode()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A part of a page, in this order: its heading, a paragraph, names and values, pictures.
+
+    Then a table that sorts, small tables by what they show (rows of equal length), and 3D views.
+    """
+
+    title: str
+    text: str = ""
+    facts: Sequence[tuple[str, str]] = ()
+    pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
+    rows: Sequence[Row] = ()
+    tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
+    scenes: Sequence[Scene] = field(default_factory=tuple)
+
+
+def table_files(*names: str) -> list[str]:
+    """Name the files that :func:`write_table` writes."""
+    return [
+        file
+        for name in names
+        for file in (f"{name}.json", f"{name}.csv", f"{'table' if name == 'rows' else name}.md")
+    ]
+
+
+def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
+    """Write ``NAME.json``, ``NAME.csv`` and ``table.md`` (``NAME.md`` for other names)."""
+    as_json, as_csv, as_markdown = table_files(name)
+    write_json(folder / as_json, [dict(row) for row in rows])
+    _write_text(folder / as_csv, csv_table(rows))
+    _write_text(folder / as_markdown, markdown_table(rows))
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """Format rows as a Markdown table, columns by first appearance; no rows are the word none."""
+    if not rows:
+        return "none\n"
+    names = column_names(rows)
+    lines = [names, ["---"] * len(names)]
+    lines += [[show_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
+    """Format rows for a terminal, in columns of their own width: all, or those of some names.
+
+    Columns without a value are left out.
+    """
+    wanted = [
+        n for n in names or column_names(rows) if any(row.get(n) not in (None, "") for row in rows)
+    ]
+    cells = [wanted, *([show_value(row.get(name)) for name in wanted] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "".join(
+        "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
+        for line in cells
+    )
+
+
+def csv_table(rows: Sequence[Row]) -> str:
+    """Format rows as CSV with a header, every digit kept."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def write_markdown(
+    path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
+) -> None:
+    """Write the text and tables of :func:`write_page` as Markdown, without pictures."""
+    parts = [f"# {title}\n"]
+    for section in sections:
+        parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
+        parts += [markdown_table(section.rows)] if section.rows else []
+    parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
+    _write_text(path, "\n".join(parts))
+
+
+def column_names(rows: Sequence[Row]) -> list[str]:
+    """Give the union of the rows' names, in order of their first appearance."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def show_value(value: object) -> str:
+    """Show a value to a person: four digits after the point, nothing for None."""
+    match value:
+        case None:
+            return ""
+        case float():
+            return f"{value:.0f}" if value.is_integer() and abs(value) >= 1 else f"{value:.4f}"
+        case _:
+            return str(value)
+
+
+def write_page(
+    path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
+) -> None:
+    """Write one HTML file that shows the sections and needs no network and no other file.
+
+    ``environment``: what the numbers were measured with (see ``core.run.environment``).
+    """
+    pages = Environment(
+        loader=PackageLoader("depthpose.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pages.globals.update(show_value=show_value, column_names=column_names, page_file=page_file)
+    html = pages.get_template("report.html").render(
+        title=title, sections=sections, environment=environment
+    )
+    _write_text(path, html)
