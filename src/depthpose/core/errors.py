@@ -66,36 +66,39 @@ def refused_memory(name: str) -> Iterator[None]:
         raise InputError(f"{name}: {full_memory(error)}") from error
 
 
-def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
-    """Import OpenCV where it is used; its absence says which extra brings it.
+def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  # noqa: ANN401
+    """Import an optional dependency where it is used.
+
+    Args:
+        module: its name in Python.
+        package: its name for pip.
+        extra: of depthpose, which brings it.
+        purpose: what needs it.
 
     Raises:
         MissingExtraError: it is not installed.
         InputError: it is installed and does not load.
     """
-    return _import("cv2", ("opencv-python-headless", "opencv"), purpose)
-
-
-def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
-    """Import Open3D where it is used; its absence says which extra brings it.
-
-    Raises:
-        MissingExtraError: it is not installed.
-        InputError: it is installed and does not load.
-    """
-    return _import("open3d", ("open3d", "open3d"), purpose)
-
-
-def _import(module: str, package_and_extra: tuple[str, str], purpose: str) -> Any:  # noqa: ANN401
     try:
         return import_module(module)
     except (ImportError, OSError) as error:  # OSError: of a library that ctypes loads
-        if isinstance(error, ModuleNotFoundError) and error.name == module:
-            raise MissingExtraError(*package_and_extra, purpose) from error
+        names = (module, module.partition(".")[0])
+        if isinstance(error, ModuleNotFoundError) and error.name in names:
+            raise MissingExtraError(package, extra, purpose) from error
         raise InputError(
-            f"{purpose} needs {package_and_extra[0]}, which is installed and does not load: "
-            f"{error}; a library of the system is missing, or the package is damaged"
+            f"{purpose} needs {package}, which is installed and does not load: {error}; a library "
+            "of the system is missing, or the package is damaged"
         ) from error
+
+
+def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
+    """Import OpenCV, as :func:`import_extra`."""
+    return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
+
+
+def import_open3d(purpose: str) -> Any:  # noqa: ANN401  Open3D's classes carry no types
+    """Import Open3D, as :func:`import_extra`."""
+    return import_extra("open3d", "open3d", "open3d", purpose)
 
 
 def refuse_seed(seed: int) -> None:

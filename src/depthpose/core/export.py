@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import file_sha256
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import atomic_write, write_json
 from depthpose.core.run import environment, refuse_to_replace
 
@@ -152,12 +152,12 @@ def _onnx_type(dtype: type) -> int:
 
 
 _PACKAGES = (
-    "onnxruntime",
-    "onnxscript",
+    "onnx",
     "onnx.compose",
     "onnx.inliner",
     "onnx.numpy_helper",
-    "onnx",
+    "onnxscript",
+    "onnxruntime",
 )
 
 
@@ -167,10 +167,9 @@ def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no 
     Raises:
         MissingExtraError: one of the three is not installed.
     """
-    try:
-        return [import_module(name) for name in _PACKAGES][-1]
-    except ImportError as error:
-        raise MissingExtraError("onnx, onnxruntime and onnxscript", "export", "export") from error
+    for name in _PACKAGES:
+        import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
+    return import_module("onnx")
 
 
 Row = dict[str, str | float]
@@ -268,7 +267,12 @@ def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> 
     difference = difference[~np.isnan(difference)]
     flipped: Row = {}
     if limit.flips:
-        difference, share = _without_flips(difference, limit)
+        # Give the differences within the limit, and the share of those beyond it.
+        is_kept = difference <= limit.value
+        difference, share = (
+            difference[is_kept],
+            1.0 - float(is_kept.mean()) if is_kept.size else 0.0,
+        )
         if share > limit.flips:
             raise InputError(
                 f"{output} of {case}: PyTorch and onnxruntime differ by more than {limit.value:g} "
@@ -291,12 +295,6 @@ def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> 
         "unit": "share" if limit.is_relative else "as the output",
         **flipped,
     }
-
-
-def _without_flips(difference: np.ndarray, limit: Limit) -> tuple[np.ndarray, float]:
-    """Give the differences within the limit, and the share of those beyond it."""
-    is_kept = difference <= limit.value
-    return difference[is_kept], 1.0 - float(is_kept.mean()) if is_kept.size else 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -383,7 +381,13 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
             verbose=False,
         )
     assert program is not None
-    return _bare(onnx.inliner.inline_local_functions(program.model_proto))
+    # Drop what identifies the exporting machine: stack traces, paths, names of lines.
+    model = onnx.inliner.inline_local_functions(program.model_proto)
+    for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    del model.graph.value_info[:]
+    return model
 
 
 @contextmanager
@@ -398,12 +402,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def _bare(model: Any) -> Any:  # noqa: ANN401
-    """Drop what identifies the exporting machine: stack traces, paths, names of lines."""
-    for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
-        del part.metadata_props[:]
-        part.doc_string = ""
-    del model.graph.value_info[:]
-    return model

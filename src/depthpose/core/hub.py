@@ -14,9 +14,8 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from depthpose.core.errors import InputError, MissingExtraError, nearest_name
+from depthpose.core.errors import InputError, import_extra, nearest_name
 
 WEIGHTS_FILE = "model.safetensors"
 """Name of the weights in a repository, as others on the hub call theirs."""
@@ -52,7 +51,7 @@ def fetch_weights(name: str) -> Path:
     file = found["file"] or WEIGHTS_FILE
     if not file.endswith(".safetensors"):
         raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
-    hub = _import_hub()
+    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
     with _explained(name):
         path = hub.hf_hub_download(found["repository"], file, revision=found["revision"])
     return Path(path)
@@ -76,7 +75,7 @@ def push_weights(path: Path, readme: str, repository: str, *, is_private: bool) 
     """
     if not re.fullmatch(_NAME, repository):
         raise InputError(f"{repository!r}: a repository on the hub is OWNER/NAME.")
-    hub = _import_hub()
+    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
     files = {WEIGHTS_FILE: path, "README.md": readme.encode()}
     operations = [
         hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=content)
@@ -97,17 +96,12 @@ def readme_of(card: str, facts: Mapping[str, str]) -> str:
     return "\n".join([*lines, "---", "", card])
 
 
-def _import_hub() -> Any:  # noqa: ANN401  imported where it is used
-    try:
-        return import_module("huggingface_hub")
-    except ImportError as error:
-        raise MissingExtraError("huggingface_hub", "hub", "weights on the hub") from error
-
-
 @contextmanager
 def _explained(name: str) -> Iterator[None]:
     """Turn what the library raises into one error with a remedy."""
     errors = import_module("huggingface_hub.errors")
+    # Base classes of the library's errors: of requests, of httpx or its successor.
+    of_http = [k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins"]
     try:
         yield
     except errors.HFValidationError as error:
@@ -134,16 +128,10 @@ def _explained(name: str) -> Iterator[None]:
             f"{name}: the repository has no such file ({WEIGHTS_FILE} by default); name it: "
             "hf://OWNER/NAME/FILE.safetensors."
         ) from error
-    except (OSError, *_http_errors()) as error:  # of the connection, of access, of a full disk
+    except (OSError, *of_http) as error:  # of the connection, of access, of a full disk
         raise InputError(
             f"{name}: the hub refused: {_short(error)}. To upload, 'hf auth login' first."
         ) from error
-
-
-def _http_errors() -> tuple[type[Exception], ...]:
-    """Give the base classes of the library's errors: of requests, of httpx or its successor."""
-    own = import_module("huggingface_hub.errors").HfHubHTTPError
-    return tuple(kind for kind in own.__mro__[1:] if kind.__module__ != "builtins")
 
 
 def _short(error: Exception) -> str:
@@ -174,7 +162,15 @@ def find_weights(name: str | Path) -> Path:
     if str(name) in shipped:
         return shipped[str(name)]
     if path.is_dir():
-        return _only_weights(path)
+        files = sorted(path.glob("*.safetensors"))
+        named = [file for file in files if file.name == WEIGHTS_FILE] or files
+        if len(named) == 1:
+            return named[0]
+        which = ", ".join(file.name for file in files) or "none"
+        raise InputError(
+            f"{path}: a folder of weights holds one .safetensors file, or one called "
+            f"{WEIGHTS_FILE}; here: {which}. Name the file."
+        )
     if is_on_hub(name):
         return fetch_weights(str(name))
     if str(name) in _IN_REPOSITORY:
@@ -186,16 +182,4 @@ def find_weights(name: str | Path) -> Path:
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
         f"{nearest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
         "hf://OWNER/NAME those on the hub."
-    )
-
-
-def _only_weights(folder: Path) -> Path:
-    files = sorted(folder.glob("*.safetensors"))
-    named = [file for file in files if file.name == WEIGHTS_FILE] or files
-    if len(named) == 1:
-        return named[0]
-    which = ", ".join(file.name for file in files) or "none"
-    raise InputError(
-        f"{folder}: a folder of weights holds one .safetensors file, or one called {WEIGHTS_FILE}; "
-        f"here: {which}. Name the file."
     )

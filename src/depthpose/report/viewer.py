@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.run import refuse_to_replace
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.pose.cloud import object_points
@@ -45,10 +44,7 @@ class Viewer:
             raise InputError(f"--view {where}: there is no folder {path.parent}; make it first")
         if where != LIVE:
             refuse_to_replace(path)
-        try:
-            self._rerun: Any = import_module("rerun")
-        except ImportError as error:
-            raise MissingExtraError("rerun-sdk", "view", "--view") from error
+        self._rerun = import_extra("rerun", "rerun-sdk", "view", "--view")
         self._stream: Any = self._rerun.RecordingStream("depthpose")
         if where == LIVE:
             self._stream.spawn()

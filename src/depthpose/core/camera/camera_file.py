@@ -283,10 +283,7 @@ def facts_from_json(content: object) -> CameraFacts:
             return _from_bop(content)
         if content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
             return _from_scene(content)
-    return _from_keys(_check_keys(content))
-
-
-def _from_keys(keys: dict[str, Any]) -> CameraFacts:
+    keys = _check_keys(content)
     optional: dict[str, Any] = {k: _json_number(keys, k) for k in OPTIONAL_KEYS if k in keys}
     return CameraFacts(
         kind="a camera",

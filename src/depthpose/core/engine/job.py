@@ -92,7 +92,10 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
             "again: what is finished is kept"
         )
-    _remove_parts(out)
+    # Remove what killed workers left; all have ended.
+    folder = local_path(join(out, SHARDS))
+    if folder is not None:
+        remove_parts(folder)
     every = [done[block.shard] for block in blocks]
     _write_manifest(out, every)
     return every
@@ -210,13 +213,6 @@ def _untimed(done: Done) -> str:
 
 def _shard(done: Done) -> str:
     return done.shard.rpartition(".")[0]
-
-
-def _remove_parts(out: str) -> None:
-    """Remove what killed workers left; all have ended."""
-    folder = local_path(join(out, SHARDS))
-    if folder is not None:
-        remove_parts(folder)
 
 
 def _write_manifest(out: str, every: Sequence[Done]) -> None:

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import PurePosixPath
 from typing import Any
 
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files.disk import find_partners
 from depthpose.core.files.store import (
     absolute,
@@ -121,11 +121,8 @@ def import_pyarrow(purpose: str) -> Any:  # noqa: ANN401  pyarrow carries no typ
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        import_module("pyarrow.parquet")
-        return import_module("pyarrow")
-    except ImportError as error:
-        raise MissingExtraError("pyarrow", "ray", purpose) from error
+    import_extra("pyarrow.parquet", "pyarrow", "ray", purpose)
+    return import_module("pyarrow")
 
 
 def _pair(words: Sequence[str], files: Files) -> list[Item]:

@@ -111,23 +111,22 @@ def read_numbers(path: AnyPath) -> np.ndarray:
                 f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
             )
         body = stream.getbuffer()[stream.tell() :]
-        _check_shape(path, shape, dtype, len(body))
+        have = len(body)
+        if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
+            raise InputError(
+                f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "
+                f"{_MAX_DIMENSIONS} at most"
+            )
+        if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != have:
+            raise InputError(
+                f"{path}: declares {dtype} {str(shape)[:60]} but {have} bytes follow; it is "
+                "truncated or damaged, save it again"
+            )
+        if math.prod(shape) > _MAX_VALUES:
+            raise InputError(
+                f"{path}: {math.prod(shape)} values, more than {_MAX_VALUES}; split it"
+            )
         return np.frombuffer(body, dtype).reshape(shape, order="F" if is_fortran else "C")
-
-
-def _check_shape(path: AnyPath, shape: tuple[int, ...], dtype: np.dtype, have: int) -> None:
-    if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
-        raise InputError(
-            f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "
-            f"{_MAX_DIMENSIONS} at most"
-        )
-    if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != have:
-        raise InputError(
-            f"{path}: declares {dtype} {str(shape)[:60]} but {have} bytes follow; it is truncated "
-            "or damaged, save it again"
-        )
-    if math.prod(shape) > _MAX_VALUES:
-        raise InputError(f"{path}: {math.prod(shape)} values, more than {_MAX_VALUES}; split it")
 
 
 def to_float32(array: np.ndarray) -> np.ndarray:

@@ -377,7 +377,12 @@ def read_pcd(path: AnyPath) -> Columns:
     end = _DATA.search(data, 0, _MAX_PCD_HEADER)
     if end is None:
         raise InputError(f"{path}: no PCD header ('FIELDS' ... 'DATA'); is it a PCD file?")
-    header = _parse_pcd_header(data[: end.start()].decode("latin-1"))
+    lines = (
+        line.split()
+        for line in (data[: end.start()].decode("latin-1")).splitlines()
+        if not line.startswith("#")
+    )
+    header = {words[0]: words[1:] for words in lines if words}
     fields, count = _parse_fields(path, header), _parse_count(path, header)
     body = memoryview(data)[end.end() :]
     if end[1] == b"binary":
@@ -476,11 +481,6 @@ def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], coun
         columns[f.name] = values.reshape(count, f.count)[:, 0]
         unpacked = unpacked[values.nbytes :]
     return columns
-
-
-def _parse_pcd_header(text: str) -> dict[str, list[str]]:
-    lines = (line.split() for line in text.splitlines() if not line.startswith("#"))
-    return {words[0]: words[1:] for words in lines if words}
 
 
 def _parse_fields(path: AnyPath, header: dict[str, list[str]]) -> list[Field]:

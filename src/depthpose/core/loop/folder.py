@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import misfits, read_torch_file
-from depthpose.core.errors import InputError, MissingExtraError, Notice
+from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refused_as, refused_write
 from depthpose.core.files.text import refuse_heavy
@@ -66,10 +66,9 @@ class Journal:
         kept = [row for row in read_metrics(self.folder) if row["step"] <= step]
         with atomic_write(self.folder / _METRICS) as part:
             part.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        try:
-            from torch.utils.tensorboard.writer import SummaryWriter
-        except ImportError as error:
-            raise MissingExtraError("tensorboard", "train", "training") from error
+        import_extra("tensorboard", "tensorboard", "train", "training")
+        from torch.utils.tensorboard.writer import SummaryWriter
+
         with refused_write(self.folder):
             self._board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
 

@@ -25,7 +25,7 @@ from torch.utils.data import DataLoader
 
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.devices import usable_precision
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, import_extra
 from depthpose.core.loop.folder import STATE, Journal, Parts, restore_last, run_files, saved_states
 from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
@@ -358,16 +358,12 @@ class _Training:
 
 def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate is an extra
     """Set up accelerate without precision: it keeps that of a process's first training."""
-    try:
-        from accelerate import Accelerator
-        from accelerate.utils import InitProcessGroupKwargs
-    except ImportError as error:
-        raise MissingExtraError("accelerate", "train", "training") from error
+    accelerate = import_extra("accelerate", "accelerate", "train", "training")
     # The other processes wait while rank 0 validates.
-    patience = InitProcessGroupKwargs(timeout=timedelta(hours=2))
+    patience = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
     on_cpu = config.device == "cpu"
     try:
-        return Accelerator(mixed_precision="no", cpu=on_cpu, kwargs_handlers=[patience])
+        return accelerate.Accelerator(mixed_precision="no", cpu=on_cpu, kwargs_handlers=[patience])
     except ValueError as error:
         raise InputError(
             f"device {config.device!r} cannot be used in this process, which has trained on "
