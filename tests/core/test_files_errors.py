@@ -225,11 +225,14 @@ IMAGE = torch.zeros(3, 2, 2)
 BAD_WRITES: list[tuple[Callable[[Path], None], str]] = [
     (lambda p: write_image(p / "x.gif", IMAGE), r"\.gif is no picture format; use \.png, \.jpg"),
     (lambda p: write_image(p / "x", IMAGE), "no suffix is no picture format"),
-    (lambda p: write_image(p / "x.png", IMAGE.mT[:2]), r"an image is \(3, H, W\), got \(2, 2, 2\)"),
-    (lambda p: write_image(p / "x.png", IMAGE[:, :0]), r"got \(3, 0, 2\)"),
+    (
+        lambda p: write_image(p / "x.png", IMAGE.mT[:2]),
+        r"must have shape \(3, H, W\), got \(2, 2, 2\)",
+    ),
+    (lambda p: write_image(p / "x.png", IMAGE[:, :0]), r"is empty: shape \(3, 0, 2\)"),
     (lambda p: write_image(p / "x.png", IMAGE.byte()), r"got torch\.uint8; divide by 255"),
-    (lambda p: write_image(p / "x.png", IMAGE / 0), "holds NaN or infinity"),
-    (lambda p: write_image(p / "x.png", IMAGE + 255), r"values 255\.\.255 are outside \[0, 1\]"),
+    (lambda p: write_image(p / "x.png", IMAGE / 0), "holds NaN or infinite"),
+    (lambda p: write_image(p / "x.png", IMAGE + 255), r"must lie in \[0, 1\], got 255 \.\. 255"),
     (lambda p: write_depth_png(p / "x.png", IMAGE[0, :0]), r"an empty map \(0, 2\) makes no PNG"),
     (lambda p: write_map(p / "x.npy", IMAGE[0] + torch.inf), "mark invalid pixels by NaN"),
     (lambda p: write_map(p / "x.tif", IMAGE[0]), r"\.tif is no map format"),

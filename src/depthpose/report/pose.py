@@ -392,7 +392,8 @@ def pose_scene(
 
 def draw_boxes(
     image: Float[Tensor, "3 h w"],
-    poses: tuple[Rigid | None, Rigid | None],
+    truth: Rigid | None,
+    found: Rigid | None,
     model: ObjectModel,
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "3 h w"]:
@@ -400,11 +401,11 @@ def draw_boxes(
 
     Args:
         image: it is not changed.
-        poses: truth and estimate, each where there is one.
+        truth: ``camera_from_model``, where it is known.
+        found: the estimate, where there is one.
         model: the object.
         K: intrinsic matrix of the image.
     """
-    truth, found = poses
     if found is not None:
         image = draw_pose(image, found, model, K.double())
     if truth is not None:
@@ -442,16 +443,16 @@ def _drawings(shown: PoseShown) -> list[Drawing]:
     if not isinstance(view, ViewInput):
         return []
     image = grey_depth(view.depth_m) if shown.image is None else shown.image
-    poses = (shown.truth, shown.estimate.camera_from_model)
+    truth, found = shown.truth, shown.estimate.camera_from_model
     what = "depth image, near bright" if shown.image is None else "picture"
-    if poses[1] is None:
+    if found is None:
         image = draw_outline(image, view.mask, _MASKED)
-    said = "the estimated pose blue" if poses[1] is not None else "the border of the mask yellow"
-    said += ", the box of the truth green and dashed" if poses[0] is not None else ""
-    whole = draw_boxes(image, poses, shown.model, view.K)
+    said = "the estimated pose blue" if found is not None else "the border of the mask yellow"
+    said += ", the box of the truth green and dashed" if truth is not None else ""
+    whole = draw_boxes(image, truth, found, shown.model, view.K)
     drawings = [Drawing(image=whole, caption=f"{what}; {said}")]
     if bool(view.mask.any()):
         near, K = close_up(image, view.mask, view.K)
-        near = draw_boxes(near, poses, shown.model, K)
+        near = draw_boxes(near, truth, found, shown.model, K)
         drawings.append(Drawing(image=near, caption=f"the object from near by; {said}"))
     return drawings

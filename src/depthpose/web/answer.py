@@ -143,6 +143,18 @@ class Form:
         write_json(path, {k: v for k, v in keys.items() if v is not None})
         return read_camera(path)
 
+    def pinhole_keys(self, size: tuple[int, int], focal_px: float | None) -> dict[str, Any]:
+        """Give size and K of a camera file from the fields; the principal point may be the centre.
+
+        Args:
+            size: of the image (width, height).
+            focal_px: the focal length [px].
+        """
+        cx, cy = self.number("cx_px"), self.number("cy_px")
+        cx, cy = (size[0] - 1) / 2 if cx is None else cx, (size[1] - 1) / 2 if cy is None else cy
+        K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
+        return {"width": size[0], "height": size[1], "K": K}
+
     def results(self) -> Path:
         """Make the folder for the results."""
         folder = self.folder / "results"

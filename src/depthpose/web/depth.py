@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from depthpose.core.camera import Camera, StereoRig, write_camera
+from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.draw import depth_scale, draw_share, rising_scale
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_exif_focal, read_image, write_image
@@ -89,42 +89,27 @@ def _input(form: Form) -> tuple[StereoInput, str]:
         exif = None if has_right else read_exif_focal(path)
         focal_px, tags = (_PHONE * width, "") if exif is None else exif
         origin = f" (EXIF: {tags})" if tags else _GUESSED
-    keys = _keys(form, width, height, focal_px)
-    camera = _with_baseline(form, form.camera(keys, (width, height)))
+    doffs_px = form.number("cx_right_minus_left_px")
+    rig = {
+        "baseline_m": baseline_m,
+        "cx_right_minus_left_px": None if baseline_m is None else doffs_px,
+    }
+    rig |= {key: form.number(key) for key in ("mount_height_m", "tilt_deg")}
+    keys = form.pinhole_keys((width, height), focal_px) | rig
+    camera = form.camera(keys, (width, height))
+    if baseline_m is not None and not isinstance(camera, StereoRig):  # of a file without one
+        camera = StereoRig(
+            width=camera.width,
+            height=camera.height,
+            K=camera.K,
+            baseline_m=baseline_m,
+            cx_right_minus_left_px=doffs_px or 0.0,
+        )
     if has_right:
         small_size(form.file("right"))
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, origin
-
-
-def _with_baseline(form: Form, camera: Camera) -> Camera:
-    """Add the baseline of the fields to a camera whose file has none."""
-    baseline_m, doffs_px = form.number("baseline_m"), form.number("cx_right_minus_left_px")
-    if baseline_m is None or isinstance(camera, StereoRig):
-        return camera
-    return StereoRig(
-        width=camera.width,
-        height=camera.height,
-        K=camera.K,
-        baseline_m=baseline_m,
-        cx_right_minus_left_px=doffs_px or 0.0,
-    )
-
-
-def _keys(form: Form, width: int, height: int, focal_px: float | None) -> dict[str, object]:
-    """Give the keys of a camera file from the fields."""
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    cx, cy = (
-        default if (typed := form.number(name)) is None else typed
-        for name, default in zip(("cx_px", "cy_px"), middle, strict=True)
-    )
-    K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
-    baseline_m = form.number("baseline_m")
-    doffs_px = None if baseline_m is None else form.number("cx_right_minus_left_px")
-    rig = {"baseline_m": baseline_m, "cx_right_minus_left_px": doffs_px}
-    rig |= {key: form.number(key) for key in ("mount_height_m", "tilt_deg")}
-    return {"width": width, "height": height, "K": K, **rig}
 
 
 def _range_m(form: Form) -> tuple[float, float]:

@@ -91,10 +91,11 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     if (least := form.number("min_certainty")) is not None:
         found = with_status(found, EstimateConfig(min_certainty=least).min_certainty)
     folder = form.results()
+    agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
         is_ok=found.is_posed,
         said=pose_sentence(found),
-        facts=_facts(found, target),
+        facts=pose_facts(found, target.model, target.how, agreeing),
         tables=pose_tables(found),
         pictures=_write(folder, given, points_m, found, target.model),
         scene=_scene(given, points_m, found, target.model, voted),
@@ -179,48 +180,32 @@ def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
         small_size(mask)
-    size = _size(depth)
-    camera = form.camera({} if "camera" in form.files else _keys(form, size), size)
+    if depth.suffix.lower() in MAP_SUFFIXES:
+        height, width = read_stored_depth(depth).shape
+        refuse_large(depth.name, width, height)
+        size = (width, height)
+    else:
+        size = small_size(depth)
+    keys: dict[str, Any] = {}
+    if "camera" not in form.files:
+        focal_px = form.number("focal_px")
+        if focal_px is None:
+            raise InputError(
+                "focal length: without it a depth image has no size; fill in that of the depth "
+                "sensor (its driver has it), or choose a camera file"
+            )
+        keys = form.pinhole_keys(size, focal_px) | {"depth_unit_m": form.number("depth_unit_m")}
+    camera = form.camera(keys, size)
     if camera.depth_unit_m is None:
         # Files of ROS, OpenCV and KITTI do not have it.
         camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
 
 
-def _size(depth: Path) -> tuple[int, int]:
-    if depth.suffix.lower() not in MAP_SUFFIXES:
-        return small_size(depth)
-    height, width = read_stored_depth(depth).shape
-    refuse_large(depth.name, width, height)
-    return width, height
-
-
-def _keys(form: Form, size: tuple[int, int]) -> dict[str, Any]:
-    """Give the keys of a camera file from the fields."""
-    focal_px = form.number("focal_px")
-    if focal_px is None:
-        raise InputError(
-            "focal length: without it a depth image has no size; fill in that of the depth sensor "
-            "(its driver has it), or choose a camera file"
-        )
-    width, height = size
-    cx, cy = form.number("cx_px"), form.number("cy_px")
-    cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
-    K = [[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]
-    unit_m = form.number("depth_unit_m")
-    return {"width": width, "height": height, "K": K, "depth_unit_m": unit_m}
-
-
 def _unit(form: Form, field: str) -> Unit:
     unit = form.fields.get(field, "")
     refuse_unknown(field, unit, METRES)
     return cast(Unit, unit)
-
-
-def _facts(found: PoseEstimate, target: _Target) -> list[tuple[str, str]]:
-    is_network = isinstance(target.net, GeoPoseNet)
-    agreeing = "votes that agree" if is_network else "points near the model"
-    return pose_facts(found, target.model, target.how, agreeing)
 
 
 def _scene(

@@ -181,10 +181,11 @@ def _picture_sections(
             estimate = known.get(instance.name)
             if estimate is None:  # of a detection: it bears no instance's name
                 continue
-            poses = (instance.camera_from_model, estimate.camera_from_model)
             picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
+            true, found = instance.camera_from_model, estimate.camera_from_model
+            model = dataset.objects[instance.object_id]
             path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
-            write_image(path, draw_boxes(picture, poses, dataset.objects[instance.object_id], K))
+            write_image(path, draw_boxes(picture, true, found, model, K))
             caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
             pictures.append(Picture(path=path, caption=caption))
         if pictures:
@@ -316,9 +317,9 @@ def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
     panels: list[Drawing] = []
     for k, view in enumerate(views.samples):
         estimate = net.estimate_many([view.input])[0]
-        poses = (view.truth.camera_from_model, estimate.camera_from_model)
+        true, found = view.truth.camera_from_model, estimate.camera_from_model
         picture, K = close_up(views.picture(k), view.input.mask, view.input.K)
-        image = draw_boxes(picture, poses, models[view.input.object], K)
+        image = draw_boxes(picture, true, found, models[view.input.object], K)
         name = view.input.name
         caption = name if estimate.is_posed else f"{name}: refused, {estimate.reason}"
         panels.append(Drawing(image=image, caption=caption))

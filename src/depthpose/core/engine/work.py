@@ -32,17 +32,14 @@ from depthpose.core.results import file_stamp
 ShardFormat = Literal["tar", "parquet"]
 
 
-@runtime_checkable
-class ShardWriter(Protocol):
-    """Takes the files of one result after the other."""
-
-    def add(self, name: str, files: Mapping[str, bytes], reason: str = "") -> None:
-        """Add a result: contents by their endings, or the reason why there are none."""
-        ...
+AddResult = Callable[[str, Mapping[str, bytes], str], None]
+"""Adds a result to a shard: its name, contents by their endings, or why there are none."""
+_GROUP_BYTES = 64 * 2**20
+"""Of rows of Parquet that are written together."""
 
 
 @contextmanager
-def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Iterator[ShardWriter]:
+def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Iterator[AddResult]:
     """Write a shard, the same bytes for the same results.
 
     Args:
@@ -56,47 +53,38 @@ def shard_writer(path: Path, form: ShardFormat, endings: Sequence[str]) -> Itera
     """
     if form == "tar":
         with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as tar:
-            yield _TarWriter(tar)
+
+            def add_members(name: str, files: Mapping[str, bytes], _: str) -> None:
+                for ending, data in sorted(files.items()):
+                    member = tarfile.TarInfo(f"{name}.{ending}")
+                    member.size = len(data)
+                    tar.addfile(member, io.BytesIO(data))
+
+            yield add_members
         return
     arrow = import_pyarrow("results in Parquet")
     fields = [("name", arrow.string()), ("reason", arrow.string())]
     schema = arrow.schema([*fields, *((ending, arrow.binary()) for ending in endings)])
+    rows: list[dict[str, Any]] = []
+    held_bytes = 0
     # Maps hardly shrink, and pictures are compressed already.
     with arrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        rows = _ParquetWriter(arrow, schema, writer)
-        yield rows
-        rows.flush()
 
+        def flush() -> None:
+            if rows:
+                writer.write_table(arrow.Table.from_pylist(rows, schema))
+            rows.clear()
 
-class _TarWriter:
-    def __init__(self, tar: tarfile.TarFile) -> None:
-        self._tar = tar
+        def add_row(name: str, files: Mapping[str, bytes], reason: str) -> None:
+            nonlocal held_bytes
+            rows.append({"name": name, "reason": reason, **files})
+            held_bytes += sum(map(len, files.values()))
+            if held_bytes > _GROUP_BYTES:
+                flush()
+                held_bytes = 0
 
-    def add(self, name: str, files: Mapping[str, bytes], reason: str = "") -> None:  # noqa: ARG002
-        for ending, data in sorted(files.items()):
-            member = tarfile.TarInfo(f"{name}.{ending}")
-            member.size = len(data)
-            self._tar.addfile(member, io.BytesIO(data))
-
-
-class _ParquetWriter:
-    _GROUP_BYTES = 64 * 2**20
-
-    def __init__(self, arrow: Any, schema: Any, writer: Any) -> None:  # noqa: ANN401
-        self._arrow, self._schema, self._writer = arrow, schema, writer
-        self._rows: list[dict[str, Any]] = []
-        self._bytes = 0
-
-    def add(self, name: str, files: Mapping[str, bytes], reason: str = "") -> None:
-        self._rows.append({"name": name, "reason": reason, **files})
-        self._bytes += sum(map(len, files.values()))
-        if self._bytes > self._GROUP_BYTES:
-            self.flush()
-
-    def flush(self) -> None:
-        if self._rows:
-            self._writer.write_table(self._arrow.Table.from_pylist(self._rows, self._schema))
-        self._rows, self._bytes = [], 0
+        yield add_row
+        flush()
 
 
 def read_shard(
@@ -310,13 +298,13 @@ class Runner:
         samples = _samples(block, self._work.files, scratch)
         results = scratch / "results"
         results.mkdir()
-        with shard_writer(file, self._form, self._work.endings) as writer:
+        with shard_writer(file, self._form, self._work.endings) as add:
             while chunk := list(islice(samples, self._work.batch)):
                 reasons = iter(self._function([one.sample for one in chunk if one.sample], results))
                 for one in chunk:
                     reason = next(reasons) if one.sample else one.reason
                     files = _take(results, one.name, self._work.endings)
-                    writer.add(one.name, {} if reason else files, reason)
+                    add(one.name, {} if reason else files, reason)
                     yield one.name, reason
                     one.close()
 
@@ -373,7 +361,9 @@ def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
     key, files = "", dict[str, Path]()
     try:
         for member, data in read_tar(tar):
-            found, ending = _split_key(member)
+            path = PurePosixPath(member)
+            start, _, ending = path.name.partition(".")
+            found = str(path.parent / start)
             if found != key and key:
                 yield _grouped(tar, key, files, wanted)
                 files = {}
@@ -386,12 +376,6 @@ def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
             yield _grouped(tar, key, files, wanted)
     except InputError as error:
         yield _Opened(name=PurePosixPath(tar).name, reason=str(error))
-
-
-def _split_key(member: str) -> tuple[str, str]:
-    path = PurePosixPath(member)
-    key, _, ending = path.name.partition(".")
-    return str(path.parent / key), ending
 
 
 def _role(ending: str, wanted: Files) -> tuple[str | None, str]:

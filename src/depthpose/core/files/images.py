@@ -16,6 +16,7 @@ from jaxtyping import Float32
 from PIL import Image
 from torch import Tensor
 
+from depthpose.core.arrays import check_image
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import (
     AnyPath,
@@ -208,7 +209,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
     suffix = Path(name).suffix.lower()
     if suffix not in WRITTEN_SUFFIXES:
         raise refused_suffix(name, "picture", WRITTEN_SUFFIXES)
-    _check_image(name, image)
+    check_image(image, f"{name}: the image", slack=0.25)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
     form, options = (
         ("PNG", FAST_PNG) if suffix == ".png" else ("JPEG", {"quality": quality, "subsampling": 0})
@@ -235,7 +236,13 @@ def list_images(path: AnyPath) -> list[Path]:
     try:
         if wanted.is_file():
             return [wanted]
-        found = list(wanted.iterdir()) if wanted.is_dir() else _glob(wanted)
+        if wanted.is_dir():
+            found = list(wanted.iterdir())
+        else:
+            home, parts = Path(wanted.anchor), list(wanted.relative_to(wanted.anchor).parts)
+            while len(parts) > 1 and (home / parts[0]).is_dir():  # its brackets are no pattern
+                home /= parts.pop(0)
+            found = [p for p in home.glob("/".join(parts)) if p.is_file()]
     except (OSError, ValueError, NotImplementedError) as error:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
     shown = (p for p in found if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
@@ -286,25 +293,6 @@ def _rgb_or_grey(path: AnyPath, image: Image.Image) -> np.ndarray:
     if image.mode == "P" and "transparency" in image.info:
         image = image.convert("RGBA")
     return np.asarray(image.convert("RGB"))
-
-
-def _check_image(path: AnyPath, image: Tensor) -> None:
-    if image.ndim != 3 or image.shape[0] != 3 or image.numel() == 0:
-        raise InputError(f"{path}: an image is (3, H, W), got {tuple(image.shape)}; permute it")
-    if not image.is_floating_point():
-        raise InputError(f"{path}: an image is float in [0, 1], got {image.dtype}; divide by 255")
-    if not bool(image.isfinite().all()):
-        raise InputError(f"{path}: the image holds NaN or infinity; find out where they come from")
-    low, high = (float(v) for v in image.detach().aminmax())
-    if low < -0.25 or high > 1.25:
-        raise InputError(f"{path}: values {low:g}..{high:g} are outside [0, 1]; divide by 255?")
-
-
-def _glob(pattern: Path) -> list[Path]:
-    home, parts = Path(pattern.anchor), list(pattern.relative_to(pattern.anchor).parts)
-    while len(parts) > 1 and (home / parts[0]).is_dir():  # brackets in its name are no pattern
-        home /= parts.pop(0)
-    return [p for p in home.glob("/".join(parts)) if p.is_file()]
 
 
 _EXIF_IFD = 0x8769

@@ -111,15 +111,14 @@ def read_numbers(path: AnyPath) -> np.ndarray:
                 f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
             )
         body = stream.getbuffer()[stream.tell() :]
-        have = len(body)
         if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
             raise InputError(
                 f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "
                 f"{_MAX_DIMENSIONS} at most"
             )
-        if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != have:
+        if min(shape, default=1) < 0 or math.prod(shape) * dtype.itemsize != len(body):
             raise InputError(
-                f"{path}: declares {dtype} {str(shape)[:60]} but {have} bytes follow; it is "
+                f"{path}: declares {dtype} {str(shape)[:60]} but {len(body)} bytes follow; it is "
                 "truncated or damaged, save it again"
             )
         if math.prod(shape) > _MAX_VALUES:
@@ -149,18 +148,14 @@ def _read_pfm(path: AnyPath) -> Float32[Tensor, "h w"]:
             f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
             "truncated or damaged, save it again"
         )
-    rows = np.frombuffer(body, _pfm_dtype(path, header[4])).reshape(height, width)
+    with refused_as(path, "PFM scale", "it must be a number other than 0"):
+        scale = float(header[4])
+    if scale == 0 or not math.isfinite(scale):
+        raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
+    rows = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
     array = to_float32(rows[::-1])
     array[~np.isfinite(array)] = np.nan
     return torch.from_numpy(array)
-
-
-def _pfm_dtype(path: AnyPath, scale: bytes) -> str:
-    with refused_as(path, "PFM scale", "it must be a number other than 0"):
-        value = float(scale)
-    if value == 0 or not math.isfinite(value):
-        raise InputError(f"{path}: PFM scale {value}; its sign gives the byte order, so not 0")
-    return "<f4" if value < 0 else ">f4"
 
 
 KITTI_UNIT = 1 / 256
@@ -177,7 +172,15 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured, or the unit makes no sense.
     """
-    return _read_units(path, unit_m)
+    _check_unit(path, unit_m)
+    with opened_image(path) as image:
+        if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
+            raise InputError(
+                f"{path}: a {image.format} of mode {image.mode}, where depth or disparity needs a "
+                "16-bit greyscale PNG; an 8-bit or colour file is a picture of it, not the data"
+            )
+        units = torch.from_numpy(np.asarray(image).astype(np.float32))
+    return torch.where(units > 0, units * unit_m, torch.nan)
 
 
 def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
@@ -212,7 +215,15 @@ def write_depth_png(
     Raises:
         InputError: the map is empty, the unit makes no sense, or the disk refuses.
     """
-    _write_units(path, depth_m, unit_m)
+    _check_unit(path, unit_m)
+    if depth_m.numel() == 0:
+        raise InputError(f"{path}: an empty map {tuple(depth_m.shape)} makes no PNG; give pixels")
+    units = (depth_m.detach().cpu().double() / unit_m).round()
+    units = torch.where((units >= 1) & (units <= 65535), units, 0)
+    encoded = BytesIO()
+    with refused_as(path, "map", "check its size"):
+        Image.fromarray(units.numpy().astype(np.uint16)).save(encoded, "PNG", **FAST_PNG)
+    write_bytes(path, encoded.getvalue())
 
 
 def read_disparity_png(path: AnyPath) -> Float32[Tensor, "h w"]:
@@ -221,7 +232,7 @@ def read_disparity_png(path: AnyPath) -> Float32[Tensor, "h w"]:
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured.
     """
-    return _read_units(path, KITTI_UNIT)
+    return read_depth_png(path)
 
 
 def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> None:
@@ -230,31 +241,7 @@ def write_disparity_png(path: AnyPath, disparity_px: Float[Tensor, "h w"]) -> No
     Raises:
         InputError: the map is empty, or the disk refuses.
     """
-    _write_units(path, disparity_px, KITTI_UNIT)
-
-
-def _read_units(path: AnyPath, unit: float) -> Float32[Tensor, "h w"]:
-    _check_unit(path, unit)
-    with opened_image(path) as image:
-        if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
-            raise InputError(
-                f"{path}: a {image.format} of mode {image.mode}, where depth or disparity needs a "
-                "16-bit greyscale PNG; an 8-bit or colour file is a picture of it, not the data"
-            )
-        units = torch.from_numpy(np.asarray(image).astype(np.float32))
-    return torch.where(units > 0, units * unit, torch.nan)
-
-
-def _write_units(path: AnyPath, values: Float[Tensor, "h w"], unit: float) -> None:
-    _check_unit(path, unit)
-    if values.numel() == 0:
-        raise InputError(f"{path}: an empty map {tuple(values.shape)} makes no PNG; give pixels")
-    units = (values.detach().cpu().double() / unit).round()
-    units = torch.where((units >= 1) & (units <= 65535), units, 0)
-    encoded = BytesIO()
-    with refused_as(path, "map", "check its size"):
-        Image.fromarray(units.numpy().astype(np.uint16)).save(encoded, "PNG", **FAST_PNG)
-    write_bytes(path, encoded.getvalue())
+    write_depth_png(path, disparity_px)
 
 
 def _check_unit(path: AnyPath, unit: float) -> None:
