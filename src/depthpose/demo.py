@@ -186,7 +186,7 @@ _FRAME = 1
 """The first that shows every part whole."""
 
 _SAMPLE = "flange"
-"""Whose depth image, mask and camera lie in a folder of their own, for a first command."""
+"""The part whose depth image, mask and camera get a folder of their own, for a first command."""
 
 _UNIT_M = 0.0001
 _COLUMNS = ("object", "visible_fraction", "status", "metric", "error_mm", "of_diameter",

@@ -138,7 +138,7 @@ from depthpose.core.export import Export, freeze
 from depthpose.core.files import (
     Cloud, write_cloud, write_depth_png, write_image, write_map, write_video
 )
-from depthpose.core.loop import Journal
+from depthpose.core.loop import RunLogger
 from depthpose.core.loop.folder import write_state
 from depthpose.report.page import Section, write_page, write_table
 from depthpose.core.run import claim_folder
@@ -154,10 +154,10 @@ class Heavy:
 
 def log_for_ever(folder):
     folder.mkdir(parents=True)
-    journal = Journal(folder, is_writer=True)
-    journal.open(0)
+    logger = RunLogger(folder, is_writer=True)
+    logger.open(0)
     while True:
-        journal.log(1, {2_000 * "x": 1.0})
+        logger.log(1, {2_000 * "x": 1.0})
 
 root, noise, long = Path(sys.argv[1]), {"a": torch.randn(100_000)}, "x" * 200_000
 images = [torch.rand(3, 300, 300) for _ in range(9)]
@@ -177,7 +177,7 @@ writers = {
     "avi": lambda p: write_video(p / "v.avi", images, 10.0),
     "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
     "graph": lambda p: freeze(p / "g.onnx", graph),
-    "journal": log_for_ever,
+    "logger": log_for_ever,
 }
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # what a full disk does, sooner

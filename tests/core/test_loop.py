@@ -32,7 +32,7 @@ from depthpose.core.loop import (
     train,
     write_card,
 )
-from depthpose.core.loop.loop import Arithmetic
+from depthpose.core.loop.loop import Precision
 
 PROGRAM = Path(__file__).with_name("loop_task.py")
 
@@ -457,7 +457,7 @@ def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:
         trained(tmp_path, loop(precision="fp16"))
 
 
-class Scaled(Arithmetic):
+class Scaled(Precision):
     """The scaler of fp16, but in fp32: times a power of two and back is exact."""
 
     def __init__(self, config: LoopConfig, device: torch.device) -> None:
@@ -469,7 +469,7 @@ def test_scaling_the_loss_changes_no_weight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     exact = trained(tmp_path / "fp32", loop(clip_norm=0.1))
-    monkeypatch.setattr("depthpose.core.loop.loop.Arithmetic", Scaled)
+    monkeypatch.setattr("depthpose.core.loop.loop.Precision", Scaled)
     assert_equal(weights(exact), weights(trained(tmp_path / "scaled", loop(clip_norm=0.1))))
     interrupted(tmp_path / "parts", loop(clip_norm=0.1), after=5)
     assert torch.load(tmp_path / "parts/state.pt", weights_only=True)["scaler"]["scale"] == 65536

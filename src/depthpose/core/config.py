@@ -169,7 +169,7 @@ def _refuse_number(value: object, source: str, name: str, *, is_whole: bool) -> 
 ConfigT = TypeVar("ConfigT")
 
 _MAX_BYTES = 2**17
-"""Of a config: a hundred times the largest of ours."""
+"""Largest config file: a hundred times the largest of ours."""
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:

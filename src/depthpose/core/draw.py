@@ -17,9 +17,9 @@ _NEAR_TO_FAR = (
 )  # fmt: skip
 _INVALID = (0.5, 0.5, 0.5)
 _DIMMED = 0.35
-"""Of a picture under points."""
+"""Brightness of a picture under points."""
 _LEAST_GAP = 0.08
-"""Of two marks on a bar, in its lengths: nearer ones would touch."""
+"""Least distance of two marks on a bar, as a share of its length: nearer ones would touch."""
 
 
 @dataclass(frozen=True, kw_only=True)

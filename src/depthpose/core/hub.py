@@ -24,7 +24,7 @@ _NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
 # One slash is left of the two where the name was made a path.
 _REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
 _LICENCES = ("mit", "apache-2.0", "cc-by-4.0", "cc-by-nc-4.0", "cc-by-nc-sa-3.0", "cc-by-nc-sa-4.0")
-"""As the hub writes them; others are ``other``."""
+"""Licences as the hub spells them; all others are ``other``."""
 
 
 def is_on_hub(name: str | Path) -> bool:

@@ -18,7 +18,7 @@ RESULTS = "results.jsonl"
 _CHUNK_BYTES = 2**22
 
 _read: dict[Path, tuple[int, int, dict[str, dict[str, Any]]]] = {}
-"""Of each folder: which file its results were read from, up to which byte, and what they are."""
+"""Cache by results file: its inode, up to which byte it was read, and the results in it."""
 
 
 def file_stamp(path: Path) -> list[int]:

@@ -5,7 +5,7 @@ from typing import Literal
 from depthpose.core.errors import refuse_unknown
 
 Unit = Literal["m", "cm", "mm"]
-"""Of the numbers in a model, a cloud, a depth image or a calibration."""
+"""Unit of the lengths in a model, a cloud, a depth image or a calibration."""
 
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres a unit."""

@@ -22,9 +22,9 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing, Layer, Scene, Section, colored_points
 
 WORST_PX = 4.0
-"""Of disparity: the brightest colour of an error."""
+"""Error of disparity [px] that gets the brightest colour."""
 WORST_SHARE = 0.3
-"""Of depth, as a share of the truth."""
+"""Error of depth, as a share of the truth, that gets the brightest colour."""
 
 _SPARSE = 0.25
 """Below this share of known pixels, LiDAR's, points are grown to be seen."""

@@ -24,11 +24,11 @@ from depthpose.core.files import Cloud, encode_image, image_size, read_image, wr
 from depthpose.core.files.disk import write_bytes
 
 MOST_POINTS = 60_000
-"""Of one cloud on a page: 0.7 MB of text."""
+"""Most points of one cloud on a page: 0.7 MB of text."""
 MOST_LINES = 20_000
 
 _GREY = 0.55
-"""Of points without a colour; it is seen on white and on black."""
+"""Grey of points without a colour: visible on white and on black."""
 _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 
@@ -218,10 +218,10 @@ def share_views(sets: int) -> list[int]:
 Row = Mapping[str, Any]
 
 _MOST_PIXELS = 480_000
-"""Of a drawing on a page of many: a frame of KITTI is whole."""
+"""Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
 _QUALITY = 85
 _MOST_BYTES = 250_000
-"""Of a picture file that goes onto a page as it is."""
+"""Largest picture file that goes onto a page as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)

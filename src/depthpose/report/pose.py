@@ -33,13 +33,13 @@ from depthpose.report.page import (
 
 Color = tuple[float, float, float]
 FOUND: Color = (0.15, 0.35, 1.0)
-"""Of an estimate: blue."""
+"""Colour of an estimate: blue."""
 TRUE: Color = (0.1, 0.8, 0.2)
-"""Of the truth: green."""
+"""Colour of the truth: green."""
 VOTED: Color = (1.0, 0.55, 0.1)
-"""Of keypoints as voted: orange."""
+"""Colour of voted keypoints: orange."""
 OTHER: Color = (0.6, 0.3, 0.85)
-"""Of an alternative: violet."""
+"""Colour of an alternative: violet."""
 _SURFACE = 5000
 _BEND = math.radians(30)
 _CROSS = 0.04

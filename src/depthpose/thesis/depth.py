@@ -190,7 +190,7 @@ TABLES = {table.number: table for table in (
         with_right=False,
     ),
 )}  # fmt: skip
-"""By the thesis's numbers; every figure as printed."""
+"""Tables by the thesis's numbers; every figure as printed."""
 
 
 _NEAR_M, _FAR_M = 3.0, 80.0

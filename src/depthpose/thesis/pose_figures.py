@@ -211,7 +211,7 @@ def _draw_star(image: Float[Tensor, "3 h w"], at: Float[Tensor, "2"]) -> Float[T
 
 _STEPS = 300
 _EXAGGERATED = 100
-"""At first near ones attract each other twelve times as much, so that groups form early."""
+"""First steps, in which neighbours attract each other twelve times as much: groups form early."""
 _EXAGGERATION = 12.0
 _SEARCH = 40
 

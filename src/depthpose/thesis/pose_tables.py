@@ -32,8 +32,8 @@ TITLES = {
     "3.2": "Table 3.2: 6D pose on LineMOD, ADD(-S)",
     "3.3": "Table 3.3: RANSAC against least squares",
 }
-"""Of the thesis's tables. Its text that is at hand ends before their numbers: the published rows
-of table 3.2 are those that its captions and chapter refer to, from the papers themselves."""
+"""Titles of the thesis's tables. Its text at hand ends before their numbers: the published rows of
+table 3.2 are those that its captions and chapter refer to, from the papers themselves."""
 
 LINEMOD = {
     1: "ape", 2: "benchvise", 4: "camera", 5: "can", 6: "cat", 8: "driller", 9: "duck",
@@ -46,15 +46,15 @@ LINEMOD_DIAMETERS_M = {
     8: 0.261472, 9: 0.108999, 10: 0.164628, 11: 0.175889, 12: 0.145543, 13: 0.278078, 14: 0.282601,
     15: 0.212358,
 }  # fmt: skip
-"""Of all its objects, as BOP and Linemod_preprocessed have them; 3 and 7 are in no printed row."""
+"""All of LineMOD's diameters, as BOP and Linemod_preprocessed have them; no row has 3 and 7."""
 
 _NUMBERS = {name.rstrip("*"): number for number, name in LINEMOD.items()} | {
     "bowl": 3, "cam": 4, "cup": 7,
 }  # fmt: skip
 _SAME_DIAMETER = 0.02
-"""Of a model without a name, which its diameter has to tell."""
+"""Largest relative difference of diameters of a model without a name, known by it alone."""
 _SAME_NAMED = 0.25
-"""Of a model with a name: tables of LineMOD's diameters differ by up to 16 %."""
+"""The same of a model with a name: tables of LineMOD's diameters differ by up to 16 %."""
 
 PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 """Trained, as ours, as one network of all objects: the rows that differences are taken from."""
@@ -261,7 +261,7 @@ def _difference(ours: ComparedRow, other: ComparedRow) -> ComparedRow:
 
 _ADD_POINTS = 1000
 LOOP_HYPOTHESES = 50
-"""Of the loop: published practice."""
+"""Hypotheses of the loop, as published ones take."""
 OUR_HYPOTHESES = (50, 128, 1024)
 _LOOP = "RANSAC, one by one (NumPy)"
 

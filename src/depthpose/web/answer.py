@@ -68,7 +68,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 
 MOST_PIXELS = 12_500_000
-"""Of a picture: those of a phone."""
+"""Most pixels of a picture: those of a phone's."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
     "right": ("a picture", LISTED_SUFFIXES),

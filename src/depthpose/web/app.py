@@ -455,7 +455,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
 
 
 _CONNECTIONS = 400
-"""At once; beyond, a connection is answered with 503 before anything of it is read."""
+"""Connections at once; more are answered with 503 before anything of them is read."""
 _LEAVE_S = 2
 """Seconds that open connections have to finish after Ctrl+C."""
 

@@ -29,7 +29,7 @@ from depthpose.web.answer import (
 )
 
 _MOST_WORK_PIXELS = 8_000_000
-"""Of the image as networks get it, resized to the focal length that they were trained at."""
+"""Most pixels of the image as networks get it, resized to their focal length."""
 _GUESSED = " (guessed as 0.75 widths: the metres are as wrong as the guess)"
 _ALL_SKY = 0.5
 """Share of the sky from which a pair without a depth is not taken for a wrong one."""
@@ -202,7 +202,7 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
 
 
 _SCALE = 0.5
-"""Of the example's street, as a share of KITTI's size."""
+"""Size of the example's street, as a share of KITTI's."""
 
 
 def depth_example() -> dict[str, Any]:

@@ -60,7 +60,7 @@ from depthpose.web.answer import (
 OWN_CAD = "cad"
 """The value of the field ``object`` that means the CAD file."""
 _SAME = 0.02
-"""In diameters: a CAD file whose size and surface differ by less is the object of the weights."""
+"""Largest difference [diameters] of size and surface of a CAD file and the weights' own object."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -27,8 +27,8 @@ from depthpose.core.camera.pinhole import (
     StereoRig,
     camera_from_facts,
     camera_keys,
-    check_intrinsics,
     facts_from_projections,
+    intrinsics,
     refuse_apart,
 )
 from depthpose.core.camera.stored_camera import (
@@ -150,7 +150,7 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
     shift = "cx_right_minus_left_px"
     return CameraFacts(
         kind="a calibration",
-        K=_intrinsics(focal_px, focal_y_px, cx, cy),
+        K=intrinsics(focal_px, focal_y_px, cx, cy),
         size=(int(_number(path, keys, "width")), int(_number(path, keys, "height")))
         if has_size
         else None,
@@ -212,7 +212,7 @@ def _colmap_facts(text: str) -> CameraFacts:
     fx, fy, cx, cy = values[:4]
     return CameraFacts(
         kind=f"a {model} camera of COLMAP",
-        K=_intrinsics(fx, fy, cx - 0.5, cy - 0.5),
+        K=intrinsics(fx, fy, cx - 0.5, cy - 0.5),
         size=(int(width), int(height)),
         distortion=tuple(values[4:]),
         undistort="colmap image_undistorter",
@@ -238,15 +238,11 @@ def _bare_facts(text: str) -> CameraFacts | None:
     is_tum = tuple(numbers[:4]) in _TUM
     return CameraFacts(
         kind="a camera of TUM RGB-D" if is_tum else "fx fy cx cy",
-        K=_intrinsics(*numbers[:4]),
+        K=intrinsics(*numbers[:4]),
         size=_TUM_SIZE if is_tum else None,
         depth_unit_m=_TUM_UNIT_M if is_tum else None,
         distortion=tuple(numbers[4:]),
     )
-
-
-def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
@@ -301,7 +297,7 @@ def _from_bop(keys: dict[str, Any]) -> CameraFacts:
     fx, fy, cx, cy = (_json_number(keys, key) for key in _BOP)
     return CameraFacts(
         kind="a camera of BOP",
-        K=_intrinsics(fx, fy, cx, cy),
+        K=intrinsics(fx, fy, cx, cy),
         size=_size(keys) if {"width", "height"} <= keys.keys() else None,
         depth_unit_m=_bop_unit_m(keys),
         distortion=lens_of(named(keys)),
@@ -583,8 +579,8 @@ def centred_camera(size: Size, focal_px: float) -> Camera:
     if not 1 < focal_px < 1e6:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
     width, height = size
-    K = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
-    return Camera(width=width, height=height, K=torch.tensor(K, dtype=torch.float64))
+    K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    return Camera(width=width, height=height, K=K)
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:

@@ -140,6 +140,11 @@ def check_intrinsics(K: Tensor) -> None:
         )
 
 
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[Tensor, "3 3"]:
+    """Make ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in float64."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
 AnyCamera = TypeVar("AnyCamera", bound=Camera)
 
 
@@ -248,7 +253,7 @@ _MM_FX_SHARE = 0.1
 """A focal length below a tenth of the width sees 157 degrees: no pinhole does."""
 _MAX_FX_SHARE = 200
 _LEAST_UNIT_M = 1e-6
-"""At a smaller one 16 bits of depth end before 7 cm."""
+"""Smallest unit of depth images: with a smaller one, 16 bits would end before 7 cm."""
 _FILE_BASELINE_M = 5.0
 """Common rigs in millimetres or centimetres (50 to 120 mm) pass as a plane's, never in a file."""
 WIDE_BASELINE_M = 2.0
@@ -260,12 +265,12 @@ _SAME_FOCAL = 1e-3
 _SAME_ROW_PX = 0.5
 SAME_DIFFERENCE_PX = 1.0
 _MAX_SQUEEZE = 1.8
-"""Of fx to fy, or inverse: a picture of KITTI squeezed to 512x256 has 1.66."""
+"""Largest ratio of fx to fy, or fy to fx; KITTI's images squeezed to 512x256 have 1.66."""
 _NO_DISTORTION = 1e-8
 _OFF_CENTRE = 0.1
 """Share of the size by which a principal point may leave the centre; KITTI's stays below 0.04."""
 _SAME_SHARE = 0.05
-"""By how much it may leave the centre differently in the two directions, at K's own resolution."""
+"""Largest difference of the two shares (along x and y) that still means another resolution."""
 _QUARTER = 0.25
 """Share of the size beyond which a point off the centre is doubted, whatever its direction."""
 _CORNER = 0.1
@@ -366,7 +371,13 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
         InputError: distortion, an unknown size, or a value in another unit or of another image.
     """
     if not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
-        raise _distorted(facts, size)
+        after = "and give the camera of the result"
+        if facts.size or size:
+            after += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
+        raise InputError(
+            f"{facts.kind} with lens distortion ({', '.join(f'{k:g}' for k in facts.distortion)}), "
+            f"and only images without are understood; undistort them by {facts.undistort}, {after}"
+        )
     camera = make_camera(facts, size)
     _refuse_units(camera, is_metric=facts.is_metric)
     if facts.size is None:
@@ -469,18 +480,6 @@ def suspicious_centre(camera: Camera) -> str | None:
     )
 
 
-def _distorted(facts: CameraFacts, size: Size | None) -> InputError:
-    shown = ", ".join(f"{k:g}" for k in facts.distortion)
-    known = facts.size or size
-    after = "and give the camera of the result"
-    if known is not None:
-        after += f": {json.dumps(camera_keys(make_camera(facts, known)))}"
-    return InputError(
-        f"{facts.kind} with lens distortion ({shown}), and only images without are understood; "
-        f"undistort them by {facts.undistort}, {after}"
-    )
-
-
 def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
     if K[0, 0] <= _NORMALISED_FX < width / 10:
         raise InputError(
@@ -548,14 +547,10 @@ def _refuse_units(camera: Camera, *, is_metric: bool) -> None:
     refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
-        if is_metric:
-            said = "a rig that is truly this wide is made in Python, as a StereoRig"
-            refuse_baseline(camera.baseline_m, said, _FILE_BASELINE_M)
-        else:
-            said = (
-                'a rig that is truly this wide is written as ours: width, height, K, "baseline_m"'
-            )
-            refuse_baseline(camera.baseline_m, said)
+        how = 'written as ours: width, height, K, "baseline_m"'
+        how = "made in Python, as a StereoRig" if is_metric else how
+        most_m = _FILE_BASELINE_M if is_metric else WIDE_BASELINE_M
+        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
         if abs(camera.cx_right_minus_left_px) >= camera.width:
             raise InputError(
                 f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "

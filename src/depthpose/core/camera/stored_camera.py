@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -10,7 +11,13 @@ import numpy as np
 import torch
 import yaml
 
-from depthpose.core.camera.pinhole import KNOWN_FILES, CameraFacts, Size, facts_from_projections
+from depthpose.core.camera.pinhole import (
+    KNOWN_FILES,
+    CameraFacts,
+    Size,
+    facts_from_projections,
+    intrinsics,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_text
 from depthpose.core.files.disk import refused_as
@@ -22,7 +29,7 @@ Names = dict[str, Any]
 _YAML_HEAD = re.compile(r"\A\s*%YAML[^\n]*\n")
 _DECLARATION = re.compile(r"<!(?!--)")
 _MAX_TEXT = 2**18
-"""Of YAML and XML: ten times the largest camera file."""
+"""Longest YAML or XML that is parsed: ten times the largest camera file."""
 
 
 def read_storage(path: AnyPath, text: str) -> Names | None:
@@ -108,7 +115,7 @@ def _read_xml(path: AnyPath, text: str) -> Names | None:
 
 _SUFFIXES = (".yaml", ".yml", ".xml")
 CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt", ".conf")
-"""Of files that a camera may be read from."""
+"""Suffixes of the files that a camera may be read from."""
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
 _D = ("d", "d1", "d2", "coeffs")
 _P = ("p", "projectionmatrix", "p1")
@@ -144,10 +151,11 @@ def facts_from_names(names: Names) -> CameraFacts | None:
     distortion = lens_of(names)
     if right is not None:
         facts = facts_from_projections("a rig of OpenCV", _need(left, "P1"), right, size_of(names))
-        return _with_distortion(facts, distortion, _RECTIFY)
+        return replace(facts, distortion=distortion, undistort=_RECTIFY)
     Q = matrix(names, ("q",), 16)
     if Q is not None:
-        return _with_distortion(_from_reprojection(Q, size_of(names)), distortion, _RECTIFY)
+        facts = _from_reprojection(Q, size_of(names))
+        return replace(facts, distortion=distortion, undistort=_RECTIFY)
     if left is not None and left[0, 0] != 0:
         return _from_projection(names, left, distortion)
     return _from_intrinsics(names, distortion)
@@ -206,7 +214,7 @@ def _from_settings(names: Names, who: str) -> CameraFacts:
     ]
     return CameraFacts(
         kind="settings of ORB-SLAM",
-        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        K=intrinsics(fx, fy, cx, cy),
         size=None if width is None or height is None else (int(width), int(height)),
         baseline_m=None if is_rgbd else baseline_m,
         depth_unit_m=1 / factor if factor else None,
@@ -219,10 +227,12 @@ def _from_projection(names: Names, P: np.ndarray, distortion: tuple[float, ...])
     kind, size = "a camera_info of ROS" if is_ros(names) else "a camera of OpenCV", size_of(names)
     if P[0, 3] == 0 and P[1, 3] == 0:
         facts = facts_from_projections(kind, P, None, size)
-        return _with_distortion(facts, distortion, _lens_remedy(names, _UNDISTORT_P))
+        return replace(facts, distortion=distortion, undistort=_lens_remedy(names, _UNDISTORT_P))
     left = P.copy()
     left[:, 3] = 0
-    return _with_distortion(facts_from_projections(kind, left, P, size), distortion, _RECTIFY)
+    return replace(
+        facts_from_projections(kind, left, P, size), distortion=distortion, undistort=_RECTIFY
+    )
 
 
 def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
@@ -238,7 +248,7 @@ def facts_from_ros_pair(first: Names, second: Names) -> CameraFacts:
     if size_of(first) != size_of(second):
         raise InputError("the two camera_info are of images of two sizes; a pair has one")
     facts = facts_from_projections("a pair of camera_info", left, right, size_of(first))
-    return _with_distortion(facts, (*lens_of(first), *lens_of(second)), _RECTIFY)
+    return replace(facts, distortion=(*lens_of(first), *lens_of(second)), undistort=_RECTIFY)
 
 
 def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
@@ -248,7 +258,7 @@ def _from_reprojection(Q: np.ndarray, size: Size | None) -> CameraFacts:
     f, cx, cy = Q[2, 3], -Q[0, 3], -Q[1, 3]
     return CameraFacts(
         kind="a rig of OpenCV",
-        K=torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64),
+        K=intrinsics(f, f, cx, cy),
         size=size,
         baseline_m=baseline_m,
         cx_right_minus_left_px=float(Q[3, 3]) * baseline_m,
@@ -263,7 +273,7 @@ def _from_intrinsics(names: Names, distortion: tuple[float, ...]) -> CameraFacts
     facts = CameraFacts(
         kind=kind, K=torch.from_numpy(K), size=size_of(names), baseline_m=_level_baseline(names)
     )
-    return _with_distortion(facts, distortion, _lens_remedy(names, facts.undistort))
+    return replace(facts, distortion=distortion, undistort=_lens_remedy(names, facts.undistort))
 
 
 def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | None:
@@ -276,7 +286,7 @@ def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | 
     fx, fy, cx, cy = found
     return CameraFacts(
         kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
-        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        K=intrinsics(fx, fy, cx, cy),
         size=size_of(names),
         depth_unit_m=scalar(names, "depthscale") if is_realsense else None,
         distortion=distortion,
@@ -295,12 +305,6 @@ def _level_baseline(names: Names) -> float | None:
             "'depthpose data rectify', or by cv2.stereoRectify and write its P1 and P2 too"
         )
     return -T[0]
-
-
-def _with_distortion(
-    facts: CameraFacts, distortion: tuple[float, ...], undistort: str
-) -> CameraFacts:
-    return CameraFacts(**{**vars(facts), "distortion": distortion, "undistort": undistort})
 
 
 def _lens_remedy(names: Names, of_pinhole: str) -> str:

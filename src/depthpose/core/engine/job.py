@@ -233,7 +233,7 @@ def _write_manifest(out: str, every: Sequence[Done]) -> None:
 
 
 _LEAST_VERSION = (2, 52)
-"""Since which Ray has passwords."""
+"""The first version of Ray that has passwords."""
 
 
 @dataclass(frozen=True, kw_only=True)

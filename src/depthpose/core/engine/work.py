@@ -35,7 +35,7 @@ ShardFormat = Literal["tar", "parquet"]
 AddResult = Callable[[str, Mapping[str, bytes], str], None]
 """Adds a result to a shard: its name, contents by their endings, or why there are none."""
 _GROUP_BYTES = 64 * 2**20
-"""Of rows of Parquet that are written together."""
+"""Size from which on the rows so far are written as one row group of Parquet."""
 
 
 @contextmanager
@@ -194,7 +194,7 @@ class Work(Protocol):
 
     @property
     def endings(self) -> Sequence[str]:
-        """Of the files of a result."""
+        """Endings of the files of a result."""
         ...
 
     @property

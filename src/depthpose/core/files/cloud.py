@@ -35,7 +35,7 @@ _PARTS = re.compile(r"[\s,;]+")
 _LOOKED_AT = 100
 """Rows of text by which it is understood."""
 _MAX_SCAN_BYTES = 2**26
-"""Of one scan of a LiDAR, thirty times KITTI's."""
+"""Largest scan of a LiDAR that is read, thirty times KITTI's."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ AnyPath = str | os.PathLike[str]
 """A path as users give it."""
 
 MAX_FILE_BYTES = 2**28
-"""Nothing that is read whole is larger; a bigger file is a mistake or an attack."""
+"""Largest file that is read whole; a bigger one is a mistake or an attack."""
 
 
 def read_file(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:

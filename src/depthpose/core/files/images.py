@@ -28,9 +28,9 @@ from depthpose.core.files.disk import (
 from depthpose.core.files.store import read_bytes
 
 WRITTEN_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Of pictures that are written."""
+"""Suffixes of pictures that can be written."""
 LISTED_SUFFIXES = (*WRITTEN_SUFFIXES, ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".webp")
-"""Of files that count as pictures where a folder is listed; of a file that is named, any."""
+"""Suffixes of pictures in a listed folder; a file that is named may have any."""
 FAST_PNG = {"compress_level": 1}
 """Four times faster than zlib's usual 6 and a third larger at most: at 6, writing the pictures of
 an estimate took as long as the estimate."""

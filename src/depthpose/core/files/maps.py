@@ -22,9 +22,9 @@ from depthpose.core.files.images import FAST_PNG, opened_image
 from depthpose.core.files.store import read_bytes
 
 MAP_SUFFIXES = (".npy", ".pfm")
-"""Of files that hold a map of floats."""
+"""Suffixes of files that hold a map of floats."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", *MAP_SUFFIXES)
-"""Of depth images of a sensor."""
+"""Suffixes of depth images of a sensor."""
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,

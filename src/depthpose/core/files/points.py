@@ -155,7 +155,7 @@ _END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
 
 
 _MOST_RUNS = 500_000
-"""Of binary lists of one length, which are read together; more take over ten seconds."""
+"""Most runs of equally long binary lists (each run is read at once); more take over ten seconds."""
 
 
 @dataclass(kw_only=True)
@@ -363,7 +363,7 @@ _PCD_CODES = {
 }
 _MAX_PCD_HEADER = 2**16
 _MAX_PACKED, _MAX_UNPACKED = 2**25, 2**27
-"""Of compressed points, which are unpacked byte by byte: eight million points."""
+"""Largest compressed points, unpacked byte by byte: eight million points."""
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 

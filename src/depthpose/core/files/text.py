@@ -14,14 +14,14 @@ from depthpose.core.files.disk import AnyPath, refused_as, write_bytes
 from depthpose.core.files.store import read_bytes
 
 MAX_TEXT_BYTES = 2**26
-"""Of text and tables in it: a million points, ten thousand images of annotations."""
+"""Largest text: a table of a million points, annotations of ten thousand images."""
 MAX_LIST_BYTES = 2**20
-"""Of text that lists a few numbers: a calibration, a camera, a config."""
+"""Largest text that lists a few numbers: a calibration, a camera, a config."""
 _MOST_MEMORY = 700_000_000
-"""That JSON or YAML may take once it is read, as estimated from its signs."""
+"""Memory [bytes] that JSON or YAML may take once it is read, estimated by counting its signs."""
 _MOST_DEPTH = 50
 _MOST_VALUES = 2_000_000
-"""Of YAML whose references are written out."""
+"""Most values of YAML whose references are written out."""
 _PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _MERGE = "tag:yaml.org,2002:merge"

@@ -1,6 +1,6 @@
 """The one training loop: a task in, trained weights and a run folder out."""
 
-from depthpose.core.loop.folder import Journal as Journal
+from depthpose.core.loop.folder import RunLogger as RunLogger
 from depthpose.core.loop.folder import card_text as card_text
 from depthpose.core.loop.folder import held_out_text as held_out_text
 from depthpose.core.loop.folder import read_metrics as read_metrics

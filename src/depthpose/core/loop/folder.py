@@ -48,7 +48,7 @@ def run_files(weights: str) -> list[str]:
     return [*own, *(f"{weights}.{ending}" for ending in ("safetensors", "md", "json"))]
 
 
-class Journal:
+class RunLogger:
     """Writes one run; only the main process of a training has one that writes."""
 
     def __init__(self, folder: Path, *, is_writer: bool) -> None:

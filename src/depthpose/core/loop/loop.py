@@ -26,7 +26,14 @@ from torch.utils.data import DataLoader
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, import_extra
-from depthpose.core.loop.folder import STATE, Journal, Parts, restore_last, run_files, saved_states
+from depthpose.core.loop.folder import (
+    STATE,
+    Parts,
+    RunLogger,
+    restore_last,
+    run_files,
+    saved_states,
+)
 from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
@@ -183,10 +190,10 @@ class _Training:
         """Bring everything to the device and, where asked, to the state of an earlier run."""
         self.task, self.samples, self.config = task, samples, config
         self.accelerator = _make_accelerator(config)
-        self.arithmetic = Arithmetic(config, self.accelerator.device)
+        self.precision = Precision(config, self.accelerator.device)
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
-        self.journal = Journal(folder, is_writer=self.accelerator.is_main_process)
+        self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
         self.step, self.began = 0, time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}
         saved = saved_states(folder)
@@ -204,14 +211,14 @@ class _Training:
         self.parts = Parts(
             modules=task.modules,
             optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
-            scaler=self.arithmetic.scaler,
+            scaler=self.precision.scaler,
             average={name: _copied(m) for name, m in task.modules.items() if has_average},
         )
         if saved:
             path, self.step, seconds = restore_last(folder, self.parts)
             self.began -= seconds
-            self.journal.has_good_last = path.name == STATE
-        self.journal.open(self.step)
+            self.logger.has_good_last = path.name == STATE
+        self.logger.open(self.step)
 
     @property
     def seconds(self) -> float:
@@ -231,22 +238,22 @@ class _Training:
             if self._is_due(self.config.log_every_steps):
                 numbers = {name: total / terms for name, (total, terms) in self.sums.items()}
                 self.sums = {}
-                self.journal.log(self.step, numbers)
+                self.logger.log(self.step, numbers)
             if self._is_due(self.config.validate_every_steps):
                 if self.accelerator.is_main_process:
                     average = self.parts.average
                     own = {name: _copied(m) for name, m in self.task.modules.items() if average}
                     self._load(average)
-                    self.journal.show(self.step, self.task.validate())
+                    self.logger.show(self.step, self.task.validate())
                     self._load(own)
                 self.accelerator.wait_for_everyone()
             if stop or self._is_due(self.config.save_every_steps):
                 state = {"step": self.step, "seconds": self.seconds, **self.parts.state()}
-                self.journal.save(state)
+                self.logger.save(state)
             if on_step is not None and self.accelerator.is_main_process:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
             if stop and self.step < self.steps:
-                self.journal.close()
+                self.logger.close()
                 self.accelerator.wait_for_everyone()  # rank 0 may still be writing
                 raise Interrupted(
                     f"stopped after step {self.step} of {self.steps}, --resume goes on from there, "
@@ -254,7 +261,7 @@ class _Training:
                 )
         self.accelerator.wait_for_everyone()  # none leaves while another still needs it
         self._load(self.parts.average)  # what is exported
-        self.journal.close()
+        self.logger.close()
 
     def _batches(self) -> Iterator[Any]:
         """Load this process's micro-batches, from the first that is still to do.
@@ -286,7 +293,7 @@ class _Training:
                 # Dropout follows the micro-batch, not the process that happens to hold it.
                 micro = place * self.world + self.accelerator.process_index
                 torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-                with self.arithmetic.autocast():
+                with self.precision.autocast():
                     update = next(iterator, None)
                 if update is None:
                     continue
@@ -371,7 +378,7 @@ def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401 - accelerate i
         ) from error
 
 
-class Arithmetic:
+class Precision:
     """Autocast, and the scaling of the loss that fp16 needs; bf16 is fp32 where it is unknown."""
 
     def __init__(self, config: LoopConfig, device: torch.device) -> None:

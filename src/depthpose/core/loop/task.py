@@ -78,7 +78,7 @@ class LoopConfig:
     all of them until the discriminator has been updated."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
-    """Arithmetic of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
+    """Precision of the forward pass; fp16 needs a GPU. A processor without bf16 takes fp32."""
 
     clip_norm: float | None = None
     """Largest norm of an optimiser's gradient; None: as it is."""
