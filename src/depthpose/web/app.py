@@ -13,7 +13,6 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import cache, partial
-from io import BytesIO
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -55,7 +54,7 @@ _SAFE = {
 _MOST_FILES, _MOST_FIELDS, _LONGEST_FIELD = 6, 30, 4096
 
 
-class AdaptationCheck:
+class HostCheck:
     """Refuses requests from other pages, and tells the browser what this page may load.
 
     Args:
@@ -82,7 +81,10 @@ class AdaptationCheck:
 def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
     """Refuse a request under another name than ours, or sent by another web page."""
     host = request.headers.get("host", "")
-    name = _host_name(host)
+    try:
+        name = urlsplit(f"//{host}").hostname
+    except ValueError:  # such as half of a bracket
+        name = None
     if hosts is not None and name not in hosts:
         return _sentence(
             403, f"this page answers to {', '.join(hosts)}, not to {host!r}; start "
@@ -92,13 +94,6 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
     if origin is not None and origin.partition("://")[2] != host:
         return _sentence(403, f"the request comes from another page, {origin}; open this one")
     return None
-
-
-def _host_name(host: str) -> str | None:
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:  # such as half of a bracket
-        return None
 
 
 def refuse_size(request: Request, most: int) -> None:
@@ -424,7 +419,7 @@ class Pages:
 
 def _picture(shown: Shown, files: Mapping[str, bytes]) -> dict[str, Any]:
     """Give what the page needs of a picture: its size too, so that nothing moves when it comes."""
-    with Image.open(BytesIO(files[shown.file])) as image:  # a file of our own
+    with Image.open(io.BytesIO(files[shown.file])) as image:  # a file of our own
         width, height = image.size
     return {**vars(shown), "scale": shown.scale and vars(shown.scale), "size": [width, height]}
 
@@ -449,7 +444,7 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
             Route("/queue/{ticket}", pages.place),
             Route("/results/{key}/{name}", pages.download),
         ],
-        middleware=[Middleware(AdaptationCheck, hosts=limits.hosts)],
+        middleware=[Middleware(HostCheck, hosts=limits.hosts)],
         exception_handlers={HTTPException: error_response, Exception: crash_response},
     )
 

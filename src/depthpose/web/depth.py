@@ -45,7 +45,15 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     """
     began = time.perf_counter()
     pair, focal = _input(form)
-    near_m, far_m = _range_m(form)
+    near_m, far_m = (
+        default if (typed := form.number(end)) is None else typed
+        for end, default in zip(("near_m", "far_m"), COLOR_RANGE_M, strict=True)
+    )
+    if not 0 < near_m < far_m:
+        raise InputError(
+            f"the colours go from {near_m:g} m to {far_m:g} m; give a near end above 0, and a far "
+            "end beyond it"
+        )
     if pair.right is not None and net.matcher is None:
         raise InputError(
             "the weights of this page take one image alone: remove the right image, or start "
@@ -110,18 +118,6 @@ def _input(form: Form) -> tuple[StereoInput, str]:
     right = read_image(form.file("right")) if has_right else None
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, origin
-
-
-def _range_m(form: Form) -> tuple[float, float]:
-    near, far = form.number("near_m"), form.number("far_m")
-    near_m = COLOR_RANGE_M[0] if near is None else near
-    far_m = COLOR_RANGE_M[1] if far is None else far
-    if not 0 < near_m < far_m:
-        raise InputError(
-            f"the colours go from {near_m:g} m to {far_m:g} m; give a near end above 0, and a far "
-            "end beyond it"
-        )
-    return near_m, far_m
 
 
 def _refuse_work(pair: StereoInput, net: FakestereoNet) -> None:

@@ -21,7 +21,7 @@ from depthpose.core.units import METRES, Unit
 from depthpose.pose.cloud import object_points
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets.write import write_mask
-from depthpose.pose.estimator import GeoPoseNet, Registration, Voted
+from depthpose.pose.estimator import GeoPoseNet, Registration
 from depthpose.pose.estimator.answer import with_status
 from depthpose.pose.estimator.find import explained_mask, nothing_found
 from depthpose.pose.estimator.given import cloud_input, view_input
@@ -35,7 +35,6 @@ from depthpose.pose.mesh import (
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.page import Scene
 from depthpose.report.pose import (
     draw_pose,
     grey_depth,
@@ -82,7 +81,15 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     given = _input(form, target.model)
     found = voted = None
     if "depth" in form.files and "mask" not in form.files:
-        given, found = _found_alone(given, target)
+        # Without a mask the object is searched for; the mask is what its best pose explains.
+        assert isinstance(given, ViewInput)
+        answers = target.net.find_in(given, [target.model.name])
+        found = nothing_found(given, target.model.name)
+        if answers:
+            found = replace(answers[0], name=given.name)
+            assert found.camera_from_model is not None
+            mask = explained_mask(given, found.camera_from_model, target.model)
+            given = replace(given, mask=mask)
     points_m = object_points(given, target.model.diameter_m)
     if found is None and isinstance(target.net, GeoPoseNet):
         found, voted = target.net.estimate_with_votes(given)
@@ -90,6 +97,10 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         found = target.net.estimate_many([given])[0]
     if (least := form.number("min_certainty")) is not None:
         found = with_status(found, EstimateConfig(min_certainty=least).min_certainty)
+    scene = pose_scene(given, points_m, found, target.model)
+    if found.keypoints_m is not None and voted is not None:
+        votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], found.keypoints_m)
+        scene = replace(scene, layers=[*scene.layers, votes])
     folder = form.results()
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
@@ -98,22 +109,10 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         facts=pose_facts(found, target.model, target.how, agreeing),
         tables=pose_tables(found),
         pictures=_write(folder, given, points_m, found, target.model),
-        scene=_scene(given, points_m, found, target.model, voted),
+        scene=scene,
         terms=net.terms if target.net is net else "",
         files=read_files(folder),
     )
-
-
-def _found_alone(given: CloudInput | ViewInput, target: _Target) -> tuple[ViewInput, PoseEstimate]:
-    """Search a depth image without a mask; give the best pose, and the pixels that it explains."""
-    assert isinstance(given, ViewInput)
-    answers = target.net.find_in(given, [target.model.name])
-    if not answers:
-        return given, nothing_found(given, target.model.name)
-    best = replace(answers[0], name=given.name)
-    assert best.camera_from_model is not None
-    mask = explained_mask(given, best.camera_from_model, target.model)
-    return replace(given, mask=mask), best
 
 
 def _write(
@@ -206,21 +205,6 @@ def _unit(form: Form, field: str) -> Unit:
     unit = form.fields.get(field, "")
     refuse_unknown(field, unit, METRES)
     return cast(Unit, unit)
-
-
-def _scene(
-    given: CloudInput | ViewInput,
-    points_m: Float[Tensor, "n 3"],
-    found: PoseEstimate,
-    model: ObjectModel,
-    voted: Voted | None,
-) -> Scene:
-    """Show the cloud, the posed model and the votes."""
-    scene = pose_scene(given, points_m, found, model)
-    if found.keypoints_m is None or voted is None:
-        return scene
-    votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], found.keypoints_m)
-    return replace(scene, layers=[*scene.layers, votes])
 
 
 _UNIT_M = 0.0001

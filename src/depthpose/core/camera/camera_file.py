@@ -27,6 +27,7 @@ from depthpose.core.camera.pinhole import (
     StereoRig,
     camera_from_facts,
     camera_keys,
+    check_intrinsics,
     facts_from_projections,
     intrinsics,
     refuse_apart,

@@ -5,10 +5,11 @@ Shards are tar files in WebDataset's layout, or Parquet.
 
 import io
 import json
+import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
@@ -306,7 +307,9 @@ class Runner:
                     files = _take(results, one.name, self._work.endings)
                     add(one.name, {} if reason else files, reason)
                     yield one.name, reason
-                    one.close()
+                    for path in one.sample.files if one.sample else ():
+                        if scratch in path.parents:  # a copy, alone in its folder
+                            shutil.rmtree(path.parent, ignore_errors=True)
 
 
 def run_here(blocks: Sequence[Block], work: Work, out: str, form: ShardFormat) -> Iterator[Done]:
@@ -323,7 +326,6 @@ class _Opened:
     name: str
     sample: Sample | None = None
     reason: str = ""
-    close: Callable[[], None] = lambda: None
 
 
 @contextmanager
@@ -346,14 +348,12 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[_Opened]:
         yield from _tar_samples(block.tar, wanted, scratch)
         return
     for item in block.items:
-        stack = ExitStack()
         try:
-            files = tuple(stack.enter_context(local_copy(url, scratch)) for url in item.files)
+            files = tuple(local_copy(url, scratch) for url in item.files)
         except InputError as error:
-            stack.close()
             yield _Opened(name=item.name, reason=str(error))
             continue
-        yield _Opened(name=item.name, sample=Sample(item.name, files), close=stack.close)
+        yield _Opened(name=item.name, sample=Sample(item.name, files))
 
 
 def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
@@ -387,26 +387,18 @@ def _role(ending: str, wanted: Files) -> tuple[str | None, str]:
 
 def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Opened:
     missing = [role for role in wanted.roles if role not in files]
-
-    def close() -> None:
-        for file in files.values():
-            with suppress(OSError):
-                file.unlink(missing_ok=True)
-                file.parent.rmdir()
-
+    reason = ""
+    if missing:
+        reason = f"{tar}: {key!r} has no {missing[0]}; a sample holds {', '.join(wanted.roles)}"
     try:
         refuse_name(key, tar)
     except InputError as error:
-        close()
-        return _Opened(name=key, reason=str(error))
-    if missing:
-        close()
-        return _Opened(
-            name=key,
-            reason=f"{tar}: {key!r} has no {missing[0]}; a sample holds {', '.join(wanted.roles)}",
-        )
-    sample = Sample(key, tuple(files[role] for role in wanted.roles))
-    return _Opened(name=key, sample=sample, close=close)
+        reason = str(error)
+    if reason:
+        for file in files.values():
+            shutil.rmtree(file.parent, ignore_errors=True)
+        return _Opened(name=key, reason=reason)
+    return _Opened(name=key, sample=Sample(key, tuple(files[role] for role in wanted.roles)))
 
 
 def _take(results: Path, name: str, endings: Sequence[str]) -> dict[str, bytes]:

@@ -185,28 +185,19 @@ def refuse_unsafe(url: str) -> None:
         )
 
 
-@contextmanager
-def local_copy(url: str, scratch: Path) -> Iterator[Path]:
-    """Give a file as a local path: itself on a disk, else a copy for as long as the block runs.
-
-    Errors inside the block name the URL, not the copy.
+def local_copy(url: str, scratch: Path) -> Path:
+    """Give a file as a local path: itself on a disk, else a copy in a new folder in ``scratch``.
 
     Raises:
-        InputError: it is not there, or cannot be read.
+        InputError: it is in a store and cannot be read there.
     """
     path = local_path(url)
     if path is not None:
-        yield path
-        return
+        return path
     copy = Path(tempfile.mkdtemp(dir=scratch)) / PurePosixPath(url).name
     with _file_system(url, "read") as (fs, inner):
         fs.get_file(inner, str(copy))
-    try:
-        yield copy
-    except InputError as error:
-        raise InputError(str(error).replace(str(copy), url)) from error
-    finally:
-        shutil.rmtree(copy.parent, ignore_errors=True)
+    return copy
 
 
 def fetch(url: str, path: Path) -> None:
