@@ -110,16 +110,16 @@ def _show_scene(
     write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *range_m))
     rows, sections = [], []
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
-    for method, (given, net) in nets.items():
-        seen = pair if given == _FROM_PAIR else replace(pair, right=None)
+    for method, (views, net) in nets.items():
+        seen = pair if views == _FROM_PAIR else replace(pair, right=None)
         estimate = net.estimate_pair(seen, with_check=False)
         measured = _measure(sample, estimate)
-        rows.append({"scene": pair.name, "method": method, "input": given, **measured})
+        rows.append({"scene": pair.name, "method": method, "input": views, **measured})
         write_estimate(homes[method], seen, estimate, range_m, CLOUD_M)
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
         shown = DepthShown(pair=seen, estimate=estimate, range_m=range_m, error=error)
-        title = f"{pair.name}: {method}, {given}"
+        title = f"{pair.name}: {method}, {views}"
         sections.append(depth_section(title, shown, with_image=False))
     best, scale = next(iter(nets)), depth_scale(*range_m)
     pictures = [

@@ -86,8 +86,24 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     """
     path = Path(path)
     with _opened_safetensors(path) as file:
-        found, config, facts = _interpreted(path, dict(file.metadata() or {}), kind)
-        return Checkpoint(kind=found, config=config, state=_tensors(path, file), facts=facts)
+        metadata = dict(file.metadata() or {})
+        if "kind" not in metadata or "config" not in metadata:
+            raise InputError(
+                f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
+                "published checkpoint is imported by 'depthpose weights import'."
+            )
+        held = metadata.pop("kind")
+        if kind is not None and held != kind:
+            raise InputError(
+                f"{path}: holds weights of kind {held!r}, but {kind!r} is needed here."
+            )
+        try:
+            config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
+        if not isinstance(config, dict):
+            raise InputError(f"{path}: its 'config' is not a mapping.")
+        return Checkpoint(kind=held, config=config, state=_tensors(path, file), facts=metadata)
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -120,7 +136,7 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
         with torch.device("meta"):
             _refuse_misfits(make(), checkpoint, source)
         network = make()
-    load_weights(network, checkpoint, source)
+    network.load_state_dict(dict(checkpoint.state))
     return network
 
 
@@ -137,10 +153,10 @@ class _WithoutDrawing(TorchFunctionMode):
         args: Sequence[Any] = (),
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:  # noqa: ANN401
-        given = kwargs or {}
+        options = kwargs or {}
         if func in _DRAWS:
-            return args[0] if args else given["tensor"]
-        return func(*args, **given)
+            return args[0] if args else options["tensor"]
+        return func(*args, **options)
 
 
 def _refuse_misfits(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
@@ -309,24 +325,3 @@ def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
                 "weights"
             )
     return state
-
-
-def _interpreted(
-    path: Path, metadata: dict[str, str], kind: str | None
-) -> tuple[str, dict[str, Any], dict[str, str]]:
-    """Give kind, config and card of a file, before its tensors are read."""
-    if "kind" not in metadata or "config" not in metadata:
-        raise InputError(
-            f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A published "
-            "checkpoint is imported by 'depthpose weights import'."
-        )
-    found = metadata.pop("kind")
-    if kind is not None and found != kind:
-        raise InputError(f"{path}: holds weights of kind {found!r}, but {kind!r} is needed here.")
-    try:
-        config = json.loads(metadata.pop("config"), parse_constant=refuse_number)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
-    if not isinstance(config, dict):
-        raise InputError(f"{path}: its 'config' is not a mapping.")
-    return found, config, metadata

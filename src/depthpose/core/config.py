@@ -74,13 +74,13 @@ def check_settings(config: Any, **ranges: str) -> None:  # noqa: ANN401  any dat
 @cache
 def _words_of(kind: type) -> dict[str, tuple[str, ...]]:
     """Settings whose type lists the words that it knows."""
-    found = {}
+    words = {}
     for name, hint in get_type_hints(kind).items():
         choices = [hint, *get_args(hint)]
         literal = next((c for c in choices if get_origin(c) is Literal), None)
         if literal is not None and all(isinstance(word, str) for word in get_args(literal)):
-            found[name] = get_args(literal)
-    return found
+            words[name] = get_args(literal)
+    return words
 
 
 def default_of(field: dataclasses.Field[Any]) -> object:

@@ -94,7 +94,7 @@ class Graph:
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> Value:  # noqa: ANN401
         """Add an operator and give its first output; None leaves an optional input out."""
         out = self._new_name(kind)
-        names = ["" if given is None else self._name_of(given) for given in inputs]
+        names = ["" if value is None else self._name_of(value) for value in inputs]
         self._nodes.append(self._onnx.helper.make_node(kind, names, [out], **attributes))
         return Value(self, out)
 
@@ -241,12 +241,12 @@ def refuse_beyond(rows: Iterable[Row]) -> None:
         InputError: the first such row.
     """
     for row in rows:
-        found, limit = row[f"{row['limited']} difference"], row["limit"]
-        if not found <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
+        difference, limit = row[f"{row['limited']} difference"], row["limit"]
+        if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
             raise InputError(
                 f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
-                f"{found:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is written. "
-                "Install other versions of onnxscript and onnxruntime, and report this."
+                f"{difference:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is "
+                "written. Install other versions of onnxscript and onnxruntime, and report this."
             )
 
 

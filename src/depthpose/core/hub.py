@@ -42,18 +42,18 @@ def fetch_weights(name: str) -> Path:
         InputError: no such name, repository, revision or file; no access; no connection.
         MissingExtraError: the extra ``hub`` is not installed.
     """
-    found = _REFERENCE.fullmatch(name)
-    if found is None:
+    reference = _REFERENCE.fullmatch(name)
+    if reference is None:
         raise InputError(
             f"{name!r}: weights on the hub are hf://OWNER/NAME, hf://OWNER/NAME@REVISION or "
             "hf://OWNER/NAME/FILE.safetensors."
         )
-    file = found["file"] or WEIGHTS_FILE
+    file = reference["file"] or WEIGHTS_FILE
     if not file.endswith(".safetensors"):
         raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
     hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
     with _explained(name):
-        path = hub.hf_hub_download(found["repository"], file, revision=found["revision"])
+        path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     return Path(path)
 
 

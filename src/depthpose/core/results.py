@@ -91,9 +91,9 @@ def _results(folder: Path) -> dict[str, dict[str, Any]]:
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()
-        number, end, found = _read.get(path, (status.st_ino, 0, {}))
+        number, end, results = _read.get(path, (status.st_ino, 0, {}))
         if number != status.st_ino or status.st_size < end:
-            end, found = 0, {}
+            end, results = 0, {}
         if status.st_size > end:
             with path.open("rb") as file:
                 file.seek(end)
@@ -102,17 +102,17 @@ def _results(folder: Path) -> dict[str, dict[str, Any]]:
             for line in filter(None, text[:whole].split(b"\n")):
                 with suppress(ValueError, KeyError, TypeError, AttributeError):
                     row = json.loads(line)
-                    found[str(row["name"])] = dict(row["files"].items())
+                    results[str(row["name"])] = dict(row["files"].items())
             end += whole
-        _read[path] = (status.st_ino, end, found)
+        _read[path] = (status.st_ino, end, results)
     except OSError:
         return {}
-    return found
+    return results
 
 
 def _checksum(path: Path) -> int:
-    found = 0
+    checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK_BYTES):
-            found = zlib.crc32(chunk, found)
-    return found
+            checksum = zlib.crc32(chunk, checksum)
+    return checksum

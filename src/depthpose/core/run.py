@@ -302,7 +302,12 @@ def claim_names(
     """
     record = folder / _SOURCES
     # Listed before the record is read: what another process writes, its record names by then.
-    results = _results_there(folder, endings)
+    results = {
+        file.name.removesuffix(ending): file
+        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
+        for ending in endings
+        if file.name.endswith(ending)
+    }
     known = _known_sources(folder)
     made = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted = {name: _entry(files) for name, files in sources.items()}
@@ -343,8 +348,8 @@ def _entry(files: Path | Sequence[Path]) -> list[str]:
 
 def read_sources(folder: Path) -> dict[str, Path]:
     """Give the file that each result of ``folder`` was made from, by the name of the result."""
-    found = {name: _source(entry)[0] for name, entry in _known_sources(folder).items()}
-    return {name: Path(path) for name, path in found.items() if path}
+    paths = {name: _source(entry)[0] for name, entry in _known_sources(folder).items()}
+    return {name: Path(path) for name, path in paths.items() if path}
 
 
 def _known_sources(folder: Path) -> dict[str, object]:
@@ -421,17 +426,6 @@ def not_ours(path: Path | str) -> InputError:
     )
 
 
-def _results_there(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
-    """Find the files that have the names of results, by what stands before the ending."""
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return {
-        file.name.removesuffix(ending): file
-        for file in files
-        for ending in endings
-        if file.name.endswith(ending)
-    }
-
-
 def refuse_other_settings(
     folder: Path | str,
     record: object,
@@ -459,11 +453,11 @@ def refuse_other_settings(
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Name nested settings by their path: ``pairs.limit``."""
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, value in settings.items():
         is_nested = isinstance(value, Mapping)
-        found |= _flat(value, f"{prefix}{name}.") if is_nested else {f"{prefix}{name}": value}
-    return found
+        flat |= _flat(value, f"{prefix}{name}.") if is_nested else {f"{prefix}{name}": value}
+    return flat
 
 
 def _version(package: str) -> str:
@@ -478,7 +472,7 @@ def _commit() -> str:
     here = Path(__file__).resolve().parent
     command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
     try:
-        found = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
+        described = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
     except (OSError, subprocess.TimeoutExpired):
         return ""
-    return found.stdout.strip() if found.returncode == 0 else ""
+    return described.stdout.strip() if described.returncode == 0 else ""

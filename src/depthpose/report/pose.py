@@ -256,15 +256,15 @@ class PoseShown:
 
 def pose_section(title: str, shown: PoseShown, text: str = "", rows: Sequence[Row] = ()) -> Section:
     """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D."""
-    found, model = shown.estimate, shown.model
+    estimate, model = shown.estimate, shown.model
     points_m = object_points(shown.given, model.diameter_m)
-    scene = pose_scene(shown.given, points_m, found, model, shown.truth)
+    scene = pose_scene(shown.given, points_m, estimate, model, shown.truth)
     return Section(
         title=title,
-        text=f"{text} {pose_sentence(found)}".strip(),
-        facts=pose_facts(found, model),
+        text=f"{text} {pose_sentence(estimate)}".strip(),
+        facts=pose_facts(estimate, model),
         rows=rows,
-        tables=pose_tables(found),
+        tables=pose_tables(estimate),
         pictures=_drawings(shown),
         scenes=[scene],
     )
@@ -443,16 +443,16 @@ def _drawings(shown: PoseShown) -> list[Drawing]:
     if not isinstance(view, ViewInput):
         return []
     image = grey_depth(view.depth_m) if shown.image is None else shown.image
-    truth, found = shown.truth, shown.estimate.camera_from_model
+    truth, pose = shown.truth, shown.estimate.camera_from_model
     what = "depth image, near bright" if shown.image is None else "picture"
-    if found is None:
+    if pose is None:
         image = draw_outline(image, view.mask, _MASKED)
-    said = "the estimated pose blue" if found is not None else "the border of the mask yellow"
+    said = "the estimated pose blue" if pose is not None else "the border of the mask yellow"
     said += ", the box of the truth green and dashed" if truth is not None else ""
-    whole = draw_boxes(image, truth, found, shown.model, view.K)
+    whole = draw_boxes(image, truth, pose, shown.model, view.K)
     drawings = [Drawing(image=whole, caption=f"{what}; {said}")]
     if bool(view.mask.any()):
         near, K = close_up(image, view.mask, view.K)
-        near = draw_boxes(near, truth, found, shown.model, K)
+        near = draw_boxes(near, truth, pose, shown.model, K)
         drawings.append(Drawing(image=near, caption=f"the object from near by; {said}"))
     return drawings

@@ -476,8 +476,8 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 def taken_address(taken: socket.socket) -> IPv4Address | IPv6Address:
     """Give the address that was taken, however it was written."""
-    found = ip_address(taken.getsockname()[0])
-    return found.ipv4_mapped or found if isinstance(found, IPv6Address) else found
+    address = ip_address(taken.getsockname()[0])
+    return address.ipv4_mapped or address if isinstance(address, IPv6Address) else address
 
 
 def known_names(host: str, address: IPv4Address | IPv6Address) -> tuple[str, ...] | None:

@@ -60,21 +60,21 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "'depthpose serve' with --weights that have a matcher"
         )
     _refuse_work(pair, net)
-    found = net.estimate_pair(pair)
+    estimate = net.estimate_pair(pair)
     seconds = time.perf_counter() - began
-    assert found.depth_m is not None
+    assert estimate.depth_m is not None
     folder = form.results()
-    write_estimate(folder, pair, found, (near_m, far_m), far_m)
+    write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    pictures = _pictures(pair, found, (near_m, far_m))
-    if found.confidence is not None:
-        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - found.confidence))
+    pictures = _pictures(pair, estimate, (near_m, far_m))
+    if estimate.confidence is not None:
+        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
     return Answer(
         is_ok=True,
-        said=_sentence(pair, found),
-        facts=[*depth_facts(pair, found, focal), ("computed in", f"{seconds:.2f} s")],
+        said=_sentence(pair, estimate),
+        facts=[*depth_facts(pair, estimate, focal), ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
-        scene=depth_scene(pair, found, far_m),
+        scene=depth_scene(pair, estimate, far_m),
         terms=net.terms,
         files=read_files(folder),
     )
@@ -181,7 +181,7 @@ def _pictures(pair: StereoInput, found: DepthEstimate, range_m: tuple[float, flo
 def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
     assert found.depth_m is not None
     known_m = found.depth_m[found.depth_m.isfinite()]
-    given = "one image" if pair.right is None else "both images"
+    images = "one image" if pair.right is None else "both images"
     is_sky = found.is_sky
     sky = 0.0 if is_sky is None else float(is_sky.float().mean())
     warning = f"Careful: {found.warning}. " if found.warning else ""
@@ -189,11 +189,11 @@ def _sentence(pair: StereoInput, found: DepthEstimate) -> str:
         why = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
         if pair.right is not None and sky < _ALL_SKY:
             why = ": is the pair rectified, and are left and right as they should be?"
-        return f"{warning}No pixel got a depth from {given}{why}"
+        return f"{warning}No pixel got a depth from {images}{why}"
     share, middle_m = len(known_m) / found.depth_m.numel(), float(known_m.median())
     return (
-        f"{warning}Depth from {given} for {share:.0%} of the pixels; half of these are nearer than "
-        f"{middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
+        f"{warning}Depth from {images} for {share:.0%} of the pixels; half of these are nearer "
+        f"than {middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
     )
 
 

@@ -78,37 +78,37 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         InputError: a file that cannot be read, or an object that is unknown.
     """
     target = _target(form, net)
-    given = _input(form, target.model)
-    found = voted = None
+    seen = _input(form, target.model)
+    estimate = voted = None
     if "depth" in form.files and "mask" not in form.files:
         # Without a mask the object is searched for; the mask is what its best pose explains.
-        assert isinstance(given, ViewInput)
-        answers = target.net.find_in(given, [target.model.name])
-        found = nothing_found(given, target.model.name)
+        assert isinstance(seen, ViewInput)
+        answers = target.net.find_in(seen, [target.model.name])
+        estimate = nothing_found(seen, target.model.name)
         if answers:
-            found = replace(answers[0], name=given.name)
-            assert found.camera_from_model is not None
-            mask = explained_mask(given, found.camera_from_model, target.model)
-            given = replace(given, mask=mask)
-    points_m = object_points(given, target.model.diameter_m)
-    if found is None and isinstance(target.net, GeoPoseNet):
-        found, voted = target.net.estimate_with_votes(given)
-    elif found is None:
-        found = target.net.estimate_many([given])[0]
+            estimate = replace(answers[0], name=seen.name)
+            assert estimate.camera_from_model is not None
+            mask = explained_mask(seen, estimate.camera_from_model, target.model)
+            seen = replace(seen, mask=mask)
+    points_m = object_points(seen, target.model.diameter_m)
+    if estimate is None and isinstance(target.net, GeoPoseNet):
+        estimate, voted = target.net.estimate_with_votes(seen)
+    elif estimate is None:
+        estimate = target.net.estimate_many([seen])[0]
     if (least := form.number("min_certainty")) is not None:
-        found = with_status(found, EstimateConfig(min_certainty=least).min_certainty)
-    scene = pose_scene(given, points_m, found, target.model)
-    if found.keypoints_m is not None and voted is not None:
-        votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], found.keypoints_m)
+        estimate = with_status(estimate, EstimateConfig(min_certainty=least).min_certainty)
+    scene = pose_scene(seen, points_m, estimate, target.model)
+    if estimate.keypoints_m is not None and voted is not None:
+        votes = vote_layer(voted.cloud.points_m, voted.outputs[..., :3], estimate.keypoints_m)
         scene = replace(scene, layers=[*scene.layers, votes])
     folder = form.results()
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
     return Answer(
-        is_ok=found.is_posed,
-        said=pose_sentence(found),
-        facts=pose_facts(found, target.model, target.how, agreeing),
-        tables=pose_tables(found),
-        pictures=_write(folder, given, points_m, found, target.model),
+        is_ok=estimate.is_posed,
+        said=pose_sentence(estimate),
+        facts=pose_facts(estimate, target.model, target.how, agreeing),
+        tables=pose_tables(estimate),
+        pictures=_write(folder, seen, points_m, estimate, target.model),
         scene=scene,
         terms=net.terms if target.net is net else "",
         files=read_files(folder),

@@ -95,17 +95,17 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
     Raises:
         InputError: a value missing or not a number, or ``cam1`` contradicts the others.
     """
-    found = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
+    values = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE))
     try:
         K, right = (
             np.array(re.sub(r"[\[\];,]", " ", text).split(), np.float64).reshape(3, 3)
-            for text in (found["cam0"], found.get("cam1", found["cam0"]))
+            for text in (values["cam0"], values.get("cam1", values["cam0"]))
         )
         size = (
-            _whole({"width": float(found["width"])}, "width"),
-            _whole({"height": float(found["height"])}, "height"),
+            _whole({"width": float(values["width"])}, "width"),
+            _whole({"height": float(values["height"])}, "height"),
         )
-        baseline_mm, difference_px = float(found["baseline"]), float(found["doffs"])
+        baseline_mm, difference_px = float(values["baseline"]), float(values["doffs"])
     except KeyError as error:
         raise InputError(
             f"{path}: has no line {error.args[0]}=...; a Middlebury calib.txt holds cam0, doffs, "
@@ -115,7 +115,7 @@ def middlebury_facts(path: AnyPath, text: str) -> CameraFacts:
         raise InputError(f"{path}: not a Middlebury calibration ({error}).") from error
     refuse_apart(K, right)
     apart_px = right[0, 2] - K[0, 2]
-    if "cam1" in found and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
+    if "cam1" in values and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
         raise InputError(
             f"{path}: doffs is {difference_px:g}, but cx of cam1 less that of cam0 is {apart_px:g}"
             "; write the true one of the two"
@@ -199,12 +199,12 @@ def _kitti_facts(path: AnyPath) -> CameraFacts:
 
 def _colmap_facts(text: str) -> CameraFacts:
     """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
-    found = {match.groups() for match in _COLMAP.finditer(text)}
-    if len(found) > 1:
+    cameras = {match.groups() for match in _COLMAP.finditer(text)}
+    if len(cameras) > 1:
         raise InputError(
-            f"a cameras.txt of COLMAP with {len(found)} different cameras; keep the line of one"
+            f"a cameras.txt of COLMAP with {len(cameras)} different cameras; keep the line of one"
         )
-    model, width, height, listed = found.pop()
+    model, width, height, listed = cameras.pop()
     values = [float(word) for word in listed.split()]
     if model.startswith(("SIMPLE_", "RADIAL")):
         values.insert(0, values[0])
@@ -564,11 +564,11 @@ def choose_lens(
     """
     fov = None if fov_deg is None else FieldOfView(fov_deg)
     named = {"camera": camera, "focal_px": focal_px, "fov_deg": fov}
-    given = {name: lens for name, lens in named.items() if lens is not None}
-    if len(given) > 1:
-        first, second = list(given)[:2]
+    chosen = {name: lens for name, lens in named.items() if lens is not None}
+    if len(chosen) > 1:
+        first, second = list(chosen)[:2]
         raise InputError(f"{first} and {second} are both given; omit one of the two")
-    return next(iter(given.values()), None)
+    return next(iter(chosen.values()), None)
 
 
 def centred_camera(size: Size, focal_px: float) -> Camera:

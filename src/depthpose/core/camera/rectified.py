@@ -122,7 +122,7 @@ def check_rectified(
                 )
                 return RectificationReport(is_pair=False, message=said)
         corners = _find_corners(one)
-        places, found, alike = _match(one, other, corners)
+        places, matched, alike = _match(one, other, corners)
         if len(places) < _MIN_MATCHES:
             unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
             done = _what_was_done(one, other, corners)
@@ -136,7 +136,7 @@ def check_rectified(
                     "needed); give both views of one moment"
                 )
                 return replace(unlike, is_pair=False, message=said)
-        where, shift_px = _place_finely(left, right, places, found)
+        where, shift_px = _place_finely(left, right, places, matched)
     return _report(where, shift_px, len(corners), left.shape[-1], apart_px)
 
 
@@ -163,12 +163,12 @@ def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places,
         Those with a mutual match, their places there, and how many look like some place there,
         or like many.
     """
-    found, is_alike, is_sole = _search(source, target, corners)
+    matched, is_alike, is_sole = _search(source, target, corners)
     alike = int(is_alike.sum())
-    corners, found = corners[is_alike & is_sole], found[is_alike & is_sole]
-    back, is_alike, is_sole = _search(target, source, found)
+    corners, matched = corners[is_alike & is_sole], matched[is_alike & is_sole]
+    back, is_alike, is_sole = _search(target, source, matched)
     is_mutual = ((back - corners).abs() <= _RETURN_PX).all(-1) & is_alike & is_sole
-    return corners[is_mutual], found[is_mutual], alike
+    return corners[is_mutual], matched[is_mutual], alike
 
 
 def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
@@ -182,14 +182,16 @@ def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags,
     scores = functional.conv2d(target[None, None], patches[:, None])[0]
     scores = (scores / (side * deviation.clamp_min(1e-6))).where(deviation > _MIN_CONTRAST, -1)
     best, index = scores.flatten(1).max(1)
-    found = torch.stack([index % scores.shape[2], index // scores.shape[2]], -1)
+    best_place = torch.stack([index % scores.shape[2], index // scores.shape[2]], -1)
     # What is near the best is no rival.
     scores = functional.pad(scores, (_RIVAL_RADIUS,) * 4, value=-1.0)
     near = torch.arange(2 * _RIVAL_RADIUS + 1)
-    n = torch.arange(len(found))[:, None, None]
-    scores[n, found[:, 1, None, None] + near[:, None], found[:, 0, None, None] + near] = -1
+    n = torch.arange(len(best_place))[:, None, None]
+    scores[
+        n, best_place[:, 1, None, None] + near[:, None], best_place[:, 0, None, None] + near
+    ] = -1
     rival = scores.flatten(1).amax(1)
-    return found + _RADIUS, best > _MIN_SCORE, rival < _MAX_RIVAL * best
+    return best_place + _RADIUS, best > _MIN_SCORE, rival < _MAX_RIVAL * best
 
 
 def _windows(image: Grey, first: Places, side: int) -> Float[Tensor, "n side side"]:
@@ -248,9 +250,9 @@ def _what_was_done(one: Grey, other: Grey, corners: Places) -> str | None:
         if len(_match(one, back, some)[0]) >= _MIN_SOME:
             return f"the right image is {how} beside the left one; turn it back"
     for turn_deg, scale in _CHANGES:
-        places, found, _ = _match(one, _changed(other, -turn_deg, 1 / scale), some)
+        places, matched, _ = _match(one, _changed(other, -turn_deg, 1 / scale), some)
         if len(places) >= _MIN_SOME:
-            rest_deg, rest_scale, _ = _fit_rows(places, (found - places)[:, 1])
+            rest_deg, rest_scale, _ = _fit_rows(places, (matched - places)[:, 1])
             turn_deg += rest_deg  # noqa: PLW2901
             return (
                 f"the right image is turned by about {round(turn_deg)} degrees and scaled by about "

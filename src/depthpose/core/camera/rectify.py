@@ -227,7 +227,7 @@ def _kalibr_camera(names: Names, who: str, is_fisheye: bool | None) -> RawCamera
 
 
 def _first(names: Names, known: tuple[str, ...]) -> list[float] | None:
-    return next((found for name in known if (found := numbers(names.get(name)))), None)
+    return next((values for name in known if (values := numbers(names.get(name)))), None)
 
 
 def _kind(model: object, is_fisheye: bool | None) -> bool:

@@ -58,16 +58,16 @@ def named(content: Mapping[Any, Any]) -> Names:
 def matrix(names: Names, known: tuple[str, ...], count: int) -> np.ndarray | None:
     """Take the first matrix of ``count`` numbers among some names, in rows."""
     for name in known:
-        found = numbers(names.get(name))
-        if found is not None and len(found) == count:
-            return np.array(found).reshape(count // (4 if count > 9 else 3), -1)
+        values = numbers(names.get(name))
+        if values is not None and len(values) == count:
+            return np.array(values).reshape(count // (4 if count > 9 else 3), -1)
     return None
 
 
 def scalar(names: Names, name: str) -> float | None:
     """Take one number."""
-    found = numbers(names.get(name))
-    return None if found is None or len(found) != 1 else found[0]
+    values = numbers(names.get(name))
+    return None if values is None or len(values) != 1 else values[0]
 
 
 def numbers(value: object) -> list[float] | None:
@@ -78,12 +78,12 @@ def numbers(value: object) -> list[float] | None:
     else:
         words = words.split() if isinstance(words, str) else [words]
     try:
-        found = [float(word) for word in words if not isinstance(word, bool)]
+        floats = [float(word) for word in words if not isinstance(word, bool)]
     except (TypeError, ValueError, OverflowError):
         return None
-    if not np.isfinite(found).all():
+    if not np.isfinite(floats).all():
         raise InputError("a matrix of it holds NaN or infinity; calibrate again")
-    return found if found and len(found) == len(words) else None
+    return floats if floats and len(floats) == len(words) else None
 
 
 class _Loader(YamlLoader):
@@ -189,14 +189,14 @@ def read_two_files(folder: Path) -> tuple[Names, Names]:
     """
     with refused_as(folder, "folder", "check who may read it"):
         files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
-    found = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
-    if len(files) != 2 or None in found:
+    read = [read_storage(path, read_text(path, MAX_LIST_BYTES)) for path in files]
+    if len(files) != 2 or None in read:
         raise InputError(
             f"a folder with {len(files)} files of {', '.join(_SUFFIXES)}; a camera of two files is "
             "left.yaml and right.yaml of ROS, or intrinsics.yml and extrinsics.yml of OpenCV, in "
             "a folder of their own"
         )
-    first, second = (names for names in found if names is not None)
+    first, second = (names for names in read if names is not None)
     return first, second
 
 
@@ -280,10 +280,10 @@ def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | 
     """RealSense's fx, fy, ppx, ppy; or fx, fy, cx, cy."""
     is_realsense = "ppx" in names
     which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
-    found = [scalar(names, name) for name in which]
-    if None in found:
+    values = [scalar(names, name) for name in which]
+    if None in values:
         return None
-    fx, fy, cx, cy = found
+    fx, fy, cx, cy = values
     return CameraFacts(
         kind="a camera of RealSense" if is_realsense else "fx, fy, cx, cy",
         K=intrinsics(fx, fy, cx, cy),
@@ -318,7 +318,7 @@ def lens_of(names: Names) -> tuple[float, ...]:
     Raises:
         InputError: coefficients that are no numbers, which would be ignored silently.
     """
-    found = [scalar(names, name) for name in _DISTORTION_KEYS]
+    coefficients = [scalar(names, name) for name in _DISTORTION_KEYS]
     for name, value in names.items():
         is_list = name in _D or name.startswith(("distcoef", "distortioncoef"))
         if is_list or name.startswith("distortion"):
@@ -327,20 +327,20 @@ def lens_of(names: Names) -> tuple[float, ...]:
             some = numbers(list(value.values()) if is_named else value)
             if some is None and is_list and inner:
                 raise InputError(f"its {name} are no list of numbers; write [k1, k2, p1, p2, k3]")
-            found += some or []
-    return tuple(value for value in found if value is not None)
+            coefficients += some or []
+    return tuple(value for value in coefficients if value is not None)
 
 
 def published(names: Names, known: tuple[str, ...], count: int) -> np.ndarray | None:
     """Take a matrix as it is of the image that ROS publishes: cut to its ROI, then binned."""
-    found = matrix(names, known, count)
-    if found is None:
+    P = matrix(names, known, count)
+    if P is None:
         return None
     (left, top), _, (across, down) = _window(names)
-    found[:2] -= [[left], [top]] * found[2]
+    P[:2] -= [[left], [top]] * P[2]
     scale = np.array([[1 / across], [1 / down]])
-    found[:2] = found[:2] * scale + (scale / 2 - 0.5) * found[2]
-    return found
+    P[:2] = P[:2] * scale + (scale / 2 - 0.5) * P[2]
+    return P
 
 
 def _window(names: Names) -> tuple[Size, Size, Size]:

@@ -171,11 +171,11 @@ def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]
 
 def _finished(out: str) -> dict[str, Done]:
     """Read the records of shards; one that is damaged is as none."""
-    found: dict[str, Done] = {}
+    records: dict[str, Done] = {}
     for name, text in read_all(join(out, SHARDS), ".json").items():
         with suppress(ValueError, KeyError, TypeError):
-            found[name.removesuffix(".json")] = Done.from_json(text)
-    return found
+            records[name.removesuffix(".json")] = Done.from_json(text)
+    return records
 
 
 def _whole(out: str, blocks: Sequence[Block]) -> dict[str, Done]:

@@ -71,20 +71,20 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     """
     manifests = [word for word in words if is_manifest(word)]
     others = [word for word in words if not is_manifest(word)]
-    found = [item for word in manifests for item in _read_manifest(word, files.roles)]
+    items = [item for word in manifests for item in _read_manifest(word, files.roles)]
     if others and len(files.roles) > 1:
-        found += _pair(others, files)
+        items += _pair(others, files)
     else:
         listed = [url for word in others for url in list_files(word, files.suffixes)]
-        found += [Item(stem(url), (url,)) for url in listed]
-    _refuse_twice(found)
-    return found
+        items += [Item(stem(url), (url,)) for url in listed]
+    _refuse_twice(items)
+    return items
 
 
 def find_tars(words: Iterable[str]) -> list[str]:
     """List tar shards: files themselves, or those of a pattern."""
-    found = [url for word in words for url in list_files(word, TARS) if is_tar(url)]
-    return list(dict.fromkeys(found))
+    tars = [url for word in words for url in list_files(word, TARS) if is_tar(url)]
+    return list(dict.fromkeys(tars))
 
 
 def is_tar(word: str) -> bool:

@@ -363,11 +363,11 @@ def _tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[_Opened]:
         for member, data in read_tar(tar):
             path = PurePosixPath(member)
             start, _, ending = path.name.partition(".")
-            found = str(path.parent / start)
-            if found != key and key:
+            next_key = str(path.parent / start)
+            if next_key != key and key:
                 yield _grouped(tar, key, files, wanted)
                 files = {}
-            key = found
+            key = next_key
             role, suffix = _role(ending, wanted)
             if role is not None:
                 files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}{suffix}"
@@ -403,10 +403,10 @@ def _grouped(tar: str, key: str, files: dict[str, Path], wanted: Files) -> _Open
 
 def _take(results: Path, name: str, endings: Sequence[str]) -> dict[str, bytes]:
     """Take the files of one result out of the folder."""
-    found: dict[str, bytes] = {}
+    contents: dict[str, bytes] = {}
     for ending in endings:
         path = results / f"{name}.{ending}"
         if path.is_file():
-            found[ending] = path.read_bytes()
+            contents[ending] = path.read_bytes()
             path.unlink()
-    return found
+    return contents

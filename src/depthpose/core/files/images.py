@@ -62,8 +62,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
         InputError: the file is missing, damaged, too large or not a picture.
     """
     with opened_image(path) as image:
-        pixels = _decoded(path, image)
-    return _tensor_of(pixels, path)
+        return picture_tensor(image, path)
 
 
 def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
@@ -72,33 +71,22 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
     Raises:
         InputError: it has 32 bits a pixel, or its file is damaged.
     """
-    with refused_as(name, "picture", "give an intact one"):
-        pixels = _decoded(name, image)
-    return _tensor_of(pixels, name)
-
-
-def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
-    """Give RGB or grey, upright, of 8 or 16 bits."""
-    turn = _UPRIGHT.get(_orientation(image))
-    deep, low_bytes = _deep_ppm(image), _low_bytes(image)
-    if deep is not None:
-        return deep
-    parts = [image] if low_bytes is None else [image, low_bytes]
-    pixels, *low = (
-        _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
-    )
-    return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
-
-
-def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    with refused_as(name, "picture", "give an intact PNG or JPEG"):
+        pixels = _deep_ppm(image)
+        if pixels is None:
+            turn, low_bytes = _UPRIGHT.get(_orientation(image)), _low_bytes(image)
+            parts = [image] if low_bytes is None else [image, low_bytes]
+            pixels, *low = (
+                _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
+            )
+            pixels = pixels.astype(np.uint16) * 256 + low[0] if low else pixels
     # Channels are parted while a pixel is an integer: the floats are there once.
-    planes = pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
-    planes = np.ascontiguousarray(planes)
+    planes = np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
     if planes.dtype.itemsize == 2:
-        found = torch.from_numpy(from_16_bit(planes, name))
+        rgb = torch.from_numpy(from_16_bit(planes, name))
     else:
-        found = torch.from_numpy(planes.astype(np.float32)).div_(255)
-    return found.expand(3, -1, -1).contiguous()
+        rgb = torch.from_numpy(planes.astype(np.float32)).div_(255)
+    return rgb.expand(3, -1, -1).contiguous()
 
 
 def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
@@ -237,15 +225,15 @@ def list_images(path: AnyPath) -> list[Path]:
         if wanted.is_file():
             return [wanted]
         if wanted.is_dir():
-            found = list(wanted.iterdir())
+            files = list(wanted.iterdir())
         else:
             home, parts = Path(wanted.anchor), list(wanted.relative_to(wanted.anchor).parts)
             while len(parts) > 1 and (home / parts[0]).is_dir():  # its brackets are no pattern
                 home /= parts.pop(0)
-            found = [p for p in home.glob("/".join(parts)) if p.is_file()]
+            files = [p for p in home.glob("/".join(parts)) if p.is_file()]
     except (OSError, ValueError, NotImplementedError) as error:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
-    shown = (p for p in found if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
+    shown = (p for p in files if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
     pictures = sorted(shown, key=natural_order)
     if not pictures:
         raise InputError(

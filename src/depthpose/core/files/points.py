@@ -206,8 +206,8 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
             assert rows is not None
             columns = split_rows(path, rows, element.fields, element.count)
         elif rows is None:
-            found, used = _binary_lists(path, body, element, order)
-            body, lists = body[used:], lists | found
+            more_lists, used = _binary_lists(path, body, element, order)
+            body, lists = body[used:], lists | more_lists
         else:
             lists |= _text_lists(path, rows, element)
         if element.name == last:
@@ -228,7 +228,7 @@ def _binary_lists(
     what = f"{element.count} {element.name}"
     steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
              for f in element.fields]  # fmt: skip
-    found: list[Any] = []
+    runs: list[Any] = []
     known: dict[tuple[int, ...], np.dtype] = {}
     at, left, ahead = 0, element.count, 64
     while left:
@@ -257,14 +257,14 @@ def _binary_lists(
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
         is_equal = np.array([size == size[0] for size in sizes] or [[True]]).all(0)
         records = records if is_equal.all() else records[: int(is_equal.argmin())]
-        found.append(records)
-        if len(found) > _MOST_RUNS:
+        runs.append(records)
+        if len(runs) > _MOST_RUNS:
             raise InputError(f"{path}: {what} of ever other lengths; export triangles alone")
         at, left, ahead = at + records.nbytes, left - len(records), 2 * len(records) + 64
     return {
         f"{element.name} {f.name}": Ragged(
-            sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in found)]),
-            values=np.concatenate([np.empty(0, f.code), *(r[f.name].reshape(-1) for r in found)]),
+            sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in runs)]),
+            values=np.concatenate([np.empty(0, f.code), *(r[f.name].reshape(-1) for r in runs)]),
         )
         for f in element.fields
         if f.size_code

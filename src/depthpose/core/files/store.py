@@ -99,8 +99,8 @@ def join(folder: str, *names: str) -> str:
 
 def absolute(path: str) -> str:
     """Give a path that means the same in every process; URLs do already."""
-    found = local_path(path)
-    return path if found is None else str(found.absolute())
+    local = local_path(path)
+    return path if local is None else str(local.absolute())
 
 
 def read_from(url: str) -> bytes:
@@ -139,8 +139,8 @@ def read_all(folder: str, suffix: str) -> dict[str, bytes]:
     if path is not None:
         return {p.name: read_file(p) for p in sorted(path.glob(f"*{suffix}")) if _shown(p.name)}
     with _file_system(folder, "listed") as (fs, inner):
-        found = [e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix)]
-        contents = fs.cat(found) if found else {}
+        names = [e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix)]
+        contents = fs.cat(names) if names else {}
         return {PurePosixPath(p).name: contents[p] for p in sorted(contents)}
 
 
@@ -238,17 +238,17 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
     """
     with _file_system(path, "listed") as (fs, inner):
         if fs.isfile(inner):
-            found = [inner]
+            files = [inner]
         elif fs.isdir(inner) or not any(mark in inner for mark in "*?["):
-            found = [entry["name"] for entry in _details(fs, inner)]
+            files = [entry["name"] for entry in _details(fs, inner)]
         else:
             # Brackets in the name of a folder that is there stand for themselves.
             home, _, rest = inner.rpartition("/")
             while "[" in home and not fs.isdir(home):
                 home, _, last = home.rpartition("/")
                 rest = f"{last}/{rest}"
-            found = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
-    kept = [p for p in found if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
+            files = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
+    kept = [p for p in files if PurePosixPath(p).suffix.lower() in suffixes and _shown(p)]
     kept.sort(key=lambda p: natural_order(Path(p)))
     if not kept:
         raise InputError(

@@ -200,16 +200,16 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
         text = line.strip()
         if not text or text.startswith("#"):
             continue
-        found = _KEY_VALUE.fullmatch(text)
-        if found is None:
+        match = _KEY_VALUE.fullmatch(text)
+        if match is None:
             raise InputError(f"{path}: line {number}, {text[:60]!r}, is not 'KEY: numbers'")
-        if found[1] in values:
-            raise InputError(f"{path}: line {number} gives {found[1]!r} again; keep one of them")
-        numbers = _numbers(found[2])
+        if match[1] in values:
+            raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
+        numbers = _numbers(match[2])
         if not all(map(math.isfinite, numbers)):
-            raise InputError(f"{path}: line {number}, {found[1]!r}, holds NaN or infinity")
+            raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
         if numbers:
-            values[found[1]] = numbers
+            values[match[1]] = numbers
     return values
 
 

@@ -127,11 +127,11 @@ def _encode(
     finally:
         if writer is not None:
             writer.release()
-    found = _count_frames(cv2, part)  # the encoder does not report a full disk
-    if count == 0 or found != count:
+    readable = _count_frames(cv2, part)  # the encoder does not report a full disk
+    if count == 0 or readable != count:
         raise InputError(
-            f"{path}: the encoder wrote {found} of {count} frames; free the space if the disk is "
-            "full, else try .avi, or PNGs"
+            f"{path}: the encoder wrote {readable} of {count} frames; free the space if the disk "
+            "is full, else try .avi, or PNGs"
         )
     return count
 
