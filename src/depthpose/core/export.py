@@ -228,7 +228,7 @@ def measure_differences(
         for (name, expected), answer in zip(case.expected.items(), answers, strict=True):
             if name in case.where and answer.shape == expected.shape:
                 answer, expected = (m[case.where[name]] for m in (answer, expected))  # noqa: PLW2901
-            rows.append(_row(case.name, name, (answer, expected), limits[name]))
+            rows.append(_row(case.name, name, answer, expected, limits[name]))
     if not rows:
         raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
     return rows
@@ -250,8 +250,8 @@ def refuse_beyond(rows: Iterable[Row]) -> None:
             )
 
 
-def _row(case: str, output: str, pair: tuple[Any, np.ndarray], limit: Limit) -> Row:
-    answer, expected = (np.asarray(values, np.float64) for values in pair)
+def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit: Limit) -> Row:
+    answer, expected = (np.asarray(values, np.float64) for values in (answer, expected))
     is_nan = np.isnan(answer), np.isnan(expected)
     is_other = answer.shape != expected.shape
     if is_other or ((is_nan[0] != is_nan[1]).any() and not limit.flips):

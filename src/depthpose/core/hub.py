@@ -100,42 +100,32 @@ def readme_of(card: str, facts: Mapping[str, str]) -> str:
 def _explained(name: str) -> Iterator[None]:
     """Turn what the library raises into one error with a remedy."""
     errors = import_module("huggingface_hub.errors")
-    # Base classes of the library's errors: of requests, of httpx or its successor.
-    of_http = [k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins"]
+    remedies = {
+        errors.HFValidationError: "no name that the hub allows: {said}",
+        errors.GatedRepoError: "its owner asks for consent; give it on the repository's page, then "
+        "'hf auth login'.",
+        errors.RepositoryNotFoundError: "there is no such repository, or it is private: check the "
+        "name, or 'hf auth login' with an account that may read it.",
+        errors.RevisionNotFoundError: "the repository has no such revision.",
+        (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled): "the hub cannot be reached, "
+        "and it is not in the cache. Connect once, unset HF_HUB_OFFLINE, or copy the repository's "
+        "folder here and give its path.",
+        errors.EntryNotFoundError: f"the repository has no such file ({WEIGHTS_FILE} by default); "
+        "name it: hf://OWNER/NAME/FILE.safetensors.",
+        # Of the connection, of access, of a full disk. Base classes of the library's errors: of
+        # requests, of httpx or its successor.
+        (OSError, *(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")): (
+            "the hub refused: {said}. To upload, 'hf auth login' first."
+        ),
+    }
     try:
         yield
-    except errors.HFValidationError as error:
-        raise InputError(f"{name}: no name that the hub allows: {_short(error)}") from error
-    except errors.GatedRepoError as error:
-        raise InputError(
-            f"{name}: its owner asks for consent; give it on the repository's page, then "
-            "'hf auth login'."
-        ) from error
-    except errors.RepositoryNotFoundError as error:
-        raise InputError(
-            f"{name}: there is no such repository, or it is private: check the name, or "
-            "'hf auth login' with an account that may read it."
-        ) from error
-    except errors.RevisionNotFoundError as error:
-        raise InputError(f"{name}: the repository has no such revision.") from error
-    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
-        raise InputError(
-            f"{name}: the hub cannot be reached, and it is not in the cache. Connect once, unset "
-            "HF_HUB_OFFLINE, or copy the repository's folder here and give its path."
-        ) from error
-    except errors.EntryNotFoundError as error:
-        raise InputError(
-            f"{name}: the repository has no such file ({WEIGHTS_FILE} by default); name it: "
-            "hf://OWNER/NAME/FILE.safetensors."
-        ) from error
-    except (OSError, *of_http) as error:  # of the connection, of access, of a full disk
-        raise InputError(
-            f"{name}: the hub refused: {_short(error)}. To upload, 'hf auth login' first."
-        ) from error
-
-
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    except Exception as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        for kinds, remedy in remedies.items():
+            if isinstance(error, kinds):
+                raise InputError(f"{name}: {remedy.replace('{said}', said)}") from error
+        raise
 
 
 SHIPPED = Path(__file__).parents[1] / "weights"
