@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from depthpose.core.loop import (
     AdamConfig,
     LoopConfig,
+    Run,
     Update,
     ValidationResult,
     make_adam,
     sample_generator,
     shuffled_index,
-    train,
 )
 
 ADAM = AdamConfig(learning_rate=0.01, schedule="cosine")
@@ -86,4 +86,4 @@ if __name__ == "__main__":
     if sys.argv[6:] == ["slow disk"]:
         Path.write_bytes = write_slowly  # pyright: ignore[reportAttributeAccessIssue]
     toy = ToyTask(pause_s)
-    train(toy, ToySamples(), config, folder, resume=True)
+    Run(folder=folder, resume=True).train(toy, ToySamples(), config)

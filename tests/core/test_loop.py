@@ -23,13 +23,13 @@ from depthpose.core.loop import (
     Interrupted,
     LoopConfig,
     Progress,
+    Run,
     ValidationResult,
     card_text,
     held_out_text,
     read_metrics,
     sample_generator,
     shuffled_index,
-    train,
     write_card,
 )
 from depthpose.core.loop.loop import Precision
@@ -45,7 +45,8 @@ def loop(**changes: object) -> LoopConfig:
 
 def trained(folder: Path, config: LoopConfig, **words: object) -> ToyTask:
     task = ToyTask()
-    train(task, ToySamples(), config, folder, **words)  # pyright: ignore[reportArgumentType]
+    run = Run(folder=folder, **words)  # pyright: ignore[reportArgumentType]
+    run.train(task, ToySamples(), config)
     return task
 
 
@@ -160,10 +161,10 @@ def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) 
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     assert 0 < state["seconds"] < 1000
     torch.save({**state, "seconds": 1000.0}, tmp_path / "state.pt")
-    assert train(ToyTask(), ToySamples(), loop(), tmp_path, resume=True) > 1000
+    assert Run(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) > 1000
     del state["seconds"]  # as older versions left it
     torch.save(state, tmp_path / "state.pt")
-    assert 0 < train(ToyTask(), ToySamples(), loop(), tmp_path, resume=True) < 1000
+    assert 0 < Run(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) < 1000
 
 
 def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
@@ -220,7 +221,7 @@ def test_gradients_are_clipped_where_asked(tmp_path: Path, limit: float | None) 
         norms.append(float(torch.cat(grads).norm()))
 
     optimizer.register_step_pre_hook(note)
-    train(task, ToySamples(), loop(clip_norm=limit), tmp_path)
+    Run(folder=tmp_path).train(task, ToySamples(), loop(clip_norm=limit))
     assert len(norms) == 12
     assert (max(norms) <= 0.05 * 1.001) == (limit is not None)
 
@@ -276,7 +277,7 @@ def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
 
     average = weights(task)["discriminator.weight"].clone()
     config = loop(steps=6, ema_decay=0.8, validate_every_steps=100)
-    train(task, ToySamples(), config, tmp_path, on_step=note)
+    Run(folder=tmp_path, on_step=note).train(task, ToySamples(), config)
     for step, weight in enumerate(path):
         decay = min(0.8, (1 + step) / (10 + step))
         average = decay * average + (1 - decay) * weight
@@ -293,7 +294,7 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path: Path) -> N
     plain = trained(tmp_path / "plain", loop(ema_decay=0.8, validate_every_steps=100))
     task = Watched()
     config = loop(ema_decay=0.8, validate_every_steps=5)
-    train(task, ToySamples(), config, tmp_path / "watched")
+    Run(folder=tmp_path / "watched").train(task, ToySamples(), config)
     assert_equal(weights(plain), weights(task))
     three = trained(tmp_path / "five", loop(steps=12, ema_decay=0.8), on_step=None)
     assert len(seen) == 3
@@ -440,7 +441,7 @@ def test_the_state_of_another_training_is_explained(tmp_path: Path, name: str) -
 
 def test_a_loss_that_is_not_finite_stops_with_advice(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"loss is inf at step 0\. Start anew in another folder"):
-        train(ToyTask(factor=float("inf")), ToySamples(), loop(), tmp_path)
+        Run(folder=tmp_path).train(ToyTask(factor=float("inf")), ToySamples(), loop())
 
 
 def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
@@ -449,7 +450,7 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
             return 0
 
     with pytest.raises(InputError, match="no sample to train on"):
-        train(ToyTask(), Nothing(), loop(), tmp_path)
+        Run(folder=tmp_path).train(ToyTask(), Nothing(), loop())
 
 
 def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:

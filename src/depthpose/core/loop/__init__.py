@@ -10,7 +10,6 @@ from depthpose.core.loop.loop import Interrupted as Interrupted
 from depthpose.core.loop.loop import Progress as Progress
 from depthpose.core.loop.loop import Run as Run
 from depthpose.core.loop.loop import releases_folder as releases_folder
-from depthpose.core.loop.loop import train as train
 from depthpose.core.loop.task import AdamConfig as AdamConfig
 from depthpose.core.loop.task import LoopConfig as LoopConfig
 from depthpose.core.loop.task import Samples as Samples

@@ -66,9 +66,6 @@ class Progress:
     numbers: dict[str, float]
 
 
-_OnStep = Callable[[Progress], None] | None
-
-
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """Folder of a training, and callbacks.
@@ -120,9 +117,38 @@ class Run:
         write_config(self.folder / "config.yaml", config)
 
     def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
-        """Train in the folder, as :func:`depthpose.core.loop.train`; give the seconds it took."""
-        return train(task, samples, config, self.folder, resume=self.resume, finish=self.finish,
-                     on_step=self.on_step)  # fmt: skip
+        """Train ``task`` in the folder until its last step; its modules hold the result.
+
+        A resumed training goes on from the folder's last state; if that is damaged, with a notice
+        from the one before. The result equals that of an uninterrupted run. Under ``accelerate
+        launch`` every process calls this; batch norm statistics are rank 0's.
+
+        Args:
+            task: what is trained.
+            samples: training samples by index.
+            config: how long and how.
+
+        Returns:
+            What it took, in seconds, together with the runs that it resumed.
+
+        Raises:
+            InputError: nothing to train on, a folder with a state and no ``resume``, states that
+                are all damaged or of another network, a precision that this machine lacks, or a
+                loss that is no longer finite.
+            Interrupted: asked to stop; the state is saved first.
+        """
+        if not len(samples):
+            raise InputError("there is no sample to train on; the dataset is empty.")
+        is_resumed = self.resume or self.finish
+        training = _Training(task, samples, config, self.folder, resume=is_resumed)
+        if self.finish and not training.step:
+            raise InputError(
+                f"{self.folder}: holds no state of a training, so there is none to finish."
+            )
+        training.steps = training.step if self.finish else training.steps
+        with StopRequest() as request:
+            training.take_steps(self.on_step, request)
+        return training.seconds
 
 
 def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
@@ -137,50 +163,6 @@ def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config,
             release_folders(but=before)
 
     return run_stage
-
-
-def train(
-    task: Task,
-    samples: Samples,
-    config: LoopConfig,
-    folder: Path,
-    *,
-    resume: bool = False,
-    finish: bool = False,
-    on_step: Callable[[Progress], None] | None = None,
-) -> float:
-    """Train ``task`` until its last step; its modules hold the result.
-
-    Under ``accelerate launch`` every process calls this; batch norm statistics are rank 0's.
-
-    Args:
-        task: what is trained.
-        samples: training samples by index.
-        config: how long and how.
-        folder: the run folder.
-        resume: go on from the folder's last state; if it is damaged, with a notice from the one
-            before. The result equals that of an uninterrupted run.
-        finish: make weights of that state, without further steps.
-        on_step: called after each step, in the main process.
-
-    Returns:
-        What it took, in seconds, together with the runs that it resumed.
-
-    Raises:
-        InputError: nothing to train on, a folder with a state and no ``resume``, states that are
-            all damaged or of another network, a precision that this machine lacks, or a loss that
-            is no longer finite.
-        Interrupted: asked to stop; the state is saved first.
-    """
-    if not len(samples):
-        raise InputError("there is no sample to train on; the dataset is empty.")
-    training = _Training(task, samples, config, folder, resume=resume or finish)
-    if finish and not training.step:
-        raise InputError(f"{folder}: holds no state of a training, so there is none to finish.")
-    training.steps = training.step if finish else training.steps
-    with StopRequest() as request:
-        training.take_steps(on_step, request)
-    return training.seconds
 
 
 class _Training:
@@ -225,7 +207,9 @@ class _Training:
         """What it took until now, with the runs before this one."""
         return time.monotonic() - self.began
 
-    def take_steps(self, on_step: _OnStep, request: "StopRequest") -> None:
+    def take_steps(
+        self, on_step: Callable[[Progress], None] | None, request: "StopRequest"
+    ) -> None:
         """Take the remaining steps; if asked to finish, the current step is the last."""
         batches = self._batches()
         while self.step < self.steps:
