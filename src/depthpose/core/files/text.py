@@ -140,14 +140,21 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     unfinished: list[tuple[str | None, int]] = []
     with suppress(yaml.YAMLError):
         for event in yaml.parse(text, YamlLoader):
-            if isinstance(event, yaml.CollectionStartEvent):
-                unfinished.append((event.anchor, 1))
-                if len(unfinished) > _MOST_DEPTH:
-                    raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; correct it")
-                continue
-            if isinstance(event, yaml.AliasEvent) and event.anchor not in sizes:
-                raise InputError(f"{path}: refers to itself (*{event.anchor}); write it out")
-            anchor, size = _finished(event, sizes, unfinished)
+            anchor, size = getattr(event, "anchor", None), 0
+            match event:
+                case yaml.CollectionStartEvent():
+                    unfinished.append((anchor, 1))
+                    if len(unfinished) > _MOST_DEPTH:
+                        raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; correct it")
+                    continue
+                case yaml.CollectionEndEvent():
+                    anchor, size = unfinished.pop()
+                case yaml.AliasEvent():
+                    if anchor not in sizes:
+                        raise InputError(f"{path}: refers to itself (*{anchor}); write it out")
+                    anchor, size = None, sizes[anchor]
+                case yaml.ScalarEvent():
+                    size = 1
             if anchor is not None:
                 sizes[anchor] = size
             if unfinished:
@@ -157,17 +164,6 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                     f"{path}: its references (*name) make more than {_MOST_VALUES} values of it; "
                     "write them out"
                 )
-
-
-def _finished(
-    event: yaml.Event, sizes: dict[str, int], unfinished: list[tuple[str | None, int]]
-) -> tuple[str | None, int]:
-    """Give the name of what ends with an event, if it has one, and how many values it holds."""
-    if isinstance(event, yaml.CollectionEndEvent):
-        return unfinished.pop()
-    if isinstance(event, yaml.AliasEvent):
-        return None, sizes[event.anchor]
-    return (event.anchor, 1) if isinstance(event, yaml.ScalarEvent) else (None, 0)
 
 
 def write_json(path: AnyPath, obj: object) -> None:
