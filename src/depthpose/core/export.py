@@ -267,12 +267,9 @@ def _row(case: str, output: str, answer: np.ndarray, expected: np.ndarray, limit
     difference = difference[~np.isnan(difference)]
     flipped: Row = {}
     if limit.flips:
-        # Give the differences within the limit, and the share of those beyond it.
-        is_kept = difference <= limit.value
-        difference, share = (
-            difference[is_kept],
-            1.0 - float(is_kept.mean()) if is_kept.size else 0.0,
-        )
+        is_within = difference <= limit.value
+        difference = difference[is_within]
+        share = 1.0 - float(is_within.mean()) if is_within.size else 0.0
         if share > limit.flips:
             raise InputError(
                 f"{output} of {case}: PyTorch and onnxruntime differ by more than {limit.value:g} "
@@ -381,8 +378,8 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
             verbose=False,
         )
     assert program is not None
-    # Drop what identifies the exporting machine: stack traces, paths, names of lines.
     model = onnx.inliner.inline_local_functions(program.model_proto)
+    # Stack traces, paths and names of lines would identify the exporting machine.
     for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
         del part.metadata_props[:]
         part.doc_string = ""

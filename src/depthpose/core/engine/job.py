@@ -22,7 +22,7 @@ import numpy as np
 
 from depthpose.core.engine.plan import PLAN, Block, Item, make_plan
 from depthpose.core.engine.work import SHARDS, Done, Runner, ShardFormat, Work, read_shard
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.core.errors import InputError, MissingExtraError, import_extra
 from depthpose.core.files import remove_parts
 from depthpose.core.files.store import (
     absolute,
@@ -92,10 +92,8 @@ def run_job(job: Job, engine: Engine) -> list[Done]:
             f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
             "again: what is finished is kept"
         )
-    # Remove what killed workers left; all have ended.
-    folder = local_path(join(out, SHARDS))
-    if folder is not None:
-        remove_parts(folder)
+    if (folder := local_path(join(out, SHARDS))) is not None:
+        remove_parts(folder)  # of killed workers: all have ended
     every = [done[block.shard] for block in blocks]
     _write_manifest(out, every)
     return every
@@ -265,7 +263,8 @@ class RayEngine:
         if self.address is None:
             _keep_to_this_machine()
         ray = _import_ray()
-        with _connected(ray, self.address, self._cores_here()):
+        cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
+        with _connected(ray, self.address, cores):
             # In a list the work stays a reference, which a worker that starts again reads again.
             shipped = [ray.put(work)]
             lines = [{"block": block.to_json()} for block in blocks]
@@ -290,9 +289,6 @@ class RayEngine:
                     yield Done.from_json(row["done"])
             except ray.exceptions.RayError as error:
                 raise _cause(error) from error
-
-    def _cores_here(self) -> float | None:
-        return None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
 
     def _capacity(self, ray: Any) -> int:  # noqa: ANN401  Ray is loaded where it is used
         """Say how many workers fit into the cluster."""
@@ -327,7 +323,10 @@ def _connected(ray: Any, address: str | None, cores: float | None) -> Iterator[N
     if is_ours:
         here = {"num_cpus": cores, "include_dashboard": False} if address is None else {}
         try:
-            _refuse_unreachable(address)
+            host, _, port = (address or "").rpartition(":")
+            if host and "/" not in host and port.isdecimal():
+                # Ray waits for minutes where nothing answers.
+                socket.create_connection((host, int(port)), timeout=10).close()
             ray.init(address=address or "local", **here)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(
@@ -339,13 +338,6 @@ def _connected(ray: Any, address: str | None, cores: float | None) -> Iterator[N
     finally:
         if is_ours:
             ray.shutdown()
-
-
-def _refuse_unreachable(address: str | None) -> None:
-    """Connect to HOST:PORT first: Ray waits for minutes where nothing answers."""
-    host, _, port = (address or "").rpartition(":")
-    if host and "/" not in host and port.isdecimal():
-        socket.create_connection((host, int(port)), timeout=10).close()
 
 
 def _cause(error: BaseException) -> BaseException:
@@ -377,11 +369,8 @@ def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
         MissingExtraError: it is not installed, or too old to ask for a password.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import_module("ray.data")
-        ray = import_module("ray")
-    except ImportError as error:
-        raise MissingExtraError("ray[data]", "ray", "--engine ray") from error
+    import_extra("ray.data", "ray[data]", "ray", "--engine ray")
+    ray = import_module("ray")
     if tuple(map(int, ray.__version__.split(".")[:2])) < _LEAST_VERSION:
         raise MissingExtraError(
             f"ray[data] 2.52 or later, not {ray.__version__}, which lets anybody in", "ray",
