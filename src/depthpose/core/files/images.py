@@ -62,7 +62,8 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
         InputError: the file is missing, damaged, too large or not a picture.
     """
     with opened_image(path) as image:
-        return picture_tensor(image, path)
+        pixels = _decoded(path, image)
+    return _tensor_of(pixels, path)
 
 
 def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
@@ -71,15 +72,26 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
     Raises:
         InputError: it has 32 bits a pixel, or its file is damaged.
     """
-    with refused_as(name, "picture", "give an intact PNG or JPEG"):
-        pixels = _deep_ppm(image)
-        if pixels is None:
-            turn, low_bytes = _UPRIGHT.get(_orientation(image)), _low_bytes(image)
-            parts = [image] if low_bytes is None else [image, low_bytes]
-            pixels, *low = (
-                _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
-            )
-            pixels = pixels.astype(np.uint16) * 256 + low[0] if low else pixels
+    with refused_as(name, "picture", "give an intact one"):
+        pixels = _decoded(name, image)
+    return _tensor_of(pixels, name)
+
+
+def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
+    """Give RGB or grey, upright, of 8 or 16 bits."""
+    turn = _UPRIGHT.get(_orientation(image))
+    deep, low_bytes = _deep_ppm(image), _low_bytes(image)
+    if deep is not None:
+        return deep
+    parts = [image] if low_bytes is None else [image, low_bytes]
+    pixels, *low = (
+        _rgb_or_grey(name, one if turn is None else one.transpose(turn)) for one in parts
+    )
+    return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
+
+
+def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    """Bring pixels to RGB in [0, 1]: apart from decoding, during which warnings are silenced."""
     # Channels are parted while a pixel is an integer: the floats are there once.
     planes = np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
     if planes.dtype.itemsize == 2:
