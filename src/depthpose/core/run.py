@@ -201,13 +201,21 @@ def wait_for(
 def environment() -> dict[str, str]:
     """Say what a number was measured with: versions, device, threads, commit, date."""
     facts = {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "python": platform.python_version()}
-    facts |= {name: found for name in _PACKAGES if (found := _version(name))}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            facts[name] = version(name)
     facts["machine"] = (
         f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
     )
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
-    return facts | ({"commit": found} if (found := _commit()) else {})
+    here = str(Path(__file__).resolve().parent)
+    command = ["git", "-C", here, "describe", "--always", "--dirty", "--exclude", "*"]
+    with suppress(OSError, subprocess.TimeoutExpired):
+        commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
+        if commit.returncode == 0 and commit.stdout.strip():
+            facts["commit"] = commit.stdout.strip()
+    return facts
 
 
 def claim_folder(
@@ -458,21 +466,3 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         is_nested = isinstance(value, Mapping)
         flat |= _flat(value, f"{prefix}{name}.") if is_nested else {f"{prefix}{name}": value}
     return flat
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
-
-
-def _commit() -> str:
-    """Commit of the source tree, where the package runs from one."""
-    here = Path(__file__).resolve().parent
-    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
-    try:
-        described = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return described.stdout.strip() if described.returncode == 0 else ""
