@@ -280,8 +280,8 @@ def _from_lengths(names: Names, distortion: tuple[float, ...]) -> CameraFacts | 
     """RealSense's fx, fy, ppx, ppy; or fx, fy, cx, cy."""
     is_realsense = "ppx" in names
     which = ("fx", "fy", "ppx", "ppy") if is_realsense else ("fx", "fy", "cx", "cy")
-    values = [scalar(names, name) for name in which]
-    if None in values:
+    values = [value for name in which if (value := scalar(names, name)) is not None]
+    if len(values) < len(which):
         return None
     fx, fy, cx, cy = values
     return CameraFacts(
