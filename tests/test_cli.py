@@ -11,7 +11,8 @@ import torch
 from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
-from depthpose.cli.help import refuse_missing
+from depthpose.cli.arguments import Source, WeightsName, refuse_missing
+from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
 from depthpose.depth.types import StereoInput
 
@@ -353,8 +354,17 @@ def test_an_option_without_a_path_is_not_the_current_folder(
 
 
 def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
-    refuse_missing({"images": ["left/*.png", "s3://bucket/left"], "weights": ["hf://me/mine"]})
-    refuse_missing({"weights": ("sgbm:default", "open3d"), "start": "nothing", "bop": None})
+    def command(images: tuple[Source, ...], bop: Path | None, start: WeightsName) -> int:
+        return len(images)
+
+    values = {"images": ("left/*.png", "s3://bucket/left"), "bop": None, "start": "hf://me/mine"}
+    refuse_missing(command, values)
+    for word in ("sgbm:default", "open3d", "nothing"):
+        refuse_missing(command, {"start": word})
+    with pytest.raises(InputError, match="there is no such file or folder"):
+        refuse_missing(command, {"bop": Path("nowhere")})
+    with pytest.raises(InputError, match="default"):
+        refuse_missing(command, {"start": "defalt"})
 
 
 @pytest.mark.parametrize(

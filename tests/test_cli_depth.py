@@ -22,8 +22,8 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth.matching import list_pairs
-from depthpose.cli.training import Lines
+from depthpose.cli.depth_match import list_pairs
+from depthpose.cli.train import Lines
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError

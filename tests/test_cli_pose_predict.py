@@ -25,9 +25,8 @@ from tests.pose.synthetic_objects import (
     view_of,
 )
 
-from depthpose.cli import main
-from depthpose.cli.pose import methods as pose_methods
-from depthpose.cli.pose.inputs import chosen_objects
+from depthpose.cli import main, pose_methods
+from depthpose.cli.pose_inputs import chosen_objects
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     Cloud,

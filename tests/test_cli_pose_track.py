@@ -11,9 +11,8 @@ from tests.pose.synthetic_frames import make_dataset
 from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, tiny_weights, view_of
 from tests.pose.test_track import moving
 
-from depthpose.cli import main
-from depthpose.cli.pose import methods as pose_methods
-from depthpose.cli.pose.inputs import cloud_jobs
+from depthpose.cli import main, pose_methods
+from depthpose.cli.pose_inputs import cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose.datasets.results import read_results

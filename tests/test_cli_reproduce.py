@@ -13,9 +13,9 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth.evaluating import signed
-from depthpose.cli.depth.methods import Method
-from depthpose.cli.thesis.depth import reproduce_table, write_figure
+from depthpose.cli.depth_evaluate import signed
+from depthpose.cli.depth_methods import Method
+from depthpose.cli.thesis_depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image

@@ -8,8 +8,7 @@ import pytest
 import yaml
 from tests.pose.synthetic_linemod import make_linemod
 
-from depthpose.cli import main
-from depthpose.cli.thesis import reproduce_all
+from depthpose.cli import main, thesis
 
 ADAM = {"learning_rate": 1e-3}
 LOOP = {"steps": 1, "batch_size": 2}
@@ -143,10 +142,10 @@ def test_a_step_that_fails_ends_it_and_says_its_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     steps = [
-        reproduce_all.Step("first", ("weights", "show", str(tmp_path / "no")), tmp_path / "a"),
-        reproduce_all.Step("second", ("weights", "list"), tmp_path / "b"),
+        thesis.Step("first", ("weights", "show", str(tmp_path / "no")), tmp_path / "a"),
+        thesis.Step("second", ("weights", "list"), tmp_path / "b"),
     ]
-    assert reproduce_all.walk(steps) == 2
+    assert thesis.walk(steps) == 2
     assert "[2/2]" not in capsys.readouterr().out
 
 

@@ -13,8 +13,7 @@ import pytest
 import torch
 from tests.pose.synthetic_objects import Oracle, bottle, bracket, cloud_of, pose_at, tiny_weights
 
-from depthpose.cli import main
-from depthpose.cli.pose import methods as pose_methods
+from depthpose.cli import main, pose_methods
 from depthpose.core.camera import Camera
 from depthpose.core.files import Cloud, write_cloud
 from depthpose.core.loop import Progress

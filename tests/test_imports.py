@@ -34,8 +34,17 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 def test_the_command_line_loads_nothing_heavy() -> None:
     assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & modules_after(
-        "import depthpose.cli.depth.commands, depthpose.cli.pose.commands"
+        "import depthpose.cli.depth, depthpose.cli.pose, depthpose.cli.train"
     )
+
+
+def test_a_command_loads_its_own_networks_alone() -> None:
+    loaded = modules_after("import depthpose.cli.depth, depthpose.cli.depth_match")
+    assert "depthpose.depth.estimator" in loaded
+    assert not {name for name in loaded if name.startswith("depthpose.pose")}
+    loaded = modules_after("import depthpose.cli.pose, depthpose.cli.pose_frames")
+    assert "depthpose.pose.estimator" in loaded
+    assert not {name for name in loaded if name.startswith("depthpose.depth")}
 
 
 def test_loading_weights_imports_no_compiler() -> None:

@@ -72,8 +72,11 @@ def place(imports: Imports) -> dict[str, tuple[float, float]]:
     for level in sorted(rows):
         y = (len(rows) - level - 0.5) * ROW_PX
         row = sorted(rows[level], key=lambda module: (_wish(imports[module], places), module))
-        step = WIDTH_PX / len(row)
-        places |= {module: ((k + 0.5) * step, y) for k, module in enumerate(row)}
+        gap = (WIDTH_PX - sum(map(_width, row))) / len(row)
+        left = gap / 2
+        for module in row:
+            places[module] = (left + _width(module) / 2, y)
+            left += _width(module) + gap
     return places
 
 
@@ -92,6 +95,11 @@ def draw(package: str) -> str:
         'orient="auto">'
         f'<path d="M0 0 8 4 0 8z"/></marker></defs>{groups}</svg>'
     )
+
+
+def _width(module: str) -> float:
+    """Pixels of a box, by its letters."""
+    return len(module.rsplit(".", 1)[-1]) * LETTER_PX + 14
 
 
 def _wish(imported: Set[str], places: Mapping[str, tuple[float, float]]) -> float:
@@ -120,8 +128,7 @@ def _arrow(start: tuple[float, float], end: tuple[float, float], kind: str) -> s
 
 
 def _box(module: str, x: float, y: float) -> str:
-    name = module.rsplit(".", 1)[-1]
-    width = len(name) * LETTER_PX + 14
+    name, width = module.rsplit(".", 1)[-1], _width(module)
     return (
         f'<rect x="{x - width / 2:.1f}" y="{y - BOX_PX / 2:.1f}" '
         f'width="{width:.1f}" height="{BOX_PX}" rx="4"/>'

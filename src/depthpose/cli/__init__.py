@@ -36,53 +36,53 @@ COMMANDS = {
     ),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": (
-        "pose.commands:predict",
+        "pose:predict",
         "a cloud, a masked depth image, or a data set, to poses",
     ),
-    "pose track": ("pose.track:track", "follow an object through depth images or clouds"),
-    "pose train": ("pose.training:train", "your CAD file, or a config, to a network that poses it"),
-    "pose evaluate": ("pose.commands:evaluate", "measure poses on a BOP or LineMOD data set"),
-    "depth match": ("depth.commands:match", "a real stereo pair, or many, to metric depth"),
-    "depth predict": ("depth.commands:predict", "one image, or many, or a video, to metric depth"),
+    "pose track": ("pose:track", "follow an object through depth images or clouds"),
+    "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
+    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
+    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "depth.training:train",
+        "train:train_depth",
         "stages view, select, stereo, adapt, finetune of generator and matcher",
     ),
     "depth calibrate": (
-        "depth.training:calibrate",
+        "train:calibrate",
         "set when an image is refused as out of distribution",
     ),
-    "depth evaluate": ("depth.commands:evaluate", "measure predictions by a named protocol"),
+    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (
-        "data.making:make_streets",
+        "data_make:make_streets",
         "synthetic streets with exact disparity and LiDAR, in KITTI's raw layout",
     ),
     "data make objects": (
-        "data.making:make_objects",
+        "data_make:make_objects",
         "synthetic frames of your CAD files on a table, in BOP's layout",
     ),
     "data rectify": (
-        "data.rectifying:rectify",
+        "data:rectify",
         "raw pairs and their calibration to rectified pairs that depth match takes",
     ),
     "data check": (
-        "data.commands:check",
+        "data:check",
         "read a whole data set and list what is wrong",
     ),
     "data label": (
-        "data.commands:label",
+        "data:label",
         "truth for pairs that have none, by a matcher, where both views agree",
     ),
     "data pack": (
-        "data.commands:pack",
+        "data:pack",
         "a data set as tar shards: few large files, from a disk or a store",
     ),
     "data export-depth": (
-        "data.commands:export_depth",
+        "data:export_depth",
         "predicted depth as COLMAP's and nerfstudio's files",
     ),
     "data duplicates": (
-        "data.commands:duplicates",
+        "data:duplicates",
         "find evaluation images that are in a training set",
     ),
     "weights list": ("weights:list_weights", "list the weights"),
@@ -97,29 +97,29 @@ COMMANDS = {
         "upload weights and their card to the Hugging Face hub",
     ),
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
-    "export depth": ("export:export_depth", "depth as an ONNX file, proven to agree"),
-    "export pose": ("export:export_pose", "the network of directions as an ONNX file"),
+    "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
+    "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
     "reproduce": (
-        "thesis.commands:reproduce",
+        "thesis:reproduce",
         "a table of chapter 2: published rows, ours, difference",
     ),
     "reproduce all": (
-        "thesis.reproduce_all:reproduce_all",
+        "thesis:reproduce_all",
         "all tables of a chapter, trainings included, from KITTI or LineMOD on disk",
     ),
     "reproduce 3.1": (
-        "thesis.commands:table_3_1",
+        "thesis:table_3_1",
         "the method beside its baselines, by object",
     ),
     "reproduce 3.2": (
-        "thesis.commands:table_3_2",
+        "thesis:table_3_2",
         "LineMOD: published rows, ours, difference",
     ),
-    "reproduce 3.3": ("thesis.commands:table_3_3", "RANSAC against least squares"),
-    "figure": ("thesis.commands:figure", "a figure of chapter 2 from your frames and weights"),
-    "figure 3-2": ("thesis.commands:figure_3_2", "features of points in one colour scale (t-SNE)"),
-    "figure 3-4": ("thesis.commands:figure_3_4", "true and predicted directions to a keypoint"),
-    "figure 3-5": ("thesis.commands:figure_3_5", "boxes of true and estimated poses"),
+    "reproduce 3.3": ("thesis:table_3_3", "RANSAC against least squares"),
+    "figure": ("thesis:figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": ("thesis:figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": ("thesis:figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("thesis:figure_3_5", "boxes of true and estimated poses"),
 }
 _REMOVED_OPTIONS = {
     ("export", "--format"): "ONNX is the one format; omit --format",
@@ -167,12 +167,12 @@ def main(words: Sequence[str] | None = None) -> int:
     return _fail(f"error: {lost}", code or 1)
 
 
-def _command(given: list[str]) -> int:
-    if given in (["--version"], ["-V"]):
+def _command(words: list[str]) -> int:
+    if words in (["--version"], ["-V"]):
         return _say_version()
-    name, rest = _split_command(given)
+    name, rest = _split_command(words)
     if name is None:
-        return _explain(given)
+        return _explain(words)
     lock = sys.modules.get("depthpose.core.run")  # not imported for --help
     before = lock.held_folders() if lock is not None else ()
     try:
@@ -240,12 +240,12 @@ def _notices_in_a_line() -> Iterator[None]:
         warnings.formatwarning = before
 
 
-def _split_command(given: list[str]) -> tuple[str | None, list[str]]:
+def _split_command(words: list[str]) -> tuple[str | None, list[str]]:
     for length in (3, 2, 1):
-        name = " ".join(given[:length])
+        name = " ".join(words[:length])
         if name in COMMANDS:
-            return name, given[length:]
-    return None, given
+            return name, words[length:]
+    return None, words
 
 
 def _run(name: str, rest: list[str]) -> int:
@@ -256,18 +256,22 @@ def _run(name: str, rest: list[str]) -> int:
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0]
 
-    from depthpose.cli.help import in_words_of, refuse_empty, refuse_missing
-    from depthpose.cli.ignored import refuse_ignored_options
+    from depthpose.cli.arguments import (
+        in_words_of,
+        refuse_empty,
+        refuse_ignored_options,
+        refuse_missing,
+    )
 
     @in_words_of(command)
     def checked(*words: object, **options: object) -> int:
         refuse_ignored_options(name, rest)
-        refuse_missing(signature(command).bind(*words, **options).arguments)
+        refuse_missing(command, signature(command).bind(*words, **options).arguments)
         code = command(*words, **options)
         sys.stdout.flush()
         return code
 
-    refuse_empty(rest)
+    refuse_empty(command, rest)
     try:
         return tyro.cli(
             checked,
@@ -287,15 +291,15 @@ def _refuse_gone(name: str, rest: list[str]) -> None:
             raise InputError(f"'depthpose {name}' has no {option} any more: {remedy}")
 
 
-def _explain(given: list[str]) -> int:
+def _explain(words: list[str]) -> int:
     """Print the commands of the group that was named, or refuse what is no command."""
-    asked_help = {"-h", "--help"} & set(given)
-    group = given[0] if given and not given[0].startswith("-") else ""
+    asked_help = {"-h", "--help"} & set(words)
+    group = words[0] if words and not words[0].startswith("-") else ""
     known = {name.partition(" ")[0] for name in COMMANDS}
     if group and group not in known:
         return _fail(f"error: no command {group!r}; {nearest_name(group, known)}")
     inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
-    verb = next((word for word in given[1:] if not word.startswith("-")), "")
+    verb = next((word for word in words[1:] if not word.startswith("-")), "")
     if group and verb:
         verbs = [name.partition(" ")[2] for name in inside]
         instead = _REMOVED_COMMANDS.get(f"{group} {verb}", nearest_name(verb, verbs))

@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
+from depthpose.cli.arguments import NewPath, WeightsName
+
 _OF_POSES = ("object", "status", "error_mm", "of_diameter", "rotation_deg", "translation_mm")
 _OF_DEPTHS = ("scene", "method", "input", "abs_rel", "rmse", "d1", "epe_px")
 """Columns that are printed; the page and the files hold all."""
 
 
 def demo(
-    out: Path = Path("out/demo"), weights: str = "default", pose_weights: str = "parts"
+    out: NewPath = Path("out/demo"),
+    weights: WeightsName = "default",
+    pose_weights: WeightsName = "parts",
 ) -> int:
     """Pose synthetic parts, estimate depth of a real pair and of a street; write a page about it.
 

@@ -4,12 +4,12 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from importlib import metadata
-from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 import tyro
 
+from depthpose.cli.arguments import NewPath
 from depthpose.core.errors import InputError, install_command
 
 if TYPE_CHECKING:
@@ -20,12 +20,11 @@ if TYPE_CHECKING:
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
 _EXTRAS_OF_OURS = ("dev",)
 """Extras for those who develop the package."""
-
 _SHIFT_PX = 12
 """Disparity of the pair that depth is tested with."""
 
 
-def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
+def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     """Check this installation, or the files that you want to use.
 
     Without files: versions, devices, extras (and how to install missing ones), weights, and one
@@ -45,12 +44,18 @@ def doctor(files: tyro.conf.Positional[tuple[Path, ...]] = ()) -> int:
         from depthpose.cli.doctor_files import look_at_all
 
         return look_at_all(files)
-    from depthpose.core.checkpoint import SHIPPED
+    from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.core.run import environment
 
     for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
-    print(*_extras(), *_weights(), sep="\n")
+    print(*_extras(), sep="\n")
+    for path in sorted(SHIPPED.glob("*.safetensors")):
+        try:
+            known = read_checkpoint(path)
+            print(f"weights {path.stem}: {known.kind}, {known.facts.get('licence', 'no licence')}")
+        except InputError as error:
+            print(f"weights {path.stem}: {error}")
     tries = {"depth": _try_depth, "pose": _try_pose}
     works = [_tried(what, work) for what, work in tries.items()]
     return 0 if all(works) else 1
@@ -60,45 +65,27 @@ def device_names() -> str:
     """Name what computes: the GPUs, or the processor alone."""
     import torch
 
-    found = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return ", ".join(f"cuda:{i} {name}" for i, name in enumerate(found)) or "cpu alone"
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return ", ".join(f"cuda:{i} {name}" for i, name in enumerate(gpus)) or "cpu alone"
 
 
 def _extras() -> Iterator[str]:
     """Give a line for each extra: what it needs, or the command that installs it."""
     lacking: dict[str, list[str]] = {}
     for line in metadata.requires("depthpose") or ():
-        found = _REQUIREMENT.match(line)
-        assert found is not None, line
-        package, extra = found.groups()
+        requirement = _REQUIREMENT.match(line)
+        assert requirement is not None, line
+        package, extra = requirement.groups()
         if extra is None or extra in _EXTRAS_OF_OURS:
             continue
         lacking.setdefault(extra, [])
-        if not _is_installed(package):
+        try:
+            metadata.version(package)
+        except metadata.PackageNotFoundError:
             lacking[extra].append(package)
     for extra, packages in lacking.items():
         how = f"lacks {', '.join(packages)}: {install_command(extra)}"
         yield f"extra {extra}: {how if packages else 'installed'}"
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
-
-
-def _weights() -> Iterator[str]:
-    from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-
-    for path in sorted(SHIPPED.glob("*.safetensors")):
-        try:
-            found = read_checkpoint(path)
-        except InputError as error:
-            yield f"weights {path.stem}: {error}"
-        else:
-            yield f"weights {path.stem}: {found.kind}, {found.facts.get('licence', 'no licence')}"
 
 
 def _tried(what: str, work: Callable[[], str]) -> bool:
@@ -125,8 +112,8 @@ def _try_depth() -> str:
     net = FakestereoNet.load("default", allow_ood=True)  # of noise
     if net.matcher is None:
         return _try_one_image(net, left)
-    found = net.estimate(left, None, right=right, with_check=False)
-    median_px = float(found.disparity_px[:, 2 * _SHIFT_PX :].median())
+    estimate = net.estimate(left, None, right=right, with_check=False)
+    median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())
     said = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
         raise RuntimeError(said)
@@ -141,10 +128,10 @@ def _try_one_image(net: "FakestereoNet", image: "Tensor") -> str:
 
     height, width = image.shape[1:]
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]).double()
-    found = net.estimate(image, Camera(width=width, height=height, K=K))
-    assert found.depth_m is not None
-    known_m = found.depth_m[found.depth_m.isfinite()]
-    said = f"one image got a depth for {len(known_m) / found.depth_m.numel():.0%} of its pixels"
+    estimate = net.estimate(image, Camera(width=width, height=height, K=K))
+    assert estimate.depth_m is not None
+    known_m = estimate.depth_m[estimate.depth_m.isfinite()]
+    said = f"one image got a depth for {len(known_m) / estimate.depth_m.numel():.0%} of its pixels"
     if not len(known_m):
         raise RuntimeError(said)
     return f"{said}, {float(known_m.median()):.1f} m in the middle"
@@ -160,10 +147,10 @@ def _try_pose() -> str:
     net = GeoPoseNet.load("parts")
     flange = next(model for model in net.weights.models if model.name == "flange")
     view = Objects((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(0)
-    (found,) = net.estimate_many([view.input])
-    if found.camera_from_model is None:
-        raise RuntimeError(f"a synthetic view of a flange was refused: {found.reason}")
-    off_m = adds_m(found.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
+    (estimate,) = net.estimate_many([view.input])
+    if estimate.camera_from_model is None:
+        raise RuntimeError(f"a synthetic view of a flange was refused: {estimate.reason}")
+    off_m = adds_m(estimate.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
     said = f"a synthetic flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
     if off_m > flange.diameter_m / 10:
         raise RuntimeError(said)

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from depthpose.cli.help import group
+from depthpose.cli.arguments import group, shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
@@ -25,7 +25,7 @@ class EngineOptions:
     many results to a shard, OUT/shards/*.tar or *.parquet, listed in OUT/manifest.csv; inputs and
     OUT may be URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest
     (*.parquet, *.csv)."""
-    address: str | None = None
+    address: Annotated[str | None, shown_as("HOST:PORT")] = None
     """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
     workers: int | None = None
     """at most; by default as many as fit into the cluster."""
@@ -130,7 +130,7 @@ class Weights:
 
 
 def run(
-    work: "Work", inputs: Inputs, out: str, settings: dict[str, Any], options: EngineOptions
+    work: "Work", inputs: Inputs, out: str, settings: dict[str, Any], engine: EngineOptions
 ) -> "Sequence[Done]":
     """Do the work on all inputs by the engine of the options, and give what is done."""
     from depthpose.core.engine import Job, run_job
@@ -141,10 +141,10 @@ def run(
         tars=inputs.tars,
         out=out,
         settings=settings,
-        form=options.shards,
-        block=options.block,
+        form=engine.shards,
+        block=engine.block,
     )
-    return run_job(job, options.build())
+    return run_job(job, engine.build())
 
 
 def say(every: "Sequence[Done]", out: str, what: str) -> int:

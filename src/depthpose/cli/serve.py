@@ -1,8 +1,6 @@
 """``depthpose serve``."""
 
-from typing import Any
-
-from depthpose.cli.help import group
+from depthpose.cli.arguments import WeightsName, group
 from depthpose.core.errors import InputError, MissingExtraError
 
 
@@ -15,9 +13,9 @@ class ServeOptions:
     page: there is no password and no encryption."""
     port: int = 8000
     """of the page; 0 takes a free one."""
-    weights: str = "default"
+    weights: WeightsName = "default"
     """of the depth networks, by name or file ('depthpose weights list')."""
-    pose_weights: str = "parts"
+    pose_weights: WeightsName = "parts"
     """of a pose network, by name or file."""
     max_upload_mb: int = 64
     """all files of one request together [1e6 bytes]."""
@@ -35,7 +33,7 @@ def serve(page: ServeOptions = ServeOptions()) -> int:
         depthpose serve --pose-weights my_part/pose.safetensors --port 8080
     """
     try:
-        from depthpose.web import Limits, known_names, make_app, open_socket, taken_address
+        from depthpose.web import Limits, known_names, make_app, open_socket, run, taken_address
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
@@ -45,17 +43,11 @@ def serve(page: ServeOptions = ServeOptions()) -> int:
     if page.max_upload_mb < 1:
         raise InputError(f"--max-upload-mb {page.max_upload_mb}: take 1 at least; 64 is usual")
     taken = open_socket(page.host, page.port)
-    names = known_names(page.host, taken_address(taken))
+    address = taken_address(taken)
+    names = known_names(page.host, address)
     limits = Limits(upload_bytes=page.max_upload_mb * 10**6, hosts=names)
     depth = FakestereoNet.load(page.weights, allow_ood=True)
-    return _answer(make_app(depth, GeoPoseNet.load(page.pose_weights), limits), taken)
-
-
-def _answer(app: Any, taken: Any) -> int:  # noqa: ANN401  types of the extra
-    """Print the address, and answer until Ctrl+C."""
-    from depthpose.web import run, taken_address
-
-    address = taken_address(taken)
+    app = make_app(depth, GeoPoseNet.load(page.pose_weights), limits)
     shown = f"[{address}]" if address.version == 6 else address
     print(f"http://{shown}:{taken.getsockname()[1]}/  (Ctrl+C stops it)", flush=True)
     if not address.is_loopback:

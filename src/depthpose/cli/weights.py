@@ -1,13 +1,17 @@
-"""``depthpose weights ...``."""
+"""``depthpose weights ...`` and ``depthpose export ...``."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from depthpose.cli.arguments import NewPath, WeightsName
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
+
+if TYPE_CHECKING:
+    from depthpose.core.export import Export
 
 
 def list_weights(folder: Path | None = None) -> int:
@@ -20,8 +24,8 @@ def list_weights(folder: Path | None = None) -> int:
     from depthpose.report.page import plain_table
 
     home = folder or SHIPPED
-    found = sorted(home.glob("*.safetensors"))
-    if not found:
+    files = sorted(home.glob("*.safetensors"))
+    if not files:
         print(f"No weights in {home}. 'depthpose weights import' imports a published checkpoint.")
         return 0
     rows = [
@@ -32,7 +36,7 @@ def list_weights(folder: Path | None = None) -> int:
             "licence": _in_short(read.facts.get("licence", "")),
             "trained on": _in_short(read.facts.get("trained_on", "")),
         }
-        for path in found
+        for path in files
     ]
     print(plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
@@ -44,7 +48,7 @@ def _in_short(text: str) -> str:
     return text if len(text) <= 34 else text[:30].rpartition(" ")[0].rstrip(",;") + " ..."
 
 
-def show_weights(weights: tyro.conf.Positional[str]) -> int:
+def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
     """Print what a weights file holds: kind, settings, parameters, origin, licence, sha256.
 
     Args:
@@ -74,7 +78,7 @@ def show_weights(weights: tyro.conf.Positional[str]) -> int:
 def import_weights(
     kind: tyro.conf.Positional[Literal["psmnet", "fcgf", "resnet18", "efficientnet-lite0"]],
     file: tyro.conf.Positional[Path],
-    out: Path,
+    out: NewPath,
     align_corners: Literal["true", "false"] | None = None,
     classes: int | None = None,
 ) -> int:
@@ -104,7 +108,14 @@ def import_weights(
             raise InputError(f"{option} {value}: is for {other}, and {kind} ignores it; omit it")
     refuse_to_replace(out)
     if kind == "psmnet":
-        _import_psmnet(file, out, align_corners)
+        from depthpose.depth.stereo import import_psmnet
+
+        if align_corners is None:
+            raise InputError(
+                "weights import psmnet needs --align-corners true (weights of 2018) or false "
+                "(of 2021): the file does not say, and a wrong choice costs about a pixel."
+            )
+        import_psmnet(file, out, align_corners=align_corners == "true")
     elif kind == "fcgf":
         from depthpose.pose.network import import_fcgf
 
@@ -120,23 +131,12 @@ def import_weights(
     return show_weights(str(out))
 
 
-def _import_psmnet(file: Path, out: Path, align_corners: str | None) -> None:
-    from depthpose.depth.stereo import import_psmnet
-
-    if align_corners is None:
-        raise InputError(
-            "weights import psmnet needs --align-corners true (weights of 2018) or false "
-            "(of 2021): the file does not say, and a wrong choice costs about a pixel."
-        )
-    import_psmnet(file, out, align_corners=align_corners == "true")
-
-
 def pack_weights(
-    weights: tyro.conf.Positional[str],
-    out: Path,
+    weights: tyro.conf.Positional[WeightsName],
+    out: NewPath,
     trained_on: str,
     licence: str,
-    matcher: str | None = None,
+    matcher: WeightsName | None = None,
     terms: str = "",
     half: bool = False,
 ) -> int:
@@ -163,15 +163,15 @@ def pack_weights(
     card = out.with_suffix(".md")
     refuse_to_replace(out)
     refuse_to_replace(card)
-    found = read_depth_weights(find_weights(weights))
+    known = read_depth_weights(find_weights(weights))
     made_of = [weights] if matcher is None else [weights, matcher]
     warn_of_terms(bound_facts({}, made_of))
-    given = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
-    facts = bound_facts(given, made_of)
+    own = {"trained_on": trained_on, "licence": licence} | ({"terms": terms} if terms else {})
+    facts = bound_facts(own, made_of)
     write_depth_weights(
         out,
-        generator=found.generator,
-        matcher=found.matcher if matcher is None else read_matcher(find_weights(matcher)),
+        generator=known.generator,
+        matcher=known.matcher if matcher is None else read_matcher(find_weights(matcher)),
         facts=facts,
         with_half=half,
     )
@@ -182,7 +182,7 @@ def pack_weights(
 
 
 def complete_weights(
-    weights: tyro.conf.Positional[str], models: Path, out: Path, unit: Unit = "mm"
+    weights: tyro.conf.Positional[WeightsName], models: Path, out: NewPath, unit: Unit = "mm"
 ) -> int:
     """Add meshes to pose weights that came without, because the meshes may not be passed on.
 
@@ -198,33 +198,29 @@ def complete_weights(
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
+    from depthpose.pose.datasets.models import read_bop_models
+    from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
+    from depthpose.pose.weights import known_numbers
 
     refuse_to_replace(out)
     path = find_weights(weights)
-    complete(path, _meshes_of(path, models, unit), out)
-    return show_weights(str(out))
-
-
-def _meshes_of(path: Path, models: Path, unit: Unit) -> Mapping[int, Any]:
-    """Read the meshes of the objects that weights know, by number."""
-    from depthpose.pose.datasets.models import read_bop_models
-    from depthpose.pose.mesh import read_model
-    from depthpose.pose.weights import known_numbers
-
     numbers = known_numbers(path)
     if not models.is_file():
-        return read_bop_models(models, numbers)
-    if len(numbers) != 1:
+        meshes = read_bop_models(models, numbers)
+    elif len(numbers) == 1:
+        meshes = {numbers[0]: read_model(models, unit, number=numbers[0])}
+    else:
         raise InputError(
             f"--models {models}: one file serves weights of one object, and {path} knows "
             f"{len(numbers)}; give the folder of the data set that it was trained on"
         )
-    return {numbers[0]: read_model(models, unit, number=numbers[0])}
+    complete(path, meshes, out)
+    return show_weights(str(out))
 
 
 def push_weights(
-    weights: tyro.conf.Positional[str],
+    weights: tyro.conf.Positional[WeightsName],
     repository: tyro.conf.Positional[str],
     public: bool = False,
     accept_terms: bool = False,
@@ -246,23 +242,19 @@ def push_weights(
 
     path = find_weights(weights)
     facts = read_checkpoint(path).facts
-    _print_terms(weights, facts.get("terms", ""), is_accepted=accept_terms)
+    terms = facts.get("terms", "")
+    if terms:
+        print(f"{weights}: {terms}")
+    if terms and not accept_terms:
+        raise InputError(
+            f"{weights}: has terms for passing it on, printed above. If you may, add "
+            "--accept-terms."
+        )
     readme = hub.readme_of(_card(path, facts), facts)
     url = hub.push_weights(path, readme, repository, is_private=not public)
     size = f"{path.stat().st_size / 1e6:.1f} MB"
     print(f"{url}: {path.name} ({size}) and its card; load them by hf://{repository}")
     return 0
-
-
-def _print_terms(weights: str, terms: str, *, is_accepted: bool) -> None:
-    """Print the terms of weights, if any, and refuse to pass them on without the user's word."""
-    if terms:
-        print(f"{weights}: {terms}")
-    if terms and not is_accepted:
-        raise InputError(
-            f"{weights}: has terms for passing it on, printed above. If you may, add "
-            "--accept-terms."
-        )
 
 
 def _card(path: Path, facts: Mapping[str, str]) -> str:
@@ -272,3 +264,78 @@ def _card(path: Path, facts: Mapping[str, str]) -> str:
 
     card = path.with_suffix(".md")
     return read_text(card) if card.is_file() else card_text(path.stem, dict(sorted(facts.items())))
+
+
+def export_depth(out: NewPath, weights: WeightsName = "default", what: str | None = None) -> int:
+    """Write the depth networks as one ONNX file that runs without torch, and prove that it agrees.
+
+    The graph does all that the estimator does at the quick speed, at any size: one image and its K
+    to metres, sky and the right view; or a pair to disparity and confidence. Its outputs are
+    compared with PyTorch's at several sizes and the differences written to NAME.proof.json; beyond
+    the limit nothing is written. Needs the extra export.
+
+        depthpose export depth --out depth.onnx
+        depthpose export depth --weights psmnet.safetensors --out psmnet.onnx
+
+    Args:
+        out: the .onnx file to write.
+        weights: of a generator, a matcher or both, by name or file ('depthpose weights list').
+        what: image: one image to depth; pair: a rectified pair to disparity. By default image
+            where the weights have a generator, else pair.
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.depth.export import depth_export
+    from depthpose.depth.weights import read_depth_weights
+
+    path = find_weights(weights)
+    known = read_depth_weights(path)
+    facts = _facts(weights, path, known.facts)
+    return _freeze(out, depth_export(known, what, facts))
+
+
+def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
+    """Write the network of directions as one ONNX file that runs without torch, and prove it.
+
+    The graph takes voxels (cloud, x, y, z; each once) and their features, and gives the direction
+    from each to every keypoint of every object; coarser levels and kernel maps are made inside it.
+    It does neither voxelise nor vote, run ICP or refuse. Its outputs are compared with PyTorch's
+    on several clouds and the differences written to NAME.proof.json; beyond the limit nothing is
+    written. Needs the extra export.
+
+        depthpose export pose --out pose.onnx
+
+    Args:
+        out: the .onnx file to write.
+        weights: of a pose network, by name or file ('depthpose weights list').
+    """
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.pose.export import pose_export
+    from depthpose.pose.weights import read_pose_weights
+
+    path = find_weights(weights)
+    known = read_pose_weights(path)
+    return _freeze(out, pose_export(known, _facts(weights, path, known.facts)))
+
+
+def _facts(weights: str, path: Path, facts: Mapping[str, str]) -> dict[str, str]:
+    """Give the facts of weights for a graph of them; prints their terms."""
+    from depthpose.core.checkpoint import file_sha256, warn_of_terms
+
+    warn_of_terms(facts)
+    own = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
+    return {**facts, **own}
+
+
+def _freeze(out: Path, export: "Export") -> int:
+    """Write the graph, and print how much it differs from PyTorch."""
+    from depthpose.core.export import freeze, proof_path
+    from depthpose.report.page import markdown_table
+
+    rows = [
+        {name: f"{v:.1e}" if isinstance(v, float) else v for name, v in row.items()}
+        for row in freeze(out, export)
+    ]
+    print(markdown_table(rows), end="")
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences are in "
+          f"{proof_path(out).name}")  # fmt: skip
+    return 0

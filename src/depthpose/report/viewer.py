@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -11,10 +11,11 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.run import refuse_to_replace
-from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.pose.cloud import object_points
-from depthpose.pose.estimator.prepare import AnyInput
-from depthpose.pose.types import ObjectModel, PoseEstimate
+
+if TYPE_CHECKING:  # a command of depth must not load what poses need, nor the other way round
+    from depthpose.depth.types import DepthEstimate, StereoInput
+    from depthpose.pose.estimator.prepare import AnyInput
+    from depthpose.pose.types import ObjectModel, PoseEstimate
 
 LIVE = "live"
 _RECORDING = ".rrd"
@@ -52,7 +53,7 @@ class Viewer:
             self._stream.save(path)
         self._count = 0
 
-    def show_depth(self, given: StereoInput, estimate: DepthEstimate) -> None:
+    def show_depth(self, given: "StereoInput", estimate: "DepthEstimate") -> None:
         """Show an image, its depth before the camera, the right view and the confidence."""
         rr = self._rerun
         self._next(given.name)
@@ -69,8 +70,10 @@ class Viewer:
             grey = estimate.confidence.nan_to_num(0.0).expand(3, -1, -1)
             self._log("confidence", rr.Image(_bytes(grey)))
 
-    def show_pose(self, given: AnyInput, estimate: PoseEstimate, model: ObjectModel) -> None:
+    def show_pose(self, given: "AnyInput", estimate: "PoseEstimate", model: "ObjectModel") -> None:
         """Show the cloud, the posed model and its keypoints; or why there is no pose."""
+        from depthpose.pose.cloud import object_points
+
         rr = self._rerun
         self._next(given.name)
         self._log("seen", rr.Clear(recursive=True))

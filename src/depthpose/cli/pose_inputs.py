@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from depthpose.cli.pose.masks import Masks
-from depthpose.cli.pose.methods import PoseMethod, match_names
+from depthpose.cli.pose_methods import EstimateMany, Masks, PoseMethod, match_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import MAP_SUFFIXES, cloud_suffixes, list_images
@@ -25,6 +24,7 @@ from depthpose.pose.datasets import BopDataset, encode_rle, object_names, read_l
 from depthpose.pose.estimator.given import AnyMask, cloud_input, rigid_input, view_input
 from depthpose.pose.estimator.prepare import AnyInput
 from depthpose.pose.predictions import Job, Place
+from depthpose.pose.types import PoseEstimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +80,14 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Job[Any]
     Raises:
         InputError: there is none, two of one name, or the folder is ``out`` too.
     """
-    files = [p for p in cloud.iterdir() if _is_cloud(p)] if cloud.is_dir() else [cloud]
+    known = cloud_suffixes()
+    files = [cloud]
+    if cloud.is_dir():
+        named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
+        files = [path for path in named if path.suffix.lower() in known]
     files.sort(key=natural_order)
     if not files:
-        known = ", ".join(cloud_suffixes())
-        raise InputError(f"{cloud}: no {known} file there; give a cloud, or a folder")
+        raise InputError(f"{cloud}: no {', '.join(known)} file there; give a cloud, or a folder")
     _refuse_one_name(files)
     refuse_among_inputs(out, [cloud], files)
     return [_file_job(p, object, cloud_input, unit, object, p.stem) for p in files]
@@ -95,12 +98,8 @@ def camera_facts(camera: Path) -> dict[str, str]:
     return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
-def _is_cloud(path: Path) -> bool:
-    return path.suffix.lower() in cloud_suffixes() and not path.name.startswith(".")
-
-
 def view_jobs(
-    given: tuple[Path, Path, Path], object: str, unit: Unit | None, out: Path
+    depth: Path, mask: Path, camera: Path, object: str, unit: Unit | None, out: Path
 ) -> list[Job[Any]]:
     """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
 
@@ -110,8 +109,8 @@ def view_jobs(
         InputError: there is none, two have one name, a depth image has no mask, or a folder is
             ``out`` too.
     """
-    depth, mask, camera = given
-    depths, pictures = _list_depths(depth), _list_masks(mask)
+    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
+    depths, pictures = _list_depths(depth), runs or list_images(mask)
     refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
     _refuse_one_name(depths)
     _refuse_one_name(pictures)
@@ -175,35 +174,8 @@ def _list_depths(depth: Path) -> list[Path]:
         return sorted(maps, key=natural_order)
 
 
-def _list_masks(mask: Path) -> list[Path]:
-    """List mask pictures, or files of run lengths where there are such."""
-    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []
-    return runs or list_images(mask)
-
-
-def known_objects(dataset: BopDataset, method: PoseMethod) -> list[int]:
-    """Number the objects of a data set that the weights know; say which are left out.
-
-    Raises:
-        InputError: they know none.
-    """
-    numbers = {model.number for model in method.models}
-    names = {model.name for model in method.models}
-    there = sorted({instance.object_id for instance in dataset.instances})
-    known = [n for n in there if n in numbers or dataset.objects[n].name in names]
-    left = sorted(set(there) - set(known))
-    if not known:
-        raise InputError(
-            f"{dataset.folder}: holds objects {left}, but the {method.holder} know "
-            f"{', '.join(names)}; give {method.holder} of its objects"
-        )
-    if left:
-        print(f"left out, as the {method.holder} do not know them: objects {left}", file=sys.stderr)
-    return known
-
-
 def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) -> BopDataset:
-    """Keep the objects of a data set that the weights know, or the one that is named.
+    """Keep the objects of a data set that the weights know, and say others; or the one named.
 
     Args:
         dataset: what there is.
@@ -213,11 +185,24 @@ def chosen_objects(dataset: BopDataset, method: PoseMethod, object: str | None) 
     Raises:
         InputError: the weights know none, or there is no instance of the one.
     """
-    if object is None:
-        return dataset.of_objects(*known_objects(dataset, method))
-    own = {model.name: model.number for model in method.models}
-    is_theirs = object in object_names(dataset.folder).values()
-    return dataset.of_objects(object if is_theirs else own.get(object, object))
+    numbers = {model.name: model.number for model in method.models}
+    if object is not None:
+        is_theirs = object in object_names(dataset.folder).values()
+        return dataset.of_objects(object if is_theirs else numbers.get(object, object))
+    there = sorted({instance.object_id for instance in dataset.instances})
+    known = [n for n in there if n in numbers.values() or dataset.objects[n].name in numbers]
+    left_out = sorted(set(there) - set(known))
+    if not known:
+        raise InputError(
+            f"{dataset.folder}: holds objects {left_out}, but the {method.holder} know "
+            f"{', '.join(numbers)}; give {method.holder} of its objects"
+        )
+    if left_out:
+        print(
+            f"left out, as the {method.holder} do not know them: objects {left_out}",
+            file=sys.stderr,
+        )
+    return dataset.of_objects(*known)
 
 
 def object_facts(dataset: BopDataset, object: str | None) -> dict[str, list[int]]:
@@ -274,3 +259,29 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
                 f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
                 "results; rename one, or move it to another folder"
             )
+
+
+def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
+    """Estimate some inputs together; what cannot be read has the status ``unreadable``."""
+    return list(safely(method)([job.read() for job in jobs]))
+
+
+def safely(method: PoseMethod) -> EstimateMany:
+    """Let a method skip what could not be read."""
+
+    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
+        readable = [one for one in inputs if not isinstance(one, Unreadable)]
+        estimates = iter(method.estimate_many(readable))
+        return [unread(one) if isinstance(one, Unreadable) else next(estimates) for one in inputs]
+
+    return estimate_many
+
+
+def unread(missing: Unreadable) -> PoseEstimate:
+    """Give the estimate of an input that could not be read."""
+    return PoseEstimate(
+        name=missing.name,
+        object=missing.object,
+        status="unreadable",
+        reason=f"cannot be read: {missing.reason}",
+    )

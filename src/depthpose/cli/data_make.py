@@ -1,24 +1,23 @@
 """``depthpose data make ...``."""
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from depthpose.cli.help import group
+from depthpose.cli.arguments import NewPath, group
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
+
+if TYPE_CHECKING:
+    from depthpose.depth.config import StreetsConfig
+    from depthpose.pose.config import ObjectsConfig
+
 
 _FRAMES_A_SCENE = 50
 _SCENES_A_SEED = 1000
 _MOST_SEED = 10**6 - 1
 """Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
-
-if TYPE_CHECKING:
-    from depthpose.depth.config import StreetsConfig
-    from depthpose.pose.config import ObjectsConfig
-    from depthpose.pose.types import ObjectModel
 
 
 @group
@@ -105,7 +104,7 @@ class ObjectsOptions:
         )
 
 
-def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
+def make_streets(out: NewPath, streets: StreetsOptions = StreetsOptions()) -> int:
     """Render synthetic street scenes with exact disparity, in KITTI's raw layout.
 
     Existing frames are skipped, so an interrupted run can be resumed, and a later run with another
@@ -118,27 +117,38 @@ def make_streets(out: Path, streets: StreetsOptions = StreetsOptions()) -> int:
     from tqdm import tqdm
 
     from depthpose.core.run import claim_folder
-    from depthpose.depth.datasets import has_calibration, has_raw_frame
-    from depthpose.depth.synthetic import rig_number
+    from depthpose.depth.datasets import RawFrame, has_calibration, has_raw_frame, write_raw_frame
+    from depthpose.depth.synthetic import camera_from_velodyne, draw_street, rig_number
 
     config = streets.config
     # Seeds have drives of their own, so they may share a folder.
-    days = [_day(day) for day in range(1, 6)]
+    days = [f"2100_01_{day:02d}" for day in range(1, 6)]
     claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
     indices = range(streets.first, streets.first + streets.number)
-    drives = {index: _drive(config, 1 + rig_number(config, index)) for index in indices}
+    drives = {k: f"{days[rig_number(config, k)]}_drive_{config.seed:04d}_sync" for k in indices}
     dates = {drive[:10]: index for index, drive in drives.items()}
     lost = {index for date, index in dates.items() if not has_calibration(out, date)}
     wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
     for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
-        _make_street(out, drives[index], config, index)
+        frame = draw_street(config, index)
+        raw = RawFrame(
+            left=frame.left,
+            right=frame.right,
+            rig=frame.rig,
+            disparity_px=frame.disparity_px,
+            occluded=frame.occluded,
+            is_sky=frame.is_sky,
+            points=frame.lidar_points,
+            camera_from_velodyne=camera_from_velodyne(),
+        )
+        write_raw_frame(out, drives[index], index, raw)
     print(f"{out}: {len(wanted)} frames made, {streets.number - len(wanted)} were there")
     return 0
 
 
 def make_objects(
     cad: tuple[Path, ...],
-    out: Path,
+    out: NewPath,
     frames: ObjectsOptions = ObjectsOptions(),
 ) -> int:
     """Render frames of objects on a table, with image, depth, masks and poses, in BOP's layout.
@@ -152,79 +162,47 @@ def make_objects(
         cad: model files with a surface or points; the first is object 1.
         out: folder to write to.
     """
-    from depthpose.core.run import claim_folder
-    from depthpose.pose.datasets import write_bop_models
-
-    settings = _object_settings(cad, frames)
-    models = _read_models(cad, frames)
-    claim_folder(out, settings, ["models", frames.split])
-    write_bop_models(out, models)
-    scenes = _scenes(frames)
-    wanted = {k: v for k, v in scenes.items() if not _is_made(out, frames.split, k, v)}
-    _make_scenes(wanted, models, frames, out)
-    print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
-    return 0
-
-
-def _read_models(cad: Sequence[Path], options: ObjectsOptions) -> "list[ObjectModel]":
     from tqdm import tqdm
 
-    from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
-
-    is_taken = options.symmetries == "found"
-    read = [read_model(path, options.unit, number=i) for i, path in enumerate(cad, start=1)]
-    refuse_one_name(read)
-    return [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in read]
-
-
-def _object_settings(cad: Sequence[Path], options: ObjectsOptions) -> dict[str, Any]:
-    """What decides the frames of a folder; of another seed, other scenes: they may share it."""
+    from depthpose.core.checkpoint import file_sha256
     from depthpose.core.config import config_to_dict
-
-    own = {k: v for k, v in config_to_dict(options.config).items() if k not in ("number", "seed")}
-    files = {f"object {i}": _fingerprint(path) for i, path in enumerate(cad, start=1)}
-    return {**own, "cad": files, "unit": options.unit, "symmetries": options.symmetries}
-
-
-def _scenes(options: ObjectsOptions) -> dict[int, range]:
-    """Give the frames of each scene by its number."""
-    starts = range(0, options.number, _FRAMES_A_SCENE)
-    return {
-        options.seed * _SCENES_A_SEED + k: range(
-            first, min(first + _FRAMES_A_SCENE, options.number)
-        )
-        for k, first in enumerate(starts)
-    }
-
-
-def _make_scenes(
-    scenes: Mapping[int, range],
-    models: "Sequence[ObjectModel]",
-    options: ObjectsOptions,
-    out: Path,
-) -> None:
-    from tqdm import tqdm
-
     from depthpose.core.results import note_result
-    from depthpose.pose.datasets import write_bop_scene
+    from depthpose.core.run import claim_folder
+    from depthpose.pose.datasets import write_bop_models, write_bop_scene
+    from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
     from depthpose.pose.synthetic import make_frames
 
-    total = sum(map(len, scenes.values()))
+    # What decides the frames; of another seed, other scenes: they may share the folder.
+    config, split = frames.config, frames.split
+    settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
+    settings["cad"] = {
+        f"object {number}": {"file": path.name, "sha256": file_sha256(path)}
+        for number, path in enumerate(cad, start=1)
+    }
+    settings |= {"unit": frames.unit, "symmetries": frames.symmetries}
+    models = [read_model(path, frames.unit, number=i) for i, path in enumerate(cad, start=1)]
+    refuse_one_name(models)
+    is_taken = frames.symmetries == "found"
+    models = [with_found_symmetries(model, tqdm.write, is_taken=is_taken) for model in models]
+    claim_folder(out, settings, ["models", split])
+    write_bop_models(out, models)
+    scenes = {
+        frames.seed * _SCENES_A_SEED + k: range(first, min(first + _FRAMES_A_SCENE, frames.number))
+        for k, first in enumerate(range(0, frames.number, _FRAMES_A_SCENE))
+    }
+    wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
+    total = sum(map(len, wanted.values()))
     with tqdm(total=total, unit=" frames", leave=False, disable=None) as bar:
-        for number, scene in scenes.items():
-            frames = []
-            for frame in make_frames(models, options.config, len(scene), scene.start):
-                frames.append(frame)
+        for number, scene in wanted.items():
+            made = []
+            for frame in make_frames(models, config, len(scene), scene.start):
+                made.append(frame)
                 bar.update()
-            home = write_bop_scene(out, options.split, number, frames)
+            home = write_bop_scene(out, split, number, made)
             files = sorted(path for path in home.rglob("*") if path.is_file())
             note_result(out, home.relative_to(out).as_posix(), files)
-
-
-def _fingerprint(path: Path) -> dict[str, str]:
-    from depthpose.core.checkpoint import file_sha256
-
-    return {"file": path.name, "sha256": file_sha256(path)}
+    print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
+    return 0
 
 
 def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
@@ -237,29 +215,3 @@ def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
         return False
     there = read_json(out / home / "scene_camera.json")
     return isinstance(there, dict) and {str(n) for n in frames} <= set(there)
-
-
-def _drive(config: "StreetsConfig", day: int) -> str:
-    return f"{_day(day)}_drive_{config.seed:04d}_sync"
-
-
-def _day(day: int) -> str:
-    return f"2100_01_{day:02d}"
-
-
-def _make_street(out: Path, drive: str, config: "StreetsConfig", index: int) -> None:
-    from depthpose.depth.datasets import RawFrame, write_raw_frame
-    from depthpose.depth.synthetic import camera_from_velodyne, draw_street
-
-    frame = draw_street(config, index)
-    raw = RawFrame(
-        left=frame.left,
-        right=frame.right,
-        rig=frame.rig,
-        disparity_px=frame.disparity_px,
-        occluded=frame.occluded,
-        is_sky=frame.is_sky,
-        points=frame.lidar_points,
-        camera_from_velodyne=camera_from_velodyne(),
-    )
-    write_raw_frame(out, drive, index, raw)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from depthpose.cli.depth.methods import Method
-from depthpose.cli.depth.page import PAGE, write_depth_page
+from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_predict import PAGE, write_depth_page
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, list_images, read_image
@@ -38,12 +38,13 @@ class Pairs:
 
     def read(self, index: int) -> StereoInput:
         """Read one pair."""
-        return StereoInput(
-            name=self.left[index].stem,
-            left=read_image(self.left[index]),
-            right=read_image(self.right[index]),
-            camera=self.rig,
-        )
+        left, right = self.left[index], self.right[index]
+        return read_pair(left.stem, left, right, self.rig)
+
+
+def read_pair(name: str, left: Path, right: Path, rig: StereoRig) -> StereoInput:
+    """Read the two images of a pair."""
+    return StereoInput(name=name, left=read_image(left), right=read_image(right), camera=rig)
 
 
 def list_pairs(left: str, right: str) -> tuple[list[Path], list[Path]]:
@@ -83,7 +84,6 @@ def match_all(
     pairs: Pairs, method: Method, out: Path, *, with_cloud: bool, with_check: bool
 ) -> int:
     """Match what is not finished; a pair that fails is named at the end and stops no other."""
-    assert isinstance(method.net, FakestereoNet)
     claim_folder(out, {**method.settings, "camera": rig_facts(pairs.rig)}, [PAGE])
     both = {left.stem: (left, right) for left, right in zip(pairs.left, pairs.right, strict=True)}
     claim_names(out, both, [f".{end}" for end in ENDINGS])
@@ -95,13 +95,12 @@ def match_all(
             continue
         try:
             pair = pairs.read(index)
-            estimate = method.net.estimate_pair(pair, with_check=with_check)
+            estimate = estimate_pair(pair, method, with_check=with_check)
         except InputError as error:
             if len(pairs.left) == 1:
                 raise
             failures.append(str(error))
             continue
-        say_doubt(pair, estimate)
         cloud_m = CLOUD_M if with_cloud else None
         note_result(out, name, write_estimate(out, pair, estimate, cloud_m=cloud_m))
     for failure in failures:
@@ -112,10 +111,13 @@ def match_all(
     return 1 if failures else 0
 
 
-def say_doubt(pair: StereoInput, estimate: DepthEstimate) -> None:
-    """Print the warning of an estimate."""
+def estimate_pair(pair: StereoInput, method: Method, *, with_check: bool) -> DepthEstimate:
+    """Match a pair, and print what is doubtful about it."""
+    assert isinstance(method.net, FakestereoNet)
+    estimate = method.net.estimate_pair(pair, with_check=with_check)
     if estimate.warning:
         tqdm.write(f"depthpose: warning: {pair.name}: {estimate.warning}", sys.stderr)
+    return estimate
 
 
 def _write_page(pairs: Pairs, out: Path, failures: list[str]) -> None:

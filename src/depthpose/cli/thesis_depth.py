@@ -10,8 +10,17 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth import evaluating
-from depthpose.cli.depth.methods import Method
+from depthpose.cli.depth_evaluate import (
+    columns,
+    describe_protocol,
+    detail_sections,
+    join,
+    measure_each,
+    predict_all,
+    say_skipped,
+    write_details,
+)
+from depthpose.cli.depth_methods import Method
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
@@ -65,31 +74,31 @@ def reproduce_table(
     claim_folder(out, settings, (*results, "predictions", "figures"))
     rule = find_protocol(protocol)
     home = out / "predictions"
-    folders = [evaluating.predict_all(dataset, method, rule, home) for _, method in methods]
+    folders = [predict_all(dataset, method, rule, home) for _, method in methods]
     if find_rank().rank > 0:
         return 0
-    measured = evaluating.measure_all(dataset, folders, protocol, caps_m)
+    measured = join(measure_each(dataset, folders, protocol, caps_m))
     owns = [own for own, _ in methods for _ in caps_m]
     joined = join_published(table, list(zip(owns, measured.rows, strict=True)))
-    rows = evaluating.columns(joined)
+    rows = columns(joined)
     write_table(out, rows)
-    evaluating.write_details(measured, out)
+    write_details(measured, out)
     how = (
-        f"Ours: {evaluating.describe_protocol(protocol)} The printed rows are of the 697 frames of "
+        f"Ours: {describe_protocol(protocol)} The printed rows are of the 697 frames of "
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
     )
     sections = [
         Section(title="Published rows, ours, and difference", text=how, rows=rows),
         *_picture_sections(dataset, [method for _, method in methods], pictures, out),
-        *evaluating.detail_sections(measured),
+        *detail_sections(measured),
         Section(title="Settings", rows=[row for _, m in methods for row in _setting_rows(m)]),
     ]
     title = f"{table.title}, on {dataset.name}"
     write_markdown(out / "report.md", title, sections, environment())
     write_page(out / "report.html", title, sections, environment())
     print(markdown_table(rows))
-    evaluating.say_skipped(measured)
+    say_skipped(measured)
     print(f"the page: {out / 'report.html'}")
     return 0
 

@@ -10,10 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
-from depthpose.cli.pose import evaluating as pose_evaluating
-from depthpose.cli.pose import masks as pose_masks
-from depthpose.cli.pose import methods as pose_methods
+from depthpose.cli import pose_evaluate, pose_methods
+from depthpose.cli.arguments import refuse_below
+from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
@@ -47,7 +46,6 @@ _SYNTHETIC_SEED = 3303
 _MOST_POINTS = 4000
 """Of a t-SNE: its time grows with the square."""
 _SCAN_POINTS = 1500
-
 BOXES = "Boxes: truth green and dashed, estimate blue and solid."
 
 
@@ -79,7 +77,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
             facts={"frames": f"synthetic, seed {_SYNTHETIC_SEED}"},
             settings={"synthetic": synthetic, "seed": _SYNTHETIC_SEED},
         )
-    dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, None)
+    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, None)
     facts = {
         "frames": f"{data.folder.resolve().name} {data.split}",
         "frames_sha256": frames_hash(dataset.instances)[:12],
@@ -118,7 +116,7 @@ def reproduce_by_object(
     refuse_below(0, "--pictures", how.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
-    dataset = pose_evaluating.open_instances(data.folder, data.split, data.objects, how.targets)
+    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, how.targets)
     models = tuple(dataset.objects.values())
     is_printed = number == "3.2"
     numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
@@ -129,24 +127,26 @@ def reproduce_by_object(
         **_settings_of(dataset),
         "rule": config_to_dict(how.evaluation),
         "methods": {method.name: dict(method.settings) for method in methods},
-        "masks": pose_masks.mask_files(how.masks) if methods else [],
-        "csv": [pose_masks.named_file(path) for path in csv],
+        "masks": pose_methods.mask_files(how.masks) if methods else [],
+        "csv": [pose_methods.named_file(path) for path in csv],
     }
     results = (*table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
-    shown = pose_masks.find_masks(how.masks, dataset, out, how.device) if methods else []
+    shown = pose_methods.find_masks(how.masks, dataset, out, how.device) if methods else []
     folders = [pose_methods.predict_all(dataset, m, one, out) for m in methods for one in shown]
-    measured = pose_evaluating.measure_all(dataset, [*folders, *csv], how.evaluation)
+    measured = pose_evaluate.join(
+        pose_evaluate.measure_each(dataset, [*folders, *csv], how.evaluation)
+    )
     joined = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
-    rows, every = [row.columns() for row in joined], pose_evaluating.table_of(measured.rows)
+    rows, every = [row.columns() for row in joined], pose_evaluate.table_of(measured.rows)
     write_table(out, rows)
     write_table(out, every, name="all")
-    pose_evaluating.write_details(measured, out)
+    pose_evaluate.write_details(measured, out)
     sections = [
         Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
-        Section(title="All numbers", text=pose_evaluating.HOW, rows=every),
+        Section(title="All numbers", text=pose_evaluate.HOW, rows=every),
         *_picture_sections(dataset, folders, how.pictures, out),
-        *pose_evaluating.detail_sections(measured),
+        *pose_evaluate.detail_sections(measured),
     ]
     return _write(
         f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}", sections, out
@@ -158,6 +158,7 @@ _HOW = (
     "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "
     "columns for masks, diameters and the list of frames."
 )
+
 _DIFFERENCES = {
     "3.1": "Differences: the first weights less each of the others.",
     "3.2": (

@@ -4,31 +4,50 @@ import operator
 import re
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.pose.inputs import Unreadable
-from depthpose.cli.pose.methods import EstimateMany, PoseMethod
-from depthpose.core.files import write_cloud, write_image
+from depthpose.cli.engine import EngineOptions
+from depthpose.cli.pose_inputs import (
+    Unreadable,
+    bop_jobs,
+    camera_facts,
+    chosen_objects,
+    cloud_jobs,
+    object_facts,
+    object_named,
+    safely,
+    view_jobs,
+)
+from depthpose.cli.pose_methods import (
+    MethodSource,
+    PoseMethod,
+    find_masks,
+    of_dataset,
+)
+from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image, write_cloud, write_image
 from depthpose.core.results import is_whole, note_result
 from depthpose.core.rigid import numbers_text
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
     claim_names,
+    environment,
     find_rank,
     read_sources,
     wait_for,
 )
 from depthpose.pose.cloud import object_points
-from depthpose.pose.datasets import BopDataset, Instance
+from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,
@@ -44,8 +63,16 @@ from depthpose.pose.predictions import (
     write_predictions,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.page import plain_table
-from depthpose.report.pose import alternative_lines, draw_pose, grey_depth, picture_of, posed_cloud
+from depthpose.report.page import Section, choose_answers, plain_table, write_page
+from depthpose.report.pose import (
+    PoseShown,
+    alternative_lines,
+    draw_pose,
+    grey_depth,
+    picture_of,
+    pose_section,
+    posed_cloud,
+)
 from depthpose.report.viewer import Viewer, open_viewer
 
 PAGE = "report.html"
@@ -53,6 +80,7 @@ _MOST_SHOWN = 20
 """Of the answers, on the terminal; poses.json holds all."""
 _FRAME = """camera_from_model: x right, y down, z forward
 certainty: the chance that the pose is right and not one of its alternatives"""
+
 _SAID = 5
 """Of so many inputs the alternatives are printed; of all they are in poses.json."""
 
@@ -101,6 +129,70 @@ def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     claim_folder(out, settings, [POSES, PAGE, *tables, *pictures])
 
 
+def predict_files(
+    method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int, view: str | None
+) -> int:
+    """Pose clouds, or masked depth images, in this process; give the exit code."""
+    name = object_named(inputs.object, method)
+    settings = {**method.settings, "object": name}
+    if inputs.cloud is not None:
+        unit = inputs.unit or "m"
+        jobs = cloud_jobs(Path(inputs.cloud), unit, name, out)
+        settings |= {"unit": unit}
+    elif inputs.depth is None or inputs.mask is None or inputs.camera is None:
+        raise InputError("--depth needs --camera beside it, and --mask unless it is to be found")
+    else:
+        mask = Path(inputs.mask)
+        jobs = view_jobs(Path(inputs.depth), mask, inputs.camera, name, inputs.unit, out)
+        settings |= camera_facts(inputs.camera) | {"mask": str(mask.resolve())}
+        settings |= {} if inputs.unit is None else {"unit": inputs.unit}
+    claim(out, settings, jobs, Path(inputs.cloud or inputs.depth or out))
+    predictions = predict_all(method, jobs, out, settings, batch, view)
+    if predictions is None:
+        return 0
+    write_files(predictions, jobs, out, method)
+    write_pose_page(out, predictions, jobs, method)
+    return say_result(predictions, out)
+
+
+def predict_dataset(
+    source: MethodSource,
+    options: DataSetOptions,
+    object: str | None,
+    out: str,
+    batch: int,
+    view: str | None,
+    engine: EngineOptions,
+) -> int:
+    """Pose the objects of a data set, or one, here or by an engine; give the exit code."""
+    assert options.bop is not None
+    if engine.is_ray:
+        from depthpose.cli.pose_ray import refuse_unshared
+
+        refuse_unshared(options.masks, out)
+    method, home = source.build("cpu" if engine.is_ray else None), Path(out)
+    dataset = chosen_objects(open_bop(options.bop, options.split), method, object)
+    (masks,) = find_masks([options.masks], dataset, home, source.config.device)
+    jobs = bop_jobs(dataset, masks, method)
+    settings = {**method.settings, "estimate": config_to_dict(source.config)}
+    settings |= {**of_dataset(dataset), "masks": masks.name, **object_facts(dataset, object)}
+    settings |= {**masks.settings, **({"shards": engine.shards} if engine.is_ray else {})}
+    claim_bop(home, settings, dataset)
+    if engine.is_ray:
+        from depthpose.cli.pose_ray import predict_instances
+
+        predictions = predict_instances(
+            source, options, dataset, jobs, batch, out, settings, engine
+        )
+    else:
+        predictions = predict_all(method, jobs, home, settings, batch, view)
+    if predictions is None:
+        return 0
+    write_bop_files(predictions, dataset, home, method)
+    write_pose_page(home, predictions, jobs, method, dataset)
+    return say_result(predictions, home)
+
+
 def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: dict[str, Any],
                 batch: int, view: str | None) -> list[Prediction] | None:  # fmt: skip
     """Estimate what is not finished; several processes share the work through the files.
@@ -115,7 +207,7 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     if left:
         with open_viewer(None if process.rank else view) as viewer:
             shown = method if viewer is None else _watched(method, viewer)
-            names = predict(_safely(shown), left, home, settings, batch)
+            names = predict(safely(shown), left, home, settings, batch)
             for _ in tqdm(names, total=len(left), disable=None, unit=" poses"):
                 pass
     if process.rank:
@@ -123,21 +215,12 @@ def predict_all(method: PoseMethod, jobs: list[Job[Any]], out: Path, settings: d
     return _gather(jobs, out, process)
 
 
-def estimate_jobs(method: PoseMethod, jobs: Sequence[Job[Any]]) -> list[PoseEstimate]:
-    """Estimate some inputs together; what cannot be read has the status ``unreadable``."""
-    return list(_safely(method)([job.read() for job in jobs]))
-
-
 def say_result(predictions: list[Prediction], out: Path) -> int:
     """Print how many were posed and why others were not; give the exit code."""
-    reasons: dict[str, int] = defaultdict(int)
     failed = [p.estimate for p in predictions if not is_finished(p)]
-    for prediction in predictions:
-        if prediction.estimate not in failed:
-            reasons[prediction.estimate.status] += 1
+    shown = [p.estimate for p in predictions if is_finished(p)]
     for estimate in failed:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
-    shown = [p.estimate for p in predictions if is_finished(p)]
     if shown:
         print(plain_table([_answer_row(estimate) for estimate in shown[:_MOST_SHOWN]]), end="")
         print(_FRAME)
@@ -147,7 +230,8 @@ def say_result(predictions: list[Prediction], out: Path) -> int:
     for prediction in predictions[:_SAID]:
         for line in alternative_lines(prediction.estimate):
             print(f"{prediction.estimate.name}: {line}")
-    said = ", ".join(f"{count} {status}" for status, count in sorted(reasons.items()))
+    statuses = Counter(estimate.status for estimate in shown)
+    said = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
     inputs = "1 input" if len(predictions) == 1 else f"{len(predictions)} inputs"
     print(f"{inputs}: {said or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
@@ -181,12 +265,12 @@ def write_files(
         pose = estimate.camera_from_model
         if pose is None:
             continue
-        given, model = job.read(), _model(method, estimate.object)
-        points_m = object_points(given, model.diameter_m)
+        view, model = job.read(), _model(method, estimate.object)
+        points_m = object_points(view, model.diameter_m)
         files = [out / f"{job.name}.{CLOUD}"]
         write_cloud(files[0], posed_cloud(points_m, pose, model))
-        if isinstance(given, ViewInput):
-            picture = draw_pose(grey_depth(given.depth_m), pose, model, given.K)
+        if isinstance(view, ViewInput):
+            picture = draw_pose(grey_depth(view.depth_m), pose, model, view.K)
             files.append(out / f"{job.name}.{PICTURE}")
             write_image(files[1], picture)
         note_result(out, job.name, files)
@@ -200,28 +284,25 @@ def write_bop_files(
     if any(p.estimate.alternatives for p in predictions):
         write_bop_results(out / alternatives_name(dataset), predictions, with_alternatives=True)
     image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    found: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
+    posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
     for prediction in predictions:
         if prediction.place is not None and prediction.estimate.is_posed:
-            found[prediction.place[:2]].append(prediction.estimate)
-    for (scene, image), estimates in found.items():
+            posed[prediction.place[:2]].append(prediction.estimate)
+    for (scene, image), estimates in posed.items():
         name = _picture_name(scene, image)
         if not is_whole(out, name, [name]):
-            write_image(out / name, _overlay(image_of[scene, image], estimates, method))
+            instance = image_of[scene, image]
+            picture = picture_of(instance)
+            for estimate in estimates:
+                assert estimate.camera_from_model is not None
+                model = _model(method, estimate.object)
+                picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
+            write_image(out / name, picture)
             note_result(out, name, [out / name])
 
 
 def _picture_name(scene: int, image: int) -> str:
     return f"{scene:06d}_{image:06d}.{PICTURE}"
-
-
-def _overlay(instance: Instance, estimates: Iterable[PoseEstimate], method: PoseMethod) -> Tensor:
-    picture = picture_of(instance)
-    for estimate in estimates:
-        assert estimate.camera_from_model is not None
-        model = _model(method, estimate.object)
-        picture = draw_pose(picture, estimate.camera_from_model, model, instance.K)
-    return picture
 
 
 def _finished(out: Path) -> set[str]:
@@ -257,34 +338,96 @@ def _model(method: PoseMethod, name: str) -> ObjectModel:
     return next(model for model in method.models if model.name == name)
 
 
-def _safely(method: PoseMethod) -> EstimateMany:
-    """Let a method skip what could not be read."""
-
-    def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        found = iter(method.estimate_many([g for g in inputs if not isinstance(g, Unreadable)]))
-        return [unread(g) if isinstance(g, Unreadable) else next(found) for g in inputs]
-
-    return estimate_many
-
-
-def unread(given: Unreadable) -> PoseEstimate:
-    """Give the estimate of an input that could not be read."""
-    return PoseEstimate(
-        name=given.name,
-        object=given.object,
-        status="unreadable",
-        reason=f"cannot be read: {given.reason}",
-    )
-
-
 def _watched(method: PoseMethod, viewer: Viewer) -> PoseMethod:
     """Give a method whose every estimate is shown as soon as it is there."""
     models = {model.name: model for model in method.models}
 
     def estimate_many(inputs: Sequence[Any]) -> list[PoseEstimate]:
-        found = list(method.estimate_many(inputs))
-        for given, estimate in zip(inputs, found, strict=True):
-            viewer.show_pose(given, estimate, models[given.object])
-        return found
+        estimates = list(method.estimate_many(inputs))
+        for view, estimate in zip(inputs, estimates, strict=True):
+            viewer.show_pose(view, estimate, models[view.object])
+        return estimates
 
     return replace(method, estimate_many=estimate_many)
+
+
+_MOST_ROWS = 1000
+
+
+def write_pose_page(
+    out: Path,
+    predictions: Sequence[Prediction],
+    jobs: Sequence[Job[Any]],
+    method: PoseMethod,
+    dataset: BopDataset | None = None,
+) -> None:
+    """Write a page of some of the predictions, and of the reason of each refusal.
+
+    Args:
+        out: its folder.
+        predictions: all, in the order of the jobs.
+        jobs: their inputs.
+        method: by which.
+        dataset: that they are of, if they are of one.
+    """
+    sections = _answer_sections(predictions, jobs, method, dataset)
+    counts = Counter(prediction.estimate.status for prediction in predictions)
+    said = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
+    rows = [_row(p.estimate) for p in sorted(predictions, key=lambda p: p.estimate.is_posed)]
+    number, shown = len(predictions), len(sections)
+    text = f"{number} inputs: {said}. Shown below: {shown}"
+    text += "." if shown == number else ", answers and refusals spread evenly."
+    if number > _MOST_ROWS:
+        text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
+        text += "poses.json."
+    results = Section(title="What was found", text=text, rows=rows[:_MOST_ROWS])
+    page = out / PAGE
+    title = f"Poses of {number} input{'s' * (number != 1)}"
+    write_page(page, title, [results, *sections], environment())
+    print(f"the page: {page}")
+
+
+def _answer_sections(
+    predictions: Sequence[Prediction],
+    jobs: Sequence[Job[Any]],
+    method: PoseMethod,
+    dataset: BopDataset | None,
+) -> list[Section]:
+    """Show some of the inputs that could be read, answered and refused."""
+    instances = () if dataset is None else dataset.instances
+    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
+    models = {model.name: model for model in method.models}
+    readable = [k for k, prediction in enumerate(predictions) if is_finished(prediction)]
+    answered = [predictions[k].estimate.is_posed for k in readable]
+    sections: list[Section] = []
+    for k in (readable[chosen] for chosen in choose_answers(answered)):
+        shown_input = jobs[k].read()
+        if isinstance(shown_input, Unreadable):  # by now; it was read when it was estimated
+            continue
+        estimate, place = predictions[k].estimate, predictions[k].place
+        rgb = None if place is None else image_of[place[:2]]
+        image = None if rgb is None else read_image(rgb)
+        model = models[estimate.object]
+        shown = PoseShown(given=shown_input, estimate=estimate, model=model, image=image)
+        sections.append(pose_section(estimate.name, shown))
+    return sections
+
+
+def _row(estimate: PoseEstimate) -> dict[str, Any]:
+    pose = estimate.camera_from_model
+    x_m, y_m, z_m = (None, None, None) if pose is None else pose.t_m.double().tolist()
+    tracking = {} if estimate.tracking is None else {"tracking": estimate.tracking}
+    return {
+        "input": estimate.name,
+        "object": estimate.object,
+        "status": estimate.status,
+        **tracking,
+        "x_m": x_m,
+        "y_m": y_m,
+        "z_m": z_m,
+        "fit": None if estimate.fit is None else estimate.fit.agrees,
+        "identity": None if estimate.identity is None else estimate.identity.status,
+        "certainty": estimate.certainty,
+        "alternatives": "; ".join(alternative_lines(estimate)),
+        "reason": estimate.reason,
+    }

@@ -1,18 +1,21 @@
-"""``depthpose reproduce ...`` and ``depthpose figure ...``: the options of each command."""
+"""``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import tyro
 
-from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions, refuse_ignored
-from depthpose.cli.help import group
-from depthpose.cli.options import PoseDataOptions, PoseTableOptions, refuse_below
+from depthpose.cli.arguments import NewPath, WeightsName, group, refuse_below
+from depthpose.cli.depth_options import MatcherOptions, ProtocolOptions, refuse_ignored
+from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth.methods import Method
+    from depthpose.cli.depth_methods import Method
     from depthpose.depth.datasets import Dataset
     from depthpose.thesis.depth import PublishedTable
 
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
 class RowOptions:
     """The methods of a table, a row each."""
 
-    weights: tuple[str, ...] = ()
+    weights: tuple[WeightsName, ...] = ()
     """weights files; 2.2 takes a stereo matcher's too."""
     matcher: Literal["sgbm"] | None = None
     """sgbm: OpenCV's StereoSGBM as a row of table 2.2."""
@@ -66,14 +69,15 @@ class RowOptions:
         self, table: "PublishedTable", config: MatcherConfig, dataset: "Dataset"
     ) -> "list[tuple[str, Method]]":
         """Build each method for a dataset, with the thesis's own row that it stands for, if any."""
-        from depthpose.cli.depth import evaluating, methods
+        from depthpose.cli.depth_evaluate import open_training
+        from depthpose.cli.depth_methods import MethodSource, baseline_method, sgbm_method
+
+        def method_of(name: str) -> "Method":
+            return MethodSource(weights=name, config=config, with_right=table.with_right).build()
 
         is_by_place = len(table.own) == len(self.weights)
         owns = table.own if is_by_place else [table.own[0]] * len(self.weights)
-        chosen = [
-            (own, methods.weights_method(file, config, with_right=table.with_right))
-            for own, file in zip(owns, self.weights, strict=True)
-        ]
+        chosen = [(own, method_of(file)) for own, file in zip(owns, self.weights, strict=True)]
         names = [method.name for _, method in chosen]
         if len(set(names)) < len(names):
             raise InputError(
@@ -81,14 +85,14 @@ class RowOptions:
                 "one."
             )
         if self.matcher is not None:
-            chosen.append((table.own[0], methods.sgbm_method(with_filled_holes=True)))
+            chosen.append((table.own[0], sgbm_method(with_filled_holes=True)))
         if not table.with_right:
             named = ("default",) if self.beside is None else self.beside
-            others = [methods.weights_method(n, config, with_right=False) for n in named]
+            others = map(method_of, named)
             chosen += [("", other) for other in others if other.name not in names]
         if self.train:
-            training = evaluating.open_training(self.train, self.train_without, dataset)
-            baselines = [methods.baseline_method(name, training) for name in ("rows", "nearest")]
+            training = open_training(self.train, self.train_without, dataset)
+            baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
             # A baseline uses no right image, but is measured on the frames of the other rows.
             chosen += [("", one._replace(with_right=table.with_right)) for one in baselines]
         return chosen
@@ -97,7 +101,7 @@ class RowOptions:
 def reproduce(
     table: tyro.conf.Positional[Literal["2.1", "2.2", "2.3"]],
     kitti: Path,
-    out: Path,
+    out: NewPath,
     rows: RowOptions = RowOptions(),
     split: str = "eigen-test",
     pictures: int = 3,
@@ -120,8 +124,8 @@ def reproduce(
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth.evaluating import open_frames
-    from depthpose.cli.thesis.depth import reproduce_table
+    from depthpose.cli.depth_evaluate import open_frames
+    from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import find_table
 
@@ -144,8 +148,8 @@ def reproduce(
 def figure(
     figure: tyro.conf.Positional[Literal["2-1", "2-5"]],
     kitti: Path,
-    weights: str,
-    out: Path,
+    weights: WeightsName,
+    out: NewPath,
     frames: tuple[str, ...] = (),
     number: int | None = None,
     split: str | None = None,
@@ -169,22 +173,22 @@ def figure(
         number: how many frames where none is named: 1 for figure 2-1 and 4 for 2-5.
         split: choose among the frames of a split, such as eigen-test.
     """
-    from depthpose.cli.depth.evaluating import open_frames
-    from depthpose.cli.depth.methods import weights_method
-    from depthpose.cli.thesis.depth import choose_frames, write_figure
+    from depthpose.cli.depth_evaluate import open_frames
+    from depthpose.cli.depth_methods import MethodSource
+    from depthpose.cli.thesis_depth import choose_frames, write_figure
 
     dataset = open_frames(kitti, split)
     if number is not None:
         refuse_below(1, "--number", number, "4")
     chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
-    method = weights_method(weights, matching.config, with_right=with_right)
-    return write_figure(figure, dataset, chosen, method, out)
+    source = MethodSource(weights=weights, config=matching.config, with_right=with_right)
+    return write_figure(figure, dataset, chosen, source.build(), out)
 
 
 def table_3_1(
-    weights: tuple[str, ...],
-    out: Path,
+    weights: tuple[WeightsName, ...],
+    out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
     estimates: PoseTableOptions = PoseTableOptions(),
 ) -> int:
@@ -202,7 +206,7 @@ def table_3_1(
             (an extra), which needs no weights.
         out: folder to write to.
     """
-    from depthpose.cli.thesis.pose import reproduce_by_object
+    from depthpose.cli.thesis_pose import reproduce_by_object
 
     if len(weights) < 2:
         raise InputError(
@@ -212,8 +216,8 @@ def table_3_1(
 
 
 def table_3_2(
-    out: Path,
-    weights: tuple[str, ...] = (),
+    out: NewPath,
+    weights: tuple[WeightsName, ...] = (),
     csv: tuple[Path, ...] = (),
     data: PoseDataOptions = PoseDataOptions(),
     estimates: PoseTableOptions = PoseTableOptions(),
@@ -230,7 +234,7 @@ def table_3_2(
         weights: files or names.
         csv: BOP results of any method, each a row of ours.
     """
-    from depthpose.cli.thesis.pose import reproduce_by_object
+    from depthpose.cli.thesis_pose import reproduce_by_object
 
     if not weights and not csv:
         raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
@@ -238,8 +242,8 @@ def table_3_2(
 
 
 def table_3_3(
-    weights: str,
-    out: Path,
+    weights: WeightsName,
+    out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
     synthetic: int | None = None,
     points: tuple[int, ...] = (500, 1000, 2000, 5000),
@@ -259,7 +263,7 @@ def table_3_3(
         synthetic: number of synthetic views where no data set is given; 40 unless told.
         points: at most so many votes of a cloud; a block of rows each.
     """
-    from depthpose.cli.thesis.pose import reproduce_voting
+    from depthpose.cli.thesis_pose import reproduce_voting
 
     if synthetic is not None and data.folder is not None:
         raise InputError(
@@ -278,8 +282,8 @@ def table_3_3(
 
 
 def figure_3_2(
-    weights: str,
-    out: Path,
+    weights: WeightsName,
+    out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
     number: int = 4,
     perplexity: float = 40.0,
@@ -298,7 +302,7 @@ def figure_3_2(
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis.pose import feature_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import feature_panels, open_figure, write_figure
 
     net, views = open_figure("3-2", weights, out, data, number, perplexity=perplexity)
     text = (
@@ -309,8 +313,8 @@ def figure_3_2(
 
 
 def figure_3_4(
-    weights: str,
-    out: Path,
+    weights: WeightsName,
+    out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
     number: int = 20,
     keypoint: int | None = None,
@@ -329,7 +333,7 @@ def figure_3_4(
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis.pose import field_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import field_panels, open_figure, write_figure
 
     net, views = open_figure("3-4", weights, out, data, number, keypoint=keypoint)
     text = "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC."
@@ -337,7 +341,7 @@ def figure_3_4(
 
 
 def figure_3_5(
-    weights: str, out: Path, data: PoseDataOptions = PoseDataOptions(), number: int = 6
+    weights: WeightsName, out: NewPath, data: PoseDataOptions = PoseDataOptions(), number: int = 6
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
 
@@ -351,7 +355,195 @@ def figure_3_5(
         out: folder for the figure.
         number: how many views.
     """
-    from depthpose.cli.thesis.pose import BOXES, box_panels, open_figure, write_figure
+    from depthpose.cli.thesis_pose import BOXES, box_panels, open_figure, write_figure
 
     net, views = open_figure("3-5", weights, out, data, number)
     return write_figure("3-5", BOXES, box_panels(net, views), out, columns=3)
+
+
+_TRAINED_ON = ("--trained-on", "KITTI raw", "--licence", "not stated; that of KITTI binds")
+_POSE = {
+    "thesis": "pose",
+    "thesis-pointnet": "pointnet",
+    "thesis-depth-image": "depth-image",
+    "thesis-masks": "segmentation",
+}
+"""Configs of chapter 3, the network that each trains, and the name of its weights."""
+
+
+class Step(NamedTuple):
+    """One command: its description, the arguments of ``depthpose``, and the file that it makes.
+
+    It is done again if a file of earlier steps, ``of``, is newer. ``is_replaced``: an older file
+    and its card are deleted first, because the command replaces none.
+    """
+
+    what: str
+    words: Sequence[str]
+    makes: Path
+    of: Sequence[Path] = ()
+    is_replaced: bool = False
+
+    @property
+    def is_done(self) -> bool:
+        """Whether what it makes is there, and not older than what it is made of."""
+        if not self.makes.is_file():
+            return False
+        made = self.makes.stat().st_mtime
+        return all(path.is_file() and path.stat().st_mtime <= made for path in self.of)
+
+
+def reproduce_all(
+    out: NewPath,
+    kitti: Path | None = None,
+    linemod: Path | None = None,
+    configs: NewPath = Path("configs"),
+    split: str = "eigen-test",
+    protocol: str = "eigen-raw",
+    device: Literal["auto", "cpu"] = "auto",
+) -> int:
+    """Reproduce all tables of the thesis from data on disk: trainings first, then tables.
+
+    From KITTI: the generator, the matcher and fine-tuning, then tables 2.1, 2.2 and 2.3. From
+    Linemod_preprocessed: the network of directions, its two baselines and the segmentation, then
+    tables 3.1, 3.2 and 3.3, with true and with found masks, poses by votes alone as published.
+    Each step is a command, which is printed. Run again, it skips finished steps and resumes an
+    interrupted training. The thesis's trainings take days on a GPU.
+
+        depthpose reproduce all --kitti /data/kitti --out out/thesis
+        depthpose reproduce all --linemod /data/Linemod_preprocessed --out out/thesis
+
+    Args:
+        out: folder of trainings and tables.
+        kitti: KITTI raw with LiDAR: drives of training and test.
+        linemod: Linemod_preprocessed.
+        configs: folder of depth/view.yaml, stereo.yaml, finetune.yaml, and of pose/thesis.yaml,
+            thesis-pointnet.yaml, thesis-depth-image.yaml, thesis-masks.yaml (see the repository).
+        split: KITTI frames of the tables: eigen-test, a file of frames, or all.
+        protocol: how depth is compared; eigen-raw is the thesis's.
+        device: auto: a GPU where there is one; cpu: none.
+    """
+    from depthpose.core.run import find_rank
+
+    if kitti is None and linemod is None:
+        raise InputError("there is nothing to reproduce from: give --kitti or --linemod FOLDER.")
+    if find_rank().world > 1:
+        raise InputError(
+            "'reproduce all' runs its steps one after the other in one process; launch the "
+            "trainings that it prints one by one, then run it again"
+        )
+    steps: list[Step] = []
+    if kitti is not None:
+        steps += _depth_steps(kitti, configs, out / "depth", device, split, protocol)
+    if linemod is not None:
+        steps += _pose_steps(linemod, configs, out / "pose", device)
+    return walk(steps)
+
+
+def _depth_steps(
+    kitti: Path, configs: Path, home: Path, device: str, split: str, protocol: str
+) -> list[Step]:
+    """List the steps from KITTI to tables 2.1, 2.2 and 2.3."""
+    from depthpose.cli.depth_evaluate import open_frames
+
+    open_frames(kitti, None if split == "all" else split)  # not only after days of training
+    names = [f"depth/{stage}.yaml" for stage in ("view", "stereo", "finetune")]
+    _claim(home, kitti, configs, names, {"split": split, "protocol": protocol})
+    generator, matcher = home / "view/generator.safetensors", home / "stereo/matcher.safetensors"
+    apart, tuned = home / "apart.safetensors", home / "finetune/fakestereo.safetensors"
+    begin = ("--generator", str(generator), "--matcher", str(matcher))
+    pack = ("weights", "pack", str(generator), "--matcher", str(matcher), "--out", str(apart))
+    train = partial(_training, kitti, configs, device)
+    how = ("--kitti", str(kitti), "--split", split, "--protocol", protocol)
+    table = partial(_table, home, device, how)
+    return [
+        train("depth/view.yaml", ("depth", "train", "view"), generator),
+        train("depth/stereo.yaml", ("depth", "train", "stereo"), matcher),
+        Step("both in one file", (*pack, *_TRAINED_ON), apart, (generator, matcher), True),
+        table("2.1", (apart,)),
+        table("2.2", (matcher,)),
+        train("depth/finetune.yaml", ("depth", "train", "finetune", *begin), tuned)._replace(
+            of=(generator, matcher)
+        ),
+        table("2.3", (apart, tuned)),
+    ]
+
+
+def _pose_steps(linemod: Path, configs: Path, home: Path, device: str) -> list[Step]:
+    """List the steps from Linemod_preprocessed to tables 3.1, 3.2 and 3.3."""
+    from depthpose.pose.datasets import open_bop
+
+    dataset = open_bop(linemod, "test")
+    print(f"{linemod}: {len(dataset.instances)} instances to test on")
+    _claim(home, linemod, configs, [f"pose/{name}.yaml" for name in _POSE], {})
+    steps: list[Step] = []
+    for name, what in _POSE.items():
+        words, makes = ("pose", "train", "--what", what), home / f"{what}/{what}.safetensors"
+        steps.append(_training(linemod, configs, device, f"pose/{name}.yaml", words, makes))
+    ours, pointnet, depth_image, masks = [step.makes for step in steps]
+    data = ("--linemod", str(linemod))
+    shown = (*data, "--no-icp", "--masks", "truth", str(masks))
+    for number, weights in (("3.1", (ours, pointnet, depth_image)), ("3.2", (ours,))):
+        table = _table(home, device, shown, number, weights)
+        steps.append(table._replace(of=(*weights, masks)))
+    return [*steps, _table(home, device, data, "3.3", (ours,))]
+
+
+def walk(steps: Sequence[Step]) -> int:
+    """Run what is not done, to the first that fails; give its exit code, or the largest."""
+    from depthpose.cli import main
+
+    code = 0
+    for number, step in enumerate(steps, 1):
+        head = f"[{number}/{len(steps)}] {step.what}"
+        if step.is_done:
+            print(f"{head}: done, {step.makes}", flush=True)
+            continue
+        print(f"{head}: depthpose {shlex.join(step.words)}", flush=True)
+        if step.is_replaced:
+            for path in (step.makes, step.makes.with_suffix(".md")):
+                path.unlink(missing_ok=True)
+        own = main(step.words)
+        if own > 1:
+            return own
+        code = max(code, own)
+    return code
+
+
+def _training(
+    data: Path, configs: Path, device: str, config: str, words: Sequence[str], makes: Path
+) -> Step:
+    """Make the step of a training, which is resumed if it was stopped."""
+    end = ("--config", str(configs / config), "--data", str(data))
+    end += ("--out", str(makes.parent), "--device", device, "--resume")
+    return Step(f"training by {config}", (*words, *end), makes)
+
+
+def _table(
+    home: Path, device: str, words: Sequence[str], number: str, weights: Sequence[Path]
+) -> Step:
+    import torch
+
+    out = home / f"table-{number}"
+    every = ("reproduce", number, *words, "--weights", *map(str, weights), "--out", str(out))
+    if number != "3.3":  # it has no such option
+        is_gpu = device == "auto" and torch.cuda.is_available()
+        every += ("--device", "cuda" if is_gpu else "cpu")
+    return Step(f"table {number}", every, out / "report.html", weights)
+
+
+def _claim(
+    home: Path, data: Path, configs: Path, names: Sequence[str], settings: Mapping[str, str]
+) -> None:
+    """Claim the folder for this data, these configs and this protocol."""
+    from depthpose.core.checkpoint import file_sha256
+    from depthpose.core.run import claim_folder
+
+    missing = [name for name in names if not (configs / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{configs}: there is no {missing[0]}; give the folder of the thesis's configs, which "
+            "is in the repository, by --configs"
+        )
+    files = {name: file_sha256(configs / name) for name in names}
+    claim_folder(home, {"data": str(data.resolve()), "configs": files, **settings})

@@ -10,13 +10,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.pose.masks import distinct_names, of_dataset
-from depthpose.cli.pose.page import instance_sections
+from depthpose.cli.pose_methods import distinct_names, of_dataset
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
+from depthpose.core.files import read_image
 from depthpose.core.run import environment, read_settings
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, open_bop, read_targets
+from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
 from depthpose.pose.evaluate import (
     Evaluation,
     InstanceRow,
@@ -24,10 +24,23 @@ from depthpose.pose.evaluate import (
     Origin,
     RiskRow,
     evaluate,
+    match,
+    nearest_copy,
     of_targets,
     read_any,
 )
-from depthpose.report.page import Section, plain_table, write_page, write_table
+from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.types import PoseEstimate
+from depthpose.report.page import (
+    Section,
+    choose_ranked,
+    plain_table,
+    share_views,
+    spread_evenly,
+    write_page,
+    write_table,
+)
+from depthpose.report.pose import PoseShown, pose_section
 
 HOW = (
     "Success: ADD (ADD-S of a symmetric object) below 10 % of the diameter. Refused: no answer, or "
@@ -35,6 +48,7 @@ HOW = (
     "to 10 cm. ar, ar_vsd, ar_mssd, ar_mspd: BOP's average recalls. The row 'mean' counts each "
     "object the same, 'all' each instance, as BOP does."
 )
+
 _SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",
           "rotation_deg_median", "translation_m_median")  # fmt: skip
 """Columns that are printed; the files hold all."""
@@ -54,26 +68,29 @@ def open_instances(
     return dataset
 
 
-def measure_all(
-    dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
-) -> Evaluation:
-    """Measure several folders or csv files of predictions as one table."""
-    return join(measure_each(dataset, predictions, config))
-
-
 def measure_each(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
 ) -> list[Evaluation]:
-    """Measure folders or csv files of predictions one by one; each row says whose it is."""
-    found: list[Evaluation] = []
+    """Measure folders or csv files of predictions one by one; each row says whose it is.
+
+    Raises:
+        InputError: a record says that predictions are of another data set or split.
+    """
+    evaluations: list[Evaluation] = []
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
-        _refuse_others(path, dataset)
+        settings = (read_settings(path) if path.is_dir() else None) or {}
+        for what, own in of_dataset(dataset).items():
+            if (theirs := settings.get(what, own)) != own:
+                raise InputError(
+                    f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
+                    f"those of this very {what}, or measure that one"
+                )
         one = evaluate(dataset, read_any(path), config, show).of(origin)
         if one.advice is not None:
             print(f"{path}: {one.advice}", file=sys.stderr)
-        found.append(one)
-    return found
+        evaluations.append(one)
+    return evaluations
 
 
 def join(each: Sequence[Evaluation]) -> Evaluation:
@@ -94,9 +111,9 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
     Raises:
         InputError: predictions are given twice.
     """
-    found = [_describe_one(path) for path in predictions]
+    origins = [_describe_one(path) for path in predictions]
     homes = [path.resolve().parent for path in predictions]
-    rows = Counter((home, one.method, one.masks) for home, one in zip(homes, found, strict=True))
+    rows = Counter((home, one.method, one.masks) for home, one in zip(homes, origins, strict=True))
     twice = [key for key, count in rows.items() if count > 1]
     if twice:
         home, method, masks = twice[0]
@@ -104,23 +121,12 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
             f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their rows "
             "would be one; give one of them, or rename it"
         )
-    own = list({(home, one.method): None for home, one in zip(homes, found, strict=True)})
+    own = list({(home, one.method): None for home, one in zip(homes, origins, strict=True)})
     names = dict(zip(own, distinct_names(own), strict=True))
     return [
-        replace(one, method=names[home, one.method]) for home, one in zip(homes, found, strict=True)
+        replace(one, method=names[home, one.method])
+        for home, one in zip(homes, origins, strict=True)
     ]
-
-
-def _refuse_others(path: Path, dataset: BopDataset) -> None:
-    """Refuse predictions whose record says that they are of another data set or split."""
-    settings = (read_settings(path) if path.is_dir() else None) or {}
-    for what, own in of_dataset(dataset).items():
-        theirs = settings.get(what, own)
-        if theirs != own:
-            raise InputError(
-                f"{path}: predictions of the {what} {theirs!r}, but {own!r} is measured; give "
-                f"those of this very {what}, or measure that one"
-            )
 
 
 def _describe_one(path: Path) -> Origin:
@@ -138,17 +144,6 @@ def _describe_one(path: Path) -> Origin:
     )
 
 
-def success_by_masks(rows: Sequence[ObjectRow]) -> list[dict[str, Any]]:
-    """Set the successes with each kind of masks side by side, a row a method and object."""
-    table: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in rows:
-        assert row.origin is not None
-        place = (row.origin.method, row.object)
-        entry = table.setdefault(place, {"method": row.origin.method, "object": row.object})
-        entry[f"{row.origin.masks or 'their'} masks"] = row.success
-    return list(table.values())
-
-
 def table_of(rows: Iterable[ObjectRow | InstanceRow | RiskRow]) -> list[dict[str, Any]]:
     """Give the columns of rows, as tables and files take them."""
     return [row.columns() for row in rows]
@@ -164,8 +159,14 @@ def measure(
     said = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     write_table(out, rows)
     write_details(measured, out)
+    by_masks: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in measured.rows:
+        assert row.origin is not None
+        method, masks = row.origin.method, row.origin.masks
+        entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
+        entry[f"{masks or 'their'} masks"] = row.success
     sections = [
-        Section(title="Success by masks", text=said, rows=success_by_masks(measured.rows)),
+        Section(title="Success by masks", text=said, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
         *instance_sections(dataset, predictions, [one.per_instance for one in each]),
         *detail_sections(measured),
@@ -197,3 +198,73 @@ def detail_sections(measured: Evaluation) -> list[Section]:
         Section(title="Each instance that is no success", rows=table_of(failed)),
     ]
     return [section for section in sections if section.rows]
+
+
+_OF_TRUTH = (
+    "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "
+    "object, the copy nearest to the estimate)."
+)
+
+_MEASURED = (
+    "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
+    "status",
+)  # fmt: skip
+
+
+def instance_sections(
+    dataset: BopDataset,
+    predictions: Sequence[Path],
+    rows: Sequence[Sequence[InstanceRow]],
+) -> list[Section]:
+    """Show the worst, the median and the best answer of each set of predictions, and a refusal.
+
+    Args:
+        dataset: as it was measured.
+        predictions: folders or csv files.
+        rows: of the instances of each, as they were measured.
+    """
+    instances = {instance.name: instance for instance in dataset.instances}
+    sections: list[Section] = []
+    for path, of_path, most in zip(predictions, rows, share_views(len(predictions)), strict=True):
+        if not most:
+            continue
+        estimates = match(dataset.instances, read_any(path), dataset.objects)
+        for role, row in _choose(of_path, most):
+            instance = instances[row.instance]
+            shown = _shown(dataset, instance, estimates[instance.name])
+            title = f"{path.stem}: {row.object} in {instance.name}, {role}"
+            columns = row.columns()
+            own = {name: columns[name] for name in _MEASURED}
+            sections.append(pose_section(title, shown, _OF_TRUTH, rows=[own]))
+    return sections
+
+
+def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceRow]]:
+    """Choose answers by their error in diameters, and the middle one of the refusals."""
+    errors = {row.instance: row.error("error_m") for row in rows}
+    answers = [row for row in rows if errors[row.instance] is not None]
+    shares = [(errors[row.instance] or 0.0) / row.diameter_m for row in answers]
+    chosen = [
+        (f"{role} answer of {len(answers)}", answers[k])
+        for role, k in choose_ranked(shares, min(most, 3))
+    ]
+    refused = [r for r in rows if errors[r.instance] is None and r.status != "missing"]
+    few = min(most - len(chosen), 1)
+    chosen += [
+        (f"one of {len(refused)} refused", refused[k]) for k in spread_evenly(len(refused), few)
+    ]
+    return chosen
+
+
+def _shown(dataset: BopDataset, instance: Instance, estimate: PoseEstimate) -> PoseShown:
+    """Show an estimate beside the truth: of copies that look alike the one nearest to it."""
+    model, truth = dataset.objects[instance.object_id], instance.camera_from_model
+    if (pose := estimate.camera_from_model) is not None:
+        truth = nearest_copy(pose, truth, symmetry_transforms(model.symmetries), model.symmetries)
+    return PoseShown(
+        given=dataset.view(instance).input,
+        estimate=estimate,
+        model=model,
+        image=None if instance.rgb is None else read_image(instance.rgb),
+        truth=truth,
+    )

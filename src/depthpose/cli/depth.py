@@ -5,7 +5,8 @@ from pathlib import Path
 
 import tyro
 
-from depthpose.cli.depth.options import (
+from depthpose.cli.arguments import NewPath, NewPlace, Source
+from depthpose.cli.depth_options import (
     ImageNetworks,
     LensOptions,
     MatcherOptions,
@@ -17,14 +18,14 @@ from depthpose.cli.depth.options import (
     ScaleOptions,
     refuse_ignored,
 )
-from depthpose.cli.engine import EngineOptions, Weights
+from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 
 
 def predict(
-    images: tyro.conf.Positional[tuple[str, ...]],
-    out: str,
+    images: tyro.conf.Positional[tuple[Source, ...]],
+    out: NewPlace,
     lens: LensOptions = LensOptions(),
     scale: ScaleOptions = ScaleOptions(),
     networks: ImageNetworks = ImageNetworks(),
@@ -48,65 +49,40 @@ def predict(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
     """
-    from depthpose.cli.depth import methods, predicting
+    from depthpose.cli.depth_methods import MethodSource
+    from depthpose.cli.depth_predict import find_sources, predict_all, read_lens
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    config = matching.config
-    output.refuse_unusable()
-    scale.refuse_unusable()
-    networks.refuse_contradiction(matching)
-    if engine.is_ray:
-        return _predict_on_ray(images, (lens, scale), networks, config, output, out, engine)
-    sources = predicting.find_sources(images, Path(out))
-    known = predicting.read_lens(lens, sources, scale)
-    method = methods.weights_method(
-        networks.weights,
-        config,
+    method = MethodSource(
+        weights=networks.weights,
+        config=matching.config,
         with_right=False,
         matcher=networks.matcher,
         allow_ood=networks.allow_ood,
         answer=networks.answer,
     )
-    if method.settings.get("answer") == "own":
+    output.refuse_unusable()
+    scale.refuse_unusable()
+    networks.refuse_contradiction(matching)
+    if engine.is_ray:
+        from depthpose.cli.depth_ray import predict_on_ray
+
+        return predict_on_ray(images, lens, scale, method.packed(), output, out, engine)
+    sources = find_sources(images, Path(out))
+    known = read_lens(lens, sources, scale)
+    built = method.build()
+    if built.settings.get("answer") == "own":
         matching.refuse_matcher_options()
-    return predicting.predict_all(sources, known, method, Path(out), output)
-
-
-def _predict_on_ray(
-    images: tuple[str, ...],
-    lens: tuple[LensOptions, ScaleOptions],
-    networks: ImageNetworks,
-    config: MatcherConfig,
-    output: PredictOutput,
-    out: str,
-    on: EngineOptions,
-) -> int:
-    from depthpose.cli.depth import engine
-
-    if networks.matcher not in (None, "sgbm"):
-        raise InputError(
-            f"--matcher {networks.matcher}: --engine ray takes sgbm or the weights' own; make one "
-            "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence L "
-            "--out W'"
-        )
-    spec = engine.NetSpec(
-        weights=Weights.read(networks.weights),
-        config=config,
-        with_right=False,
-        with_sgbm=networks.matcher == "sgbm",
-        allow_ood=networks.allow_ood,
-        answer=networks.answer,
-    )
-    return engine.predict(images, lens, spec, output, out, on)
+    return predict_all(sources, known, built, Path(out), output)
 
 
 def match(
-    left: tyro.conf.Positional[str],
-    right: tyro.conf.Positional[str | None] = None,
+    left: tyro.conf.Positional[Source],
+    right: tyro.conf.Positional[Source | None] = None,
     *,
     camera: Path,
-    out: str,
+    out: NewPlace,
     pairs: PairNetworks = PairNetworks(),
     matching: MatchOptions = MatchOptions(),
     engine: EngineOptions = EngineOptions(),
@@ -131,61 +107,37 @@ def match(
             Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
-    from depthpose.cli.depth import matching as pairs_of
-    from depthpose.cli.depth import methods
+    from depthpose.cli.depth_match import Pairs, match_all, say_tile_change
+    from depthpose.cli.depth_methods import MethodSource
     from depthpose.core.run import refuse_among_inputs
 
-    weights = pairs.used
-    config = matching.config
-    if weights is None and config != MatcherConfig():
+    method = MethodSource(weights=pairs.used, config=matching.config, with_right=True)
+    if method.weights is None and method.config != MatcherConfig():
         raise InputError(
             "--device, --speed, --precision, --max-memory, --tile and --left-right-check are for "
             "matchers with weights; sgbm takes none."
         )
     if engine.is_ray:
-        return _match_on_ray(left, right, camera, weights, config, out, engine, pairs)
+        from depthpose.cli.depth_ray import match_on_ray
+
+        sides = [left] if right is None else [left, right]
+        return match_on_ray(
+            sides, camera, method.packed(), out, engine,
+            with_cloud=pairs.cloud, with_check=pairs.check,
+        )  # fmt: skip
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    found = pairs_of.Pairs.find(left, right, camera)
-    refuse_among_inputs(Path(out), (left, right), (*found.left, *found.right))
-    if weights is None:
-        method = methods.sgbm_method(with_filled_holes=False)
-    else:
-        method = methods.weights_method(weights, config, with_right=True)
+    files = Pairs.find(left, right, camera)
+    refuse_among_inputs(Path(out), (left, right), (*files.left, *files.right))
+    built = method.build()
     if matching.tile is not None:
-        pairs_of.say_tile_change(found, method)
-    return pairs_of.match_all(
-        found, method, Path(out), with_cloud=pairs.cloud, with_check=pairs.check
-    )
-
-
-def _match_on_ray(
-    left: str,
-    right: str | None,
-    camera: Path,
-    weights: str | None,
-    config: MatcherConfig,
-    out: str,
-    on: EngineOptions,
-    pairs: PairNetworks,
-) -> int:
-    from depthpose.cli.depth import engine as engine_depth
-
-    spec = engine_depth.NetSpec(
-        weights=None if weights is None else Weights.read(weights),
-        config=config,
-        with_right=True,
-        with_sgbm=False,
-    )
-    words = [left] if right is None else [left, right]
-    return engine_depth.match(
-        words, camera, spec, out, on, with_cloud=pairs.cloud, with_check=pairs.check
-    )
+        say_tile_change(files, built)
+    return match_all(files, built, Path(out), with_cloud=pairs.cloud, with_check=pairs.check)
 
 
 def evaluate(
     data: Path,
-    out: Path,
+    out: NewPath,
     split: str | None = None,
     methods: MethodOptions = MethodOptions(),
     comparison: ProtocolOptions = ProtocolOptions(),
@@ -209,35 +161,38 @@ def evaluate(
         split: eigen-test, eigen-val, eigen-train, eigen-train-val, eigen-benchmark, or a file of
             frames.
     """
-    from depthpose.cli.depth import evaluating
+    from depthpose.cli.depth_evaluate import (
+        ShardTruth,
+        choose_methods,
+        measure,
+        measure_shards,
+        open_frames,
+        predict_all,
+    )
     from depthpose.core.engine import is_job
     from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
     from depthpose.report.page import table_files
 
-    predictions = methods.predictions
     methods.refuse_none()
     refuse_ignored(methods.weights, matching)
     comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
-    dataset = evaluating.open_frames(data, split)
-    chosen = evaluating.choose_methods(methods, matching.config, dataset)
-    home = out / "predictions"
-    files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
+    dataset = open_frames(data, split)
+    chosen = choose_methods(methods, matching.config, dataset)
     is_url = re.match(r"\w+:/", str(data)) is not None
     where = str(data if is_url else data.resolve())
     about = {"data": where, "split": None if split is None else str(split)}
     about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
+    files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate", **about}, files)
-    folders = [evaluating.predict_all(dataset, method, rule, home) for method in chosen]
-    name, caps_m = comparison.protocol, comparison.cap
+    folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
+    name, caps_m, predictions = comparison.protocol, comparison.cap, methods.predictions
     if predictions is not None and is_job(predictions):
-        from depthpose.cli.depth.engine import ShardTruth, measure_shards
-
         truth = ShardTruth(data=str(data.resolve()), split=split, protocol=name, caps_m=caps_m)
         ready = measure_shards(dataset, predictions, truth, out, engine)
-        return evaluating.measure(dataset, folders, name, caps_m, out, [ready])
+        return measure(dataset, folders, name, caps_m, out, [ready])
     if engine.is_ray:
         raise InputError("--engine ray measures shards; give them by --predictions")
     folders += [] if predictions is None else [Path(predictions)]
-    return evaluating.measure(dataset, folders, name, caps_m, out)
+    return measure(dataset, folders, name, caps_m, out)

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from depthpose.cli.help import group
-from depthpose.cli.options import Device
+from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, group
 from depthpose.core.errors import InputError
+from depthpose.core.units import Unit, metres_of
 
 if TYPE_CHECKING:
-    from depthpose.depth.datasets import Duplicate, Frame
+    from torch import Tensor
+
+    from depthpose.core.camera import RawPair, RectificationReport, Rectifier
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.labels import LabelConfig
 
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 class LabelOptions:
     """What matches the pairs, and what counts as known."""
 
-    weights: str = "default"
+    weights: WeightsName = "default"
     """with a matcher, by name or file; their terms hold for the labels too."""
     device: Device = "cpu"
     max_difference_px: float = 1.0
@@ -100,7 +102,11 @@ def check(
 
     check_folder = check_bop if is_bop(path) else check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
-        show = partial(_show_done, bar)
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
         report = check_folder(path, split, with_decoding=with_decoding, progress=show)
     for problem in (*report.notices, *report.problems):
         print(f"{problem.kind}: {problem.path}: {problem.message}")
@@ -108,13 +114,8 @@ def check(
     return 0 if report.is_ok else 1
 
 
-def _show_done(bar: Any, done: int, total: int) -> None:  # noqa: ANN401  tqdm's
-    bar.total = total
-    bar.update(done - bar.n)
-
-
 def pack(
-    path: tyro.conf.Positional[Path], out: Path, split: str | None = None, shard_mb: int = 256
+    path: tyro.conf.Positional[Path], out: NewPath, split: str | None = None, shard_mb: int = 256
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
 
@@ -131,36 +132,31 @@ def pack(
     """
     from tqdm import tqdm
 
+    from depthpose.core.run import refuse_to_replace
     from depthpose.depth.datasets import open_dataset, pack_frames
 
     if shard_mb < 1:
         raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
     dataset = open_dataset(path, split)
-    _refuse_to_pack(path, dataset.frames, out)
-    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
-        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
-    print(f"{len(dataset)} frames in {shards} shards: {out}")
-    return 0
-
-
-def _refuse_to_pack(path: Path, frames: "list[Frame]", out: Path) -> None:
-    from depthpose.core.run import refuse_to_replace
-
     refuse_to_replace(out / "index.json")
-    if any(part.suffix == ".tar" for frame in frames[:1] for part in frame.left.parents):
+    if any(part.suffix == ".tar" for frame in dataset.frames[:1] for part in frame.left.parents):
         raise InputError(f"{path}: is packed already; give the folder that it was made of")
     if out.resolve() == path.resolve():
         raise InputError(
             f"--out {out}: is the data set itself, which would be read as packed from then on; "
             "choose another folder"
         )
+    with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:
+        shards = pack_frames(dataset.frames, out, shard_mb * 10**6, lambda _: bar.update())
+    print(f"{len(dataset)} frames in {shards} shards: {out}")
+    return 0
 
 
 def duplicates(
     train: tyro.conf.Positional[Path],
     evaluation: tyro.conf.Positional[Path],
     at_least: float = 0.3,
-    out: Path | None = None,
+    out: NewPath | None = None,
 ) -> int:
     """List images of one set that show nearly the same as images of another.
 
@@ -181,7 +177,7 @@ def duplicates(
 
     from depthpose.core.run import claim_folder
     from depthpose.depth.datasets import find_duplicates, open_dataset
-    from depthpose.report.page import table_files
+    from depthpose.report.page import markdown_table, table_files, write_table
 
     if not -1 <= at_least <= 1:
         raise InputError(f"--at-least {at_least:g}: a similarity is -1 .. 1; take 0.3")
@@ -191,28 +187,20 @@ def duplicates(
         about |= {"command": "data duplicates", "at_least": at_least}
         claim_folder(out, about, table_files("duplicates"))
     ranked = find_duplicates(*sets, at_least, partial(tqdm, unit=" frames", disable=None))
-    count = _list_duplicates([pair for pair in ranked if pair.similarity >= at_least], out)
-    best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
-    size = f"{len(sets[0])} x {len(sets[1])} images"
-    print(f"{size}: {count} pairs of similarity {at_least:g} or more; the most similar: {best}")
-    return 1 if count else 0
-
-
-def _list_duplicates(pairs: "list[Duplicate]", out: Path | None) -> int:
-    """Print pairs, and write them; give their number."""
-    from depthpose.report.page import markdown_table, write_table
-
-    rows = [asdict(pair) for pair in pairs]
+    rows = [asdict(pair) for pair in ranked if pair.similarity >= at_least]
     if rows:
         print(markdown_table(rows))
     if out is not None:
         write_table(out, rows, name="duplicates")
-    return len(rows)
+    best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
+    size = f"{len(sets[0])} x {len(sets[1])} images"
+    print(f"{size}: {len(rows)} pairs of similarity {at_least:g} or more; the most similar: {best}")
+    return 1 if rows else 0
 
 
 def label(
     path: tyro.conf.Positional[Path],
-    out: Path,
+    out: NewPath,
     labels: LabelOptions = LabelOptions(),
 ) -> int:
     """Make truth for pairs that have none: match them both ways, keep where both views agree.
@@ -238,10 +226,6 @@ def label(
     noted = failures if len(dataset) > 1 else None
     labelled = label_pairs(labels.load(), dataset, config, out, settings, failures=noted)
     shares = [share for _, share in _shown(labelled, None, "pairs")]
-    return _say_labelled(out, shares, failures)
-
-
-def _say_labelled(out: Path, shares: list[float], failures: list[InputError]) -> int:
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     known = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
@@ -253,7 +237,7 @@ def _say_labelled(out: Path, shares: list[float], failures: list[InputError]) ->
 def export_depth(
     results: tyro.conf.Positional[Path],
     format: Literal["colmap", "nerfstudio"],
-    out: Path,
+    out: NewPath,
     export: ExportOptions = ExportOptions(),
 ) -> int:
     """Write depth of 'depth predict' or 'depth match' as files of COLMAP or nerfstudio.
@@ -274,43 +258,37 @@ def export_depth(
         format: program whose format is written.
         out: folder to write to: COLMAP's dense workspace, or nerfstudio's data set.
     """
+    from depthpose.core.run import claim_folder
+    from depthpose.depth import exchange
+
     export.refuse_unusable(format)
+    settings = {"command": "data export-depth", "results": str(results.resolve())}
+    settings |= {"scale": export.scale, "format": format}
     if format == "colmap":
-        return _export_colmap(results, out, export)
-    return _export_nerfstudio(results, out, export)
-
-
-def _export_colmap(results: Path, out: Path, options: ExportOptions) -> int:
-    from depthpose.core.run import claim_folder
-    from depthpose.depth import exchange
-
-    named = exchange.colmap_files(results, options.images)
-    claim_folder(out, _export_settings(results, options, "colmap"), named.values())
-    list(_shown(exchange.write_colmap(results, out, named, options.scale), len(named), "frames"))
-    print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
-    return 0
-
-
-def _export_nerfstudio(results: Path, out: Path, options: ExportOptions) -> int:
-    from depthpose.core.run import claim_folder
-    from depthpose.depth import exchange
-
-    named = exchange.nerfstudio_files(results, options.files)
+        named = exchange.colmap_files(results, export.images)
+        claim_folder(out, settings, named.values())
+        written = exchange.write_colmap(results, out, named, export.scale)
+        list(_shown(written, len(named), "frames"))
+        print(f"{out}: depth of {len(named)} images in stereo/depth_maps")
+        return 0
+    named = exchange.nerfstudio_files(results, export.files)
     frames = exchange.nerfstudio_frames(out, named)
-    own = {**_export_settings(results, options, "nerfstudio"), "files": options.files}
-    claim_folder(out, own, [*named.values(), exchange.TRANSFORMS_DEPTH])
-    written = exchange.write_nerfstudio(results, out, named, options.scale)
+    files = [*named.values(), exchange.TRANSFORMS_DEPTH]
+    claim_folder(out, settings | {"files": export.files}, files)
+    written = exchange.write_nerfstudio(results, out, named, export.scale)
     lost = sum(_shown(written, len(named), "frames"))
     if frames is not None:
         exchange.write_transforms(out, frames)
-    _say_nerfstudio(out, len(named), lost, is_listed=frames is not None)
+    there = "there is no transforms.json"
+    beside = there if frames is None else "transforms_depth.json names them"
+    print(f"{out}: depth of {len(named)} frames in depths; {beside}")
+    if lost:
+        print(
+            f"depthpose: {lost} pixels are beyond 65.535 m, which a PNG cannot hold, and are "
+            "unknown there; --files npy keeps them",
+            file=sys.stderr,
+        )
     return 0
-
-
-def _export_settings(results: Path, options: ExportOptions, format: str) -> dict[str, Any]:
-    folder = str(results.resolve())
-    own = {"command": "data export-depth", "results": folder, "scale": options.scale}
-    return {**own, "format": format}
 
 
 def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[Any]":
@@ -319,12 +297,158 @@ def _shown(written: "Iterable[Any]", total: int | None, what: str) -> "Iterable[
     return tqdm(written, total=total, unit=f" {what}", leave=False, disable=None)
 
 
-def _say_nerfstudio(out: Path, frames: int, lost: int, *, is_listed: bool) -> None:
-    beside = "transforms_depth.json names them" if is_listed else "there is no transforms.json"
-    print(f"{out}: depth of {frames} frames in depths; {beside}")
-    if lost:
-        print(
-            f"depthpose: {lost} pixels are beyond 65.535 m, which a PNG cannot hold, and are "
-            "unknown there; --files npy keeps them",
-            file=sys.stderr,
+_LOOKED_AT = 8
+"""Pairs that are checked before anything is written."""
+_WARN_PX = 0.5
+_SIDES = ("left", "right")
+_ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
+
+
+@group
+class RectifyOptions:
+    """What the calibration says, and what is kept of the images."""
+
+    unit: Unit | None = None
+    """of the translation between the cameras: that of the calibration board (default m)."""
+    fisheye: bool = False
+    """the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it."""
+    keep: float = 0.0
+    """0 keeps only what the raw images show, 1 all of it, with black borders."""
+    check: bool = True
+    """refuse what is swapped or differs by more than a row."""
+
+    def read(self, camera: Path) -> "RawPair":
+        """Read the calibration of both cameras."""
+        from depthpose.core.camera import read_raw_pair
+
+        return read_raw_pair(
+            camera,
+            unit_m=metres_of(self.unit) if self.unit else None,
+            is_fisheye=self.fisheye or None,
         )
+
+
+def rectify(
+    left: tyro.conf.Positional[Source],
+    right: tyro.conf.Positional[Source],
+    camera: Path,
+    out: NewPath,
+    rectifying: RectifyOptions = RectifyOptions(),
+) -> int:
+    """Rectify raw stereo pairs by the calibration of their two cameras, with OpenCV.
+
+    Writes left/NAME.png, right/NAME.png and camera.json, the camera of the rectified pairs: OUT is
+    input for 'depth match' and 'data check'. First, corners of up to 8 pairs are
+    matched and the differences of their rows printed: a warning above 0.5 px, an error where most
+    of these pairs are not rectified. Needs the extra 'opencv'.
+
+        depthpose data rectify left.png right.png --camera stereo.yaml --out rectified
+        depthpose data rectify 'raw/cam0/*.png' 'raw/cam1/*.png' --camera camchain.yaml --out out
+        depthpose depth match rectified/left rectified/right --camera rectified/camera.json --out o
+
+    Args:
+        left: raw left image, a folder of them, or a quoted pattern such as 'left/*.png'.
+        right: raw right image, folder or pattern; images are paired by their names, or the numbers
+            in them.
+        camera: calibration of both cameras: a camchain of Kalibr, a file of OpenCV's K1, D1, K2,
+            D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
+            with left.yaml and right.yaml of ROS.
+        out: folder for the results.
+    """
+    from tqdm import tqdm
+
+    from depthpose.cli.depth_match import list_pairs
+    from depthpose.core.camera import make_rectifier, write_camera
+    from depthpose.core.files import image_size, write_image
+    from depthpose.core.run import claim_folder, claim_names
+
+    calibration = rectifying.read(camera)
+    lefts, rights = list_pairs(left, right)
+    homes = {(out / side).resolve() for side in _SIDES}
+    if any(path.parent.resolve() in homes for path in (*lefts, *rights)):
+        raise InputError(
+            f"--out {out}: the inputs lie in its left or right, where the results would be written "
+            "over them; choose another folder"
+        )
+    rectifier = make_rectifier(calibration, image_size(lefts[0]), rectifying.keep)
+    pairs = list(zip(lefts, rights, strict=True))
+    _check_rows(rectifier, pairs, is_refused=rectifying.check)
+    settings = {
+        "command": "data rectify",
+        "right_from_left": calibration.right_from_left.matrix().tolist(),
+        "keep": rectifying.keep,
+    }
+    for side, camera_of_side in zip(_SIDES, (calibration.left, calibration.right), strict=True):
+        settings[side] = {
+            "K": camera_of_side.K.tolist(),
+            "D": list(camera_of_side.distortion),
+            "is_fisheye": camera_of_side.is_fisheye,
+        }
+    claim_folder(out, settings, [*_SIDES, "camera.json"])
+    claim_names(out, {first.stem: (first, second) for first, second in pairs})
+    for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
+        for side, image in zip(_SIDES, _rectified(rectifier, first, second), strict=True):
+            write_image(out / side / f"{first.stem}.png", image)
+    write_camera(out / "camera.json", rectifier.rig)
+    print(f"{out}: {len(pairs)} pairs in left and right, their camera in camera.json")
+    return 0
+
+
+def _rectified(rectifier: "Rectifier", first: Path, second: Path) -> tuple["Tensor", "Tensor"]:
+    from depthpose.core.files import read_image
+
+    images = [read_image(path) for path in (first, second)]
+    for path, image in zip((first, second), images, strict=True):
+        rectifier.refuse_other_size(image, str(path))
+    return rectifier.rectify(*images)
+
+
+def _check_rows(
+    rectifier: "Rectifier", pairs: list[tuple[Path, Path]], *, is_refused: bool
+) -> None:
+    """Check some rectified pairs, spread over all, and say by how much their rows differ."""
+    from statistics import median
+
+    from depthpose.core.camera import check_rectified
+
+    rig = rectifier.rig
+    print(
+        f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
+        f"{rig.baseline_m:.4f} m; the raw images show {rectifier.seen_share:.1%} of the left view"
+    )
+    count = min(_LOOKED_AT, len(pairs))
+    some = [pairs[k * len(pairs) // count] for k in range(count)]
+    reports = [
+        check_rectified(*_rectified(rectifier, *pair), rig.cx_right_minus_left_px) for pair in some
+    ]
+    known = [report for report in reports if report.is_rectified is not None]
+    if not known:
+        unknown = f"depthpose: the rows cannot be checked: {reports[0].message}"
+        print(unknown, file=sys.stderr)
+        return
+    measured = [report for report in known if report.matches] or known
+    offset_px = median(abs(report.vertical_offset_px) for report in measured)
+    said = (
+        f"rows of {len(known)} pairs: they differ by {offset_px:.2f} px, with a spread of "
+        f"{median(report.vertical_spread_px for report in measured):.2f} px "
+        f"({sum(report.matches for report in known)} matches)"
+    )
+    wrong = _what_is_wrong(known)
+    if wrong and is_refused:
+        raise InputError(f"{said}: {wrong}. Nothing was written (--no-check writes all the same)")
+    print(said)
+    if wrong or offset_px > _WARN_PX:
+        wrong = wrong or f"that is above {_WARN_PX:g} px, which costs depth far away; {_ASK}"
+        print(f"depthpose: {wrong}", file=sys.stderr)
+
+
+def _what_is_wrong(known: "list[RectificationReport]") -> str | None:
+    """Say what is wrong with more than half of the pairs."""
+    if 2 * sum(bool(report.is_swapped) for report in known) > len(known):
+        return "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
+    if 2 * sum(report.is_wrong for report in known) > len(known):
+        return (
+            "they are not rectified by it, so this is not the calibration of these images, or "
+            f"LEFT and RIGHT are exchanged; {_ASK}"
+        )
+    return None

@@ -3,7 +3,7 @@
 import re
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth.methods import Method
-from depthpose.cli.depth.options import LensOptions, PredictOutput, ScaleOptions
-from depthpose.cli.depth.page import PAGE, write_depth_page
+from depthpose.cli.depth_methods import Method
+from depthpose.cli.depth_options import LensOptions, PredictOutput, ScaleOptions
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.pinhole import camera_keys
 from depthpose.core.draw import draw_depth
@@ -31,19 +30,31 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
+from depthpose.core.files.text import read_text
 from depthpose.core.results import note_result
-from depthpose.core.run import claim_folder, claim_names, find_rank, refuse_among_inputs
+from depthpose.core.run import (
+    claim_folder,
+    claim_names,
+    environment,
+    find_rank,
+    refuse_among_inputs,
+)
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD_M,
+    COLOR_RANGE_M,
     ENDINGS,
     is_finished,
+    read_estimate,
     write_estimate,
 )
 from depthpose.depth.types import StereoInput
+from depthpose.report.depth import DepthShown, depth_section
+from depthpose.report.page import MOST_VIEWS, Section, spread_evenly, write_page
 from depthpose.report.viewer import Viewer, open_viewer
 
+PAGE = "report.html"
 _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
 
@@ -52,23 +63,23 @@ _SAME_FOCAL = 0.01
 class Lens:
     """What is known of the camera, and what sets the scale."""
 
-    given: Camera | FieldOfView | float
+    camera: Camera | FieldOfView | float
     scale: ScaleOptions
 
     def camera_of(self, image: Tensor) -> Camera:
         """Make the camera of an image."""
-        camera = camera_of(self.given, (image.shape[2], image.shape[1]))
+        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
         assert camera is not None
         mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
         return replace(camera, **{key: value for key, value in mount.items() if value is not None})
 
     def facts(self) -> dict[str, Any]:
         """Give what is known as JSON values: it decides the results."""
-        known: dict[str, Any] = {"focal_px": self.given}
-        if isinstance(self.given, FieldOfView):
-            known = {"fov_deg": self.given.degrees}
-        elif isinstance(self.given, Camera):
-            keys = camera_keys(self.given)
+        known: dict[str, Any] = {"focal_px": self.camera}
+        if isinstance(self.camera, FieldOfView):
+            known = {"fov_deg": self.camera.degrees}
+        elif isinstance(self.camera, Camera):
+            keys = camera_keys(self.camera)
             known = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
         return known | {
             key: value for key, value in asdict(self.scale).items() if value is not None
@@ -91,34 +102,40 @@ def read_lens(options: LensOptions, sources: Sequence[Path], scale: ScaleOptions
     if focal_px is not None and not 1 < focal_px < 1e6:
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
-        return Lens(given=FieldOfView(fov), scale=scale)
+        return Lens(camera=FieldOfView(fov), scale=scale)
     if options.camera is None:
-        return Lens(given=_exif_of_all(sources) if focal_px is None else focal_px, scale=scale)
-    read = read_camera(options.camera, _first_size(sources))
+        focal_px = _exif_of_all(sources) if focal_px is None else focal_px
+        return Lens(camera=focal_px, scale=scale)
+    size = None
+    for source in sources:
+        with suppress(InputError):  # an image that cannot be read fails by itself, later
+            size = _size_of(source)
+            break
+    read = read_camera(options.camera, size)
     if isinstance(read, StereoRig):
         print("the camera's baseline is ignored: one image has none", file=sys.stderr)
         keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
         read = Camera(width=read.width, height=read.height, K=read.K, **keys)
-    return Lens(given=read, scale=scale)
+    return Lens(camera=read, scale=scale)
 
 
 def _exif_of_all(sources: Sequence[Path]) -> float:
     """Read the focal length that the EXIF of all images says, and say it."""
     known: dict[str, tuple[float, str]] = {}
     for source in sources:
-        found = None
+        focal = None
         if not _is_video(source):
             try:
-                found = read_exif_focal(source)
+                focal = read_exif_focal(source)
             except InputError:  # what cannot be read fails by itself, later
                 continue
-        if found is None:
+        if focal is None:
             raise InputError(
                 f"metres from one image need its focal length, and {source.name} has none in its "
                 "EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to right (a "
                 "phone's main camera has about 0.75 times the image's width, or 67 degrees)"
             )
-        known[source.name] = found
+        known[source.name] = focal
     if not known:
         raise InputError(
             "no image can be read; give --camera, --focal-px or --fov, and intact ones"
@@ -142,37 +159,36 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
         InputError: nothing there, two inputs whose results would have one name, or a folder of
             inputs that is ``out`` too.
     """
-    found: list[Path] = []
+    sources: list[Path] = []
     for word in words:
-        found += [Path(word)] if _is_video(Path(word)) else list_images(word)
-    stems = Counter(path.stem for path in found)
+        sources += [Path(word)] if _is_video(Path(word)) else list_images(word)
+    stems = Counter(path.stem for path in sources)
     twice = next((stem for stem, times in stems.items() if times > 1), None)
     if twice is not None:
         raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
-    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in found
+    frames = [re.fullmatch(re.escape(path.stem) + r"_\d{6}", stem) for path in sources
               if _is_video(path) for stem in stems]  # fmt: skip
     if (frame := next(filter(None, frames), None)) is not None:
         raise InputError(
             f"an input is called {frame[0]!r}, as a frame of a video would be, and so would their "
             "results; rename one of the two"
         )
-    refuse_among_inputs(out, words, found)
-    return found
+    refuse_among_inputs(out, words, sources)
+    return sources
 
 
 def predict_all(
-    sources: list[Path], lens: Lens, method: Method, out: Path, look: PredictOutput
+    sources: list[Path], lens: Lens, method: Method, out: Path, output: PredictOutput
 ) -> int:
     """Predict what is not finished; an image that fails is named and stops no other."""
-    settings = {**method.settings, "camera": lens.facts(), "color_range_m": list(look.color_range)}
-    claim_folder(out, settings, [PAGE])
+    claim_folder(out, settings_of(method.settings, lens, output), [PAGE])
     videos = [source.stem for source in sources if _is_video(source)]
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
     claim_names(out, {source.stem: source for source in sources}, endings, videos)
     mine = [sources[k] for k in find_rank().share(len(sources))]
-    assert isinstance(method.net, FakestereoNet), "weights_method builds no other"
-    with open_viewer(None if find_rank().rank else look.view) as viewer:
-        predictor = Predictor(lens=lens, net=method.net, out=out, look=look, viewer=viewer)
+    assert isinstance(method.net, FakestereoNet), "weights build no other"
+    with open_viewer(None if find_rank().rank else output.view) as viewer:
+        predictor = Predictor(lens=lens, net=method.net, out=out, output=output, viewer=viewer)
         images = {path.stem: path for path in mine if not _is_video(path)}
         done = predictor.predict_images(images)
         for path in filter(_is_video, mine):
@@ -184,12 +200,12 @@ def predict_all(
         print(f"depthpose: failed: {failure}", file=sys.stderr)
     print(f"{done} depth maps are in {out}")
     if find_rank().rank == 0:
-        _write_page(sources, lens, out, look, [str(failure) for failure in failures])
+        _write_page(sources, lens, out, output, [str(failure) for failure in failures])
     return 1 if failures else 0
 
 
 def _write_page(
-    sources: list[Path], lens: Lens, out: Path, look: PredictOutput, failures: list[str]
+    sources: list[Path], lens: Lens, out: Path, output: PredictOutput, failures: list[str]
 ) -> None:
     """Write the page of what is finished: other processes may still be at work."""
     done = {source: _finished_names(source, out) for source in sources}
@@ -203,7 +219,7 @@ def _write_page(
                     yield StereoInput(name=name, left=image, right=None, camera=camera)
 
     write_depth_page(
-        out, [n for some in done.values() for n in some], read, failures, look.color_range
+        out, [n for some in done.values() for n in some], read, failures, output.color_range
     )
 
 
@@ -214,7 +230,7 @@ class Predictor:
     lens: Lens
     net: FakestereoNet
     out: Path
-    look: PredictOutput
+    output: PredictOutput
     viewer: Viewer | None = None
     failures: dict[str, InputError] = field(default_factory=dict)
 
@@ -224,13 +240,26 @@ class Predictor:
 
     def predict_video(self, source: Path) -> int:
         """Predict a video's frames, and make a video of them; give how many are done."""
+        frames: list[str] = []
+
+        def noted() -> Iterator[tuple[str, Tensor]]:
+            for name, image in video:
+                frames.append(name)
+                yield name, image
+
+        def colors() -> Iterator[Tensor]:
+            """Draw each frame's depth, in grey where there is none, so that none is missing."""
+            done, first = set(names), self.out / f"{min(names)}.depth_m.npy"
+            unknown = torch.full_like(read_map(first), torch.nan)
+            for name in frames:
+                depth_m = read_map(self.out / f"{name}.depth_m.npy") if name in done else unknown
+                yield draw_depth(depth_m, *self.output.color_range)
+
         try:
             video = read_video(source)
-            frames: list[str] = []
-            seen = _noted(iter(video), frames)
-            names = self._predict(seen, video.frames or None, source.name)
-            colors = _colors(frames, set(names), self.out, self.look)
-            write_video(self.out / f"{source.stem}{_VIDEO}", colors, video.fps)
+            names = self._predict(noted(), video.frames or None, source.name)
+            drawn = colors() if names else iter(())
+            write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
         except InputError as error:
             self.failures[source.name] = error
             return 0
@@ -248,7 +277,7 @@ class Predictor:
     ) -> list[str]:
         done: list[str] = []
         with tqdm(total=total, desc=what, disable=None, unit=" images") as bar:
-            while chunk := list(islice(frames, self.look.batch)):
+            while chunk := list(islice(frames, self.output.batch)):
                 done += self._predict_chunk([self._input(*frame) for frame in chunk])
                 bar.update(len(chunk))
         return done
@@ -258,39 +287,28 @@ class Predictor:
 
     def _predict_chunk(self, inputs: list[StereoInput]) -> list[str]:
         """Predict inputs together; where one of them is unusable, each alone."""
-        wanted = [
-            given
-            for given in inputs
-            if not is_finished(self.out, given.name, with_cloud=self.look.cloud)
-        ]
+        with_cloud, color_range = self.output.cloud, self.output.color_range
+        wanted = [i for i in inputs if not is_finished(self.out, i.name, with_cloud=with_cloud)]
         try:
-            found = self.net.estimate_many(wanted)
-            known = self.lens.scale.distance
-            for given, one in zip(wanted, found, strict=True):
-                estimate = one if known is None else scale_by_distance(one, given.name, known)
-                cloud_m = CLOUD_M if self.look.cloud else None
-                files = write_estimate(self.out, given, estimate, self.look.color_range, cloud_m)
-                note_result(self.out, given.name, files)
+            distance = self.lens.scale.distance
+            for image, estimate in zip(wanted, self.net.estimate_many(wanted), strict=True):
+                if distance is not None:
+                    estimate = scale_by_distance(estimate, image.name, distance)  # noqa: PLW2901
+                cloud_m = CLOUD_M if with_cloud else None
+                files = write_estimate(self.out, image, estimate, color_range, cloud_m)
+                note_result(self.out, image.name, files)
                 if estimate.warning:
-                    tqdm.write(f"depthpose: warning: {given.name}: {estimate.warning}", sys.stderr)
+                    tqdm.write(f"depthpose: warning: {image.name}: {estimate.warning}", sys.stderr)
                 if estimate.ground is not None:
-                    tqdm.write(f"{given.name}: {estimate.ground}")
+                    tqdm.write(f"{image.name}: {estimate.ground}")
                 if self.viewer is not None:
-                    self.viewer.show_depth(given, estimate)
+                    self.viewer.show_depth(image, estimate)
         except InputError as error:
             if len(inputs) > 1:
-                return [name for given in inputs for name in self._predict_chunk([given])]
+                return [name for image in inputs for name in self._predict_chunk([image])]
             self.failures[inputs[0].name] = error
             return []
-        return [given.name for given in inputs]
-
-
-def _first_size(sources: Sequence[Path]) -> tuple[int, int] | None:
-    """Give width and height of the first image that can be read; the others fail by themselves."""
-    for source in sources:
-        with suppress(InputError):
-            return _size_of(source)
-    return None
+        return [image.name for image in inputs]
 
 
 def _size_of(source: Path) -> tuple[int, int]:
@@ -309,8 +327,8 @@ def _finished_names(source: Path, out: Path) -> list[str]:
     if not _is_video(source):
         return [source.stem] if is_finished(out, source.stem) else []
     frame = re.compile(re.escape(source.stem) + r"_\d{6}\.disparity_px\.npy")
-    found = sorted(path.name for path in out.iterdir() if frame.fullmatch(path.name))
-    return [name.removesuffix(".disparity_px.npy") for name in found]
+    names = sorted(path.name for path in out.iterdir() if frame.fullmatch(path.name))
+    return [name.removesuffix(".disparity_px.npy") for name in names]
 
 
 def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tensor]]:
@@ -325,19 +343,47 @@ def _read_some(source: Path, wanted: Sequence[str]) -> Iterator[tuple[str, Tenso
                 return
 
 
-def _noted(frames: Iterator[tuple[str, Tensor]], names: list[str]) -> Iterator[tuple[str, Tensor]]:
-    for name, image in frames:
-        names.append(name)
-        yield name, image
+def write_depth_page(
+    out: Path,
+    names: Sequence[str],
+    read: Callable[[Sequence[str]], Iterator[StereoInput]],
+    failures: Sequence[str],
+    range_m: tuple[float, float] = COLOR_RANGE_M,
+) -> None:
+    """Write a page of some of the depth maps that a folder holds, of warnings and of what failed.
+
+    Args:
+        out: the folder.
+        names: of all that are there.
+        read: gives what some of them were made of, as far as that can still be read.
+        failures: why others are not there, a sentence each.
+        range_m: metres of the brightest and the darkest colour.
+    """
+    chosen = [names[k] for k in spread_evenly(len(names), MOST_VIEWS)]
+    pairs = list(read(chosen))
+    which = "all" if len(pairs) == len(names) else "spread evenly"
+    text = f"Shown: {len(pairs)} of {_count(len(names), 'depth map')} in this folder ({which})."
+    noted = [{"not estimated, because": reason} for reason in failures]
+    doubts = {name: out / f"{name}.warning.txt" for name in names}
+    noted += [
+        {"warning": f"{name}: {read_text(path).strip()}"}
+        for name, path in doubts.items()
+        if path.is_file()
+    ]
+    sections = [Section(title="What is here", text=text, rows=noted)]
+    for pair in pairs:
+        estimate = read_estimate(out, pair.name, pair.camera)
+        shown = DepthShown(pair=pair, estimate=estimate, range_m=range_m)
+        sections.append(depth_section(pair.name, shown))
+    page = out / PAGE
+    write_page(page, f"Depth of {_count(len(names), 'image')}", sections, environment())
+    print(f"the page: {page}")
 
 
-def _colors(
-    frames: list[str], done: Collection[str], out: Path, look: PredictOutput
-) -> Iterator[Tensor]:
-    """Draw the depth of a video's frames, in grey where there is none, so that none is missing."""
-    if not done:
-        return
-    unknown = torch.full_like(read_map(out / f"{min(done)}.depth_m.npy"), torch.nan)
-    for name in frames:
-        depth_m = read_map(out / f"{name}.depth_m.npy") if name in done else unknown
-        yield draw_depth(depth_m, *look.color_range)
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def settings_of(method: dict[str, Any], lens: Lens, output: PredictOutput) -> dict[str, Any]:
+    """Give what decides the results, for the record of a run."""
+    return {**method, "camera": lens.facts(), "color_range_m": list(output.color_range)}

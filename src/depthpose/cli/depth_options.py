@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from depthpose.cli.help import group
-from depthpose.cli.options import Device
+from depthpose.cli.arguments import Device, Source, View, WeightsName, group, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
@@ -24,7 +23,7 @@ class MatcherOptions:
     device: Device = "cpu"
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32, or bf16: faster, with errors of a few hundredths of a pixel."""
-    max_memory: str | None = None
+    max_memory: Annotated[str | None, shown_as("SIZE")] = None
     """limit on the memory of a matcher's activations, such as 1GB or 800MB; the result stays
     exact."""
     speed: Speed = "fine"
@@ -140,9 +139,9 @@ class MatchOptions(MatcherOptions):
 class PairNetworks:
     """What matches real pairs, whether they are checked, and what is written."""
 
-    weights: str | None = None
+    weights: WeightsName | None = None
     """weights with a matcher, by name or file; 'default' unless sgbm matches."""
-    matcher: str | None = None
+    matcher: WeightsName | None = None
     """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
     matcher, by name or file. Left out: that of the weights."""
     cloud: bool = False
@@ -172,9 +171,9 @@ class PairNetworks:
 class ImageNetworks:
     """Which networks answer depth of one image."""
 
-    weights: str = "default"
+    weights: WeightsName = "default"
     """weights with a generator, by name or file ('depthpose weights list')."""
-    matcher: str | None = None
+    matcher: WeightsName | None = None
     """what matches the synthesised view: sgbm (OpenCV's), or other weights with a matcher, by name
     or file. Left out: that of the weights."""
     answer: Answer | None = None
@@ -210,7 +209,7 @@ class PredictOutput:
     with one."""
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
-    view: str | None = None
+    view: View = None
     """live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it."""
 
     def refuse_unusable(self) -> None:
@@ -232,7 +231,7 @@ class PredictOutput:
 class MethodOptions:
     """What is measured; several at once share the table."""
 
-    weights: tuple[str, ...] = ()
+    weights: tuple[WeightsName, ...] = ()
     """files or names. Weights with a generator are given the left view alone; 'both:NAME' gives
     their matcher the real right view too, 'sgbm:NAME' lets OpenCV match the synthesised one,
     'own:NAME', 'matched:NAME', 'joined:NAME' take the depth of one image from the generator, from
@@ -243,7 +242,7 @@ class MethodOptions:
     holes: Literal["fill", "leave"] = "fill"
     """sgbm's pixels without an answer: fill, as KITTI's devkit does, or leave them out (then the
     column 'coverage' is the share that was measured)."""
-    predictions: str | None = None
+    predictions: Source | None = None
     """measure these files: NAME.disparity_px.npy or NAME.depth_m.npy; or the shards that 'depth
     predict|match --engine ray' left, path or URL."""
     baseline: Annotated[tuple[BaselineName, ...], tyro.conf.arg(aliases=("--floor",))] = ()
@@ -314,7 +313,7 @@ def parse_bytes(text: str | None) -> int | None:
     """
     if text is None:
         return None
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if found is None or (found[3] and not found[2]):
+    size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
+    if size is None or (size[3] and not size[2]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
-    return int(float(found[1]) * (1024 if found[3] else 1000) ** _POWERS[found[2].upper()])
+    return int(float(size[1]) * (1024 if size[3] else 1000) ** _POWERS[size[2].upper()])

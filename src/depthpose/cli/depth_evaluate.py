@@ -1,7 +1,9 @@
 """The work behind ``depthpose depth evaluate``."""
 
+import json
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,9 +11,28 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.depth.methods import Method, baseline_method, named_method, sgbm_method
-from depthpose.cli.depth.options import MethodOptions
-from depthpose.cli.depth.page import frame_sections
+from depthpose.cli.depth_methods import (
+    Method,
+    baseline_method,
+    named_method,
+    sgbm_method,
+)
+from depthpose.cli.depth_options import MethodOptions
+from depthpose.cli.engine import EngineOptions
+from depthpose.core.engine import (
+    Done,
+    Files,
+    Function,
+    Job,
+    Sample,
+    read_job_settings,
+    read_shard,
+    result_items,
+    run_here,
+    run_job,
+    shard_results,
+    stem,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
 from depthpose.depth.config import MatcherConfig
@@ -20,22 +41,36 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     PROTOCOLS,
     Evaluation,
+    FrameRow,
+    Measured,
     Protocol,
     Row,
     Source,
     evaluate,
+    frame_result,
     has_truth,
+    measure_frame,
+    ranking_metric,
+    summarise,
 )
 from depthpose.depth.metrics import METRICS
-from depthpose.depth.predictions import is_finished, predict
+from depthpose.depth.predictions import (
+    is_finished,
+    predict,
+)
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.page import Section, plain_table, write_page, write_table
+from depthpose.report.depth import DepthError, DepthShown, depth_section
+from depthpose.report.page import (
+    Section,
+    choose_ranked,
+    plain_table,
+    share_views,
+    write_page,
+    write_table,
+)
 
-
-def printed_columns() -> list[str]:
-    """Name the columns that are printed; files hold all."""
-    metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
-    return ["method", "weights", "speed", "cap_m", "frames", "coverage", *metrics, "ause"]
+_SAID_ABOVE = ("method", "input", "speed", "weights", "protocol", "dataset")
+"""Columns that the title of a frame's part of the page says already."""
 
 
 def columns(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -173,29 +208,24 @@ def measure(
         *detail_sections(measured),
     ]
     write_page(page, f"{protocol} on {dataset.name}", sections, environment())
-    print(plain_table(rows, printed_columns()))
+    metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
+    about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
+    print(plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
     say_skipped(measured)
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {page}")
     return 0
-
-
-def measure_all(
-    dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
-) -> Evaluation:
-    """Measure several folders of predictions as one table; each row says whose it is."""
-    return join(measure_each(dataset, folders, protocol, caps_m))
 
 
 def measure_each(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> list[Evaluation]:
     """Measure folders of predictions one by one; each row says whose it is."""
-    found: list[Evaluation] = []
+    evaluations: list[Evaluation] = []
     show = partial(tqdm, unit=" frames", disable=None)
     for folder in folders:
         result = evaluate(dataset, folder, protocol, caps_m, show)
-        found.append(signed(result, folder.name, read_settings(folder)))
-    return found
+        evaluations.append(signed(result, folder.name, read_settings(folder)))
+    return evaluations
 
 
 def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
@@ -206,7 +236,17 @@ def signed(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Ev
         name: of their folder.
         settings: that made them, where they are ours.
     """
-    source = describe_source(name, settings)
+    holes = {True: " (holes filled)", False: " (matched pixels)"}
+    source = Source(method=name)
+    if settings is not None:
+        how = holes.get(settings.get("with_filled_holes", ""), "")
+        source = Source(
+            method=settings.get("matcher", "") + how,
+            input=settings.get("input", "both views"),
+            speed=settings.get("speed", ""),
+            weights=settings.get("weights", ""),
+            weights_sha256=settings.get("weights_sha256", "")[:12],
+        )
     short = {field: getattr(source, field) for field in ("method", "input", "speed", "weights")}
     return Evaluation(
         rows=[replace(row, **asdict(source)) for row in result.rows],
@@ -263,16 +303,142 @@ def say_skipped(measured: Evaluation) -> None:
     print(f"{len(measured.skipped)} frames skipped")
 
 
-def describe_source(name: str, settings: dict[str, Any] | None) -> Source:
-    """Say whose predictions a folder holds, by its name and its settings (None: not ours)."""
-    if settings is None:
-        return Source(method=name)
-    holes = {True: " (holes filled)", False: " (matched pixels)"}
-    suffix = holes.get(settings.get("with_filled_holes", ""), "")
-    return Source(
-        method=settings.get("matcher", "") + suffix,
-        input=settings.get("input", "both views"),
-        speed=settings.get("speed", ""),
-        weights=settings.get("weights", ""),
-        weights_sha256=settings.get("weights_sha256", "")[:12],
-    )
+def frame_sections(
+    dataset: Dataset,
+    folders: Sequence[Path],
+    rows: Sequence[Sequence[FrameRow]],
+    protocol: str,
+) -> list[Section]:
+    """Show the worst, the median and the best frame of each set of predictions.
+
+    Args:
+        dataset: as it was measured.
+        folders: of the predictions.
+        rows: of each folder's frames, as they were measured.
+        protocol: by which.
+    """
+    sections: list[Section] = []
+    for folder, of_folder, most in zip(folders, rows, share_views(len(folders)), strict=True):
+        cap_m = of_folder[0].cap_m
+        of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
+        metric = ranking_metric(cap_m)
+        sign = 1 if metric.better == "lower" else -1
+        cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
+        for role, k in choose_ranked([sign * row.metrics[metric.name] for row in of_cap], most):
+            row, value = of_cap[k], of_cap[k].metrics[metric.name]
+            frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
+            text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
+            index = next(i for i, frame in enumerate(dataset.frames) if frame.name == row.frame)
+            result = frame_result(dataset, index, folder, protocol, row.cap_m)
+            error = DepthError(
+                error=result.error,
+                is_disparity=PROTOCOLS[protocol].truth == "disparity",
+                true_depth_m=result.true_depth_m,
+            )
+            pair = dataset.read_input(index)
+            shown = DepthShown(pair=pair, estimate=result.estimate, error=error)
+            own = {name: v for name, v in row.columns().items() if name not in _SAID_ABOVE}
+            title = f"{folder.name}: {row.frame}, {role}"
+            sections.append(replace(depth_section(title, shown, text), rows=[own]))
+    return sections
+
+
+ENDING = "measured.json"
+RESULTS = Files(roles=("record", "shard"), suffixes=(".json", ".tar", ".parquet"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardTruth:
+    """Shards of predictions to the numbers of their frames; every worker reads the truth.
+
+    Attributes:
+        data: folder of the data set, which all workers see.
+        split: of it.
+        protocol: how prediction and truth are compared.
+        caps_m: metres beyond which truth does not count.
+    """
+
+    data: str
+    split: str | None
+    protocol: str
+    caps_m: tuple[float, ...]
+    files: Files = RESULTS
+    endings: Sequence[str] = (ENDING,)
+    batch: int = 1
+
+    def start(self) -> Function:
+        """Open the data set."""
+        dataset = open_dataset(Path(self.data), self.split)
+        places = {frame.name: index for index, frame in enumerate(dataset.frames)}
+
+        def measure(samples: Sequence[Sample], out: Path) -> list[str]:
+            return [self._measure_shard(dataset, places, sample, out) for sample in samples]
+
+        return measure
+
+    def _measure_shard(
+        self, dataset: Dataset, places: Mapping[str, int], sample: Sample, out: Path
+    ) -> str:
+        """Measure each frame by the files of its prediction; give why not where that fails."""
+        record, shard = sample.files
+        measured: dict[str, Any] = {}
+        try:
+            done = Done.from_json(record.read_bytes())
+            names = {name for name, reason in done.entries if not reason}
+            for name, files in read_shard(str(shard), names, done.endings):
+                if name not in places:
+                    continue
+                with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
+                    for ending, data in files.items():
+                        path = Path(folder) / f"{name}.{ending}"
+                        path.parent.mkdir(parents=True, exist_ok=True)
+                        path.write_bytes(data)
+                    rows = measure_frame(
+                        dataset, places[name], Path(folder), self.protocol, self.caps_m
+                    )
+                is_said = isinstance(rows, str)
+                measured[name] = rows if is_said else [row.to_values() for row in rows]
+        except InputError as error:
+            return str(error)
+        (out / f"{sample.name}.{ENDING}").write_text(json.dumps(measured))
+        return ""
+
+
+def measure_shards(
+    dataset: Dataset, predictions: str, truth: ShardTruth, out: Path, engine: EngineOptions
+) -> Evaluation:
+    """Measure shards of predictions, here or on a cluster, and put the rows together.
+
+    Each frame is measured where its shard is read; the rows of all frames are collected here in the
+    order of the data set, and summed as if one process had measured them.
+
+    Raises:
+        InputError: a prediction is missing or damaged, or no frame has truth.
+    """
+    items = result_items(predictions)
+    names = {item.name for item in items}
+    before = read_job_settings(predictions)
+    settings = {
+        "predictions": before, "data": truth.data, "split": truth.split,
+        "protocol": truth.protocol, "caps_m": list(truth.caps_m),
+    }  # fmt: skip
+    home = str(out / "measured" / stem(predictions.rstrip("/")))
+    job = Job(work=truth, items=items, out=home, settings=settings, block=1)
+    rows: dict[str, list[Measured] | str] = {}
+    for done in run_job(job, engine.build() if engine.is_ray else run_here):
+        for name, reason in done.failures:
+            if name in names:
+                raise InputError(f"{home}: {reason}")
+        for name, files in shard_results(home, done):
+            of_frames = json.loads(files[ENDING]) if name in names else {}
+            for frame, some in of_frames.items():
+                is_said = isinstance(some, str)
+                rows[frame] = some if is_said else [Measured.from_values(one) for one in some]
+    with tempfile.TemporaryDirectory() as nothing:
+        for index, frame in enumerate(dataset.frames):
+            if frame.name not in rows:  # it has no truth, or its absence is an error
+                rows[frame.name] = measure_frame(
+                    dataset, index, Path(nothing), truth.protocol, truth.caps_m
+                )
+    name = stem(predictions.rstrip("/"))
+    return signed(summarise(dataset, truth.protocol, rows), name, before)

@@ -1,0 +1,337 @@
+"""The options of commands: their types and how ``--help`` shows them; what is refused early.
+
+Types become words (``{None}|PATH`` is PATH), and a default that is nothing is not shown. Paths and
+weights that do not exist are refused before anything is loaded.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from difflib import get_close_matches
+from enum import Enum
+from inspect import signature, unwrap
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
+
+import tyro
+
+from depthpose.core.errors import InputError
+from depthpose.core.hub import find_weights, is_on_hub
+
+
+class _Names(Enum):
+    """What the value of an option names, where its type alone does not say it."""
+
+    INPUT = "what is read"
+    NEW = "what need not exist"
+    WEIGHTS = "weights"
+
+
+Source = Annotated[str, _Names.INPUT]
+"""A file, folder, pattern or URL that is read; a ``Path`` is a file or folder that is read."""
+NewPath = Annotated[Path, _Names.NEW]
+"""A file or folder that need not exist: it is written, or the command itself says it is missing."""
+NewPlace = Annotated[str, _Names.NEW]
+"""A folder or URL that is written."""
+WeightsName = Annotated[str, _Names.WEIGHTS]
+"""Weights, by name or file, or a word in their place."""
+
+_WORDS = ("sgbm", "nothing", "open3d", "register")
+"""What may be said in place of weights."""
+_PREFIXES = ("both:", "sgbm:", "own:", "matched:", "joined:", "quick:", "fine:")
+"""Before the name of weights: how they are used."""
+_POSITIONAL = get_args(tyro.conf.Positional[int])[1]
+_OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+_NOTHING = ("", "None")
+Group = TypeVar("Group")
+
+
+@runtime_checkable
+class Settings(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Config = TypeVar("Config", bound=Settings)
+
+
+def shown_as(metavar: str | None, help: str | None = None) -> Any:  # noqa: ANN401  tyro's own object
+    """Show an option with this in the place of its value; None: as tyro does."""
+    return tyro.conf.arg(
+        metavar=metavar,
+        help=help,
+        help_behavior_hint=lambda default: "" if default in _NOTHING else f"(default: {default})",
+    )
+
+
+Device = Annotated[str, shown_as("DEVICE", help="cpu, cuda, cuda:1, ...")]
+View = Annotated[str | None, shown_as("live|FILE.rrd")]
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def group(options: type[Group]) -> type[Group]:
+    """Make a class a frozen dataclass of options, each shown with its type in words.
+
+    A parameter of a command that is one gives the command all of its fields as options.
+    """
+    options = dataclass(frozen=True, kw_only=True)(options)
+    for name, hint in get_type_hints(options, include_extras=True).items():
+        if name in options.__annotations__:
+            options.__annotations__[name] = _worded(hint)
+    return options
+
+
+def in_words_of(command: Callable[..., int]) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Give a wrapper the signature of its command, with option types in words, for tyro.
+
+    Groups of options, which are dataclasses, have words of their own.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    shape = signature(command)
+    for name, parameter in shape.parameters.items():
+        if not is_dataclass(parameter.default):
+            hints[name] = _worded(hints[name])
+    worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
+
+    def with_signature(wrapper: Callable[..., int]) -> Callable[..., int]:
+        function = unwrap(wrapper)  # tyro looks behind what checks types in tests, and so do we
+        function.__doc__, function.__module__ = command.__doc__, command.__module__
+        function.__annotations__ = hints
+        vars(function)["__signature__"] = shape.replace(parameters=worded)
+        return function
+
+    return with_signature
+
+
+def _worded(hint: Any) -> Any:  # noqa: ANN401  any type
+    if any(getattr(mark, "metavar", None) for mark in getattr(hint, "__metadata__", ())):
+        return hint  # it says itself how it is shown
+    return Annotated[hint, shown_as(_metavar(hint))]
+
+
+def _metavar(hint: Any) -> str | None:  # noqa: ANN401
+    """Name a value; None where tyro's own name will do: of positional arguments and flags."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        if _POSITIONAL in parts or not any(isinstance(mark, _Names) for mark in parts):
+            return None
+        return "NAME|FILE" if _Names.WEIGHTS in parts else "PATH"
+    if origin in (Union, UnionType):
+        return _metavar(next(part for part in parts if part is not NoneType))
+    if origin is Literal:
+        return f"{{{','.join(map(str, parts))}}}"
+    if origin in (tuple, list):
+        one = _metavar(parts[0])
+        return one and (f"{one} ..." if parts[1:] in ((), (...,)) else " ".join([one] * len(parts)))
+    return _OF_TYPES.get(hint)
+
+
+def _names(hint: Any) -> _Names | None:  # noqa: ANN401
+    """Say what values of a type name, alone or in a tuple or a list."""
+    if hint is Path:
+        return _Names.INPUT
+    parts = get_args(hint)
+    own = next((part for part in parts if isinstance(part, _Names)), None)
+    return own or next((found for part in parts if (found := _names(part)) is not None), None)
+
+
+def _options_of(command: Callable[..., int]) -> Iterator[tuple[str, str, _Names | None]]:
+    """Give the parameter, option and kind of each option; of groups too."""
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in signature(command).parameters.items():
+        if is_dataclass(parameter.default):
+            fields = get_type_hints(type(parameter.default), include_extras=True)
+            yield from ((name, field, _names(hint)) for field, hint in fields.items())
+        elif name in hints:
+            yield name, name, _names(hints[name])
+
+
+def refuse_empty(command: Callable[..., int], words: Sequence[str]) -> None:
+    """Refuse an option that names a file or folder by nothing, which would be the current folder.
+
+    A script whose variable is unset gives such a word.
+
+    Args:
+        command: whose options these are.
+        words: what follows its name.
+
+    Raises:
+        InputError: the option that is empty.
+    """
+    paths = {option for _, option, kind in _options_of(command) if kind is not None}
+    for word, after in pairwise([*words, "end"]):
+        option, sign, value = word.partition("=")
+        is_path = option.startswith("--") and option[2:].replace("-", "_") in paths
+        if is_path and (value if sign else after) == "":
+            raise InputError(
+                f"{option} is empty; name a file or folder (the current folder is '.'), or check "
+                "the variable that should hold it"
+            )
+
+
+def refuse_missing(command: Callable[..., int], values: Mapping[str, Any]) -> None:
+    """Refuse paths and weights that do not exist.
+
+    Args:
+        command: what will be called.
+        values: its arguments by name.
+
+    Raises:
+        InputError: a path or weights that are not there.
+    """
+    for name, option, kind in _options_of(command):
+        if name not in values:
+            continue
+        value = values[name] if name == option else getattr(values[name], option)
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if kind is _Names.INPUT and one is not None:
+                _refuse_path(str(one))
+            elif kind is _Names.WEIGHTS and one is not None:
+                _refuse_weights(one)
+
+
+def _refuse_path(path: str) -> None:
+    if any(mark in path for mark in ("://", "*", "?", "[", "{")) or Path(path).exists():
+        return
+    wanted = Path(path)
+    beside = [p.name for p in wanted.parent.iterdir()] if wanted.parent.is_dir() else []
+    near = get_close_matches(wanted.name, beside, n=1)
+    hint = f"; did you mean {str(wanted.parent / near[0])!r}?" if near else "; check the path"
+    raise InputError(f"{path}: there is no such file or folder{hint}")
+
+
+def _refuse_weights(name: str) -> None:
+    for prefix in _PREFIXES:
+        name = name.removeprefix(prefix)
+    if name not in _WORDS and not is_on_hub(name):
+        find_weights(name)
+
+
+Typed = Mapping[str, Sequence[str]]
+"""Options as they were typed, without dashes, and the words after each."""
+
+
+class _Rule(NamedTuple):
+    """In which case some commands ignore options, and why."""
+
+    commands: tuple[str, ...]
+    case: Callable[[Typed], bool]
+    options: tuple[str, ...]
+    why: str
+
+
+def _has_value(option: str, *values: str) -> Callable[[Typed], bool]:
+    return lambda typed: bool(set(typed.get(option, ())) & set(values))
+
+
+def _without(*options: str) -> Callable[[Typed], bool]:
+    return lambda typed: not any(option in typed for option in options)
+
+
+def _all_begin(option: str, *prefixes: str) -> Callable[[Typed], bool]:
+    return lambda typed: all(word.startswith(prefixes) for word in typed.get(option, [""]))
+
+
+def _has_idle_gpus(typed: Typed) -> bool:
+    on_cpu = typed.get("device", ["cpu"])[:1] == ["cpu"]
+    return on_cpu and typed.get("worker-gpus", ["0"])[:1] not in (["0"], ["0.0"])
+
+
+_POSES = ("pose predict", "pose track")
+_MEASURED = ("pose evaluate",)
+_RULES = (
+    _Rule(_POSES, _has_value("method", "register"),
+          ("weights", "voting", "hypotheses", "batch", "device"),
+          "--method register fits the CAD file alone, one input after the other on the processor"),
+    _Rule(("pose predict",), _has_value("voting", "least-squares"), ("hypotheses",),
+          "--voting least-squares draws no hypotheses"),
+    _Rule(("pose predict",), lambda typed: "depth" in typed and "mask" not in typed, ("batch",),
+          "an image without --mask is searched alone"),
+    _Rule(("pose predict", "depth predict"), _has_value("engine", "ray"), ("view",),
+          "the workers of --engine ray show nothing"),
+    _Rule(("pose predict", "depth predict", "depth match"), _has_idle_gpus, ("worker-gpus",),
+          "the workers compute on the processor without --device cuda"),
+    _Rule(("pose track",), _without("bop"), ("split",), "it is of a data set; give --bop"),
+    _Rule(_MEASURED, _without("weights"), ("masks", "voting", "icp", "device"),
+          "nothing is estimated: --csv and --predictions are measured as they are"),
+    _Rule(_MEASURED, _all_begin("weights", "register", "open3d"), ("voting", "device"),
+          "register and open3d do not vote, and compute on the processor"),
+    _Rule(("depth predict",), _has_value("answer", "own"), ("precision", "max-memory"),
+          "they are for a matcher with weights, and with --answer own none runs"),
+    _Rule(("depth evaluate",), _without("baseline", "floor"), ("train", "train-without"),
+          "they are for --baseline; add it"),
+    _Rule(("depth evaluate",), _without("train"), ("train-without",),
+          "it leaves frames out of --train, and none is given"),
+    _Rule(("depth evaluate",), _without("matcher"), ("holes",), "it is for --matcher sgbm"),
+    _Rule(("depth evaluate",), _has_value("protocol", "kitti-2015"), ("cap",),
+          "--protocol kitti-2015 measures disparity, without a limit in metres"),
+    _Rule(("depth evaluate",), _all_begin("weights", "quick:", "fine:"), ("speed",),
+          "'quick:' and 'fine:' say the speed of these weights"),
+    _Rule(("depth evaluate",), _all_begin("weights", "own:"), ("precision", "max-memory"),
+          "they are for a matcher with weights, and with 'own:' none runs"),
+    _Rule(("data export-depth",), _has_value("format", "colmap"), ("files",),
+          "--format colmap has one kind of file; --files is for nerfstudio"),
+    _Rule(("weights complete",), lambda typed: all(Path(w).is_dir() for w in typed["models"]),
+          ("unit",), "the models of a data set are in mm; --unit is for a model file"),
+    _Rule(("reproduce all",), _without("kitti"), ("split", "protocol"), "they are for --kitti"),
+)  # fmt: skip
+
+
+def refuse_ignored_options(command: str, words: Sequence[str]) -> None:
+    """Refuse what the command would ignore.
+
+    Args:
+        command: its name.
+        words: what follows the name.
+
+    Raises:
+        InputError: options that have no effect beside the others; why, and to leave them out.
+    """
+    typed: dict[str, list[str]] = {}
+    spelled: dict[str, str] = {}
+    here: list[str] = []
+    for word in words:
+        if word.startswith("--"):
+            option, sign, value = word.removeprefix("--").partition("=")
+            name = option.replace("_", "-").removeprefix("no-")
+            spelled[name], here = f"--{option}", typed.setdefault(name, [])
+            here += [value] if sign else []
+        else:
+            here.append(word)
+    for rule in _RULES:
+        ignored = [name for name in rule.options if name in typed]
+        if command in rule.commands and ignored and rule.case(typed):
+            named = " and ".join(spelled[name] for name in ignored)
+            raise InputError(f"{named}: has no effect here; {rule.why}. Leave {named} out")
+
+
+def refuse_below(least: int, option: str, value: int, usual: str) -> None:
+    """Refuse a count that is too small.
+
+    Raises:
+        InputError: the option, its value, the least and a usual value are named.
+    """
+    if value < least:
+        raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
+
+
+def changed(config: Config, **values: object) -> Config:
+    """Give a config with other values; None leaves a setting as it is."""
+    return dataclasses.replace(config, **{k: v for k, v in values.items() if v is not None})

@@ -1,0 +1,192 @@
+"""Methods by their names on the command line, with what decides their results."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args
+
+from tqdm import tqdm
+
+from depthpose.cli.engine import Weights
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.run import own_device
+from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
+from depthpose.depth.config import Answer, BaselineName, MatcherConfig, SGBMConfig, Speed
+from depthpose.depth.datasets import Dataset
+from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.predictions import Estimator
+from depthpose.depth.stereo import MATCHERS, SGBMMatcher, with_usable_precision
+
+
+class Method(NamedTuple):
+    """An estimator, what to call it, and the JSON values that decide its results.
+
+    ``with_right`` says whether it is given the real right view.
+    """
+
+    name: str
+    net: Estimator
+    settings: dict[str, Any]
+    with_right: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodSource:
+    """What a method is built from, in this process or by the workers of an engine.
+
+    Attributes:
+        weights: by name or file, or packed to travel; what they hold decides what is built. None:
+            OpenCV's matcher.
+        config: how the networks run.
+        with_right: give them the real right view; by default only a matcher, which needs it.
+        matcher: for the synthesised view: None (the weights' own), sgbm (OpenCV's), or that of
+            other weights, by name or file.
+        allow_ood: answer out-of-distribution images too, as a measurement must.
+        answer: where depth of one image comes from, in place of what the weights say.
+    """
+
+    weights: str | Weights | None
+    config: MatcherConfig
+    with_right: bool | None = None
+    matcher: str | None = None
+    allow_ood: bool = True
+    answer: Answer | None = None
+
+    def build(self) -> Method:
+        """Build the networks on the device of the config.
+
+        Raises:
+            InputError: a matcher alone is asked to do without the right view, or weights without a
+                matcher for it.
+        """
+        if self.weights is None:
+            return sgbm_method(with_filled_holes=False)
+        if isinstance(self.weights, Weights):
+            with self.weights.unpacked() as file:
+                return replace(self, weights=file).build()
+        config = with_usable_precision(self.config)  # what is computed in is what is recorded
+        config = replace(config, device=own_device(config.device))
+        path = find_weights(self.weights)
+        kind = read_checkpoint(path).kind
+        is_matcher = kind in MATCHERS
+        with_right = is_matcher if self.with_right is None else self.with_right
+        if is_matcher and not with_right:
+            raise InputError(
+                f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
+                "synthesise the right view."
+            )
+        facts: dict[str, Any] = {
+            "matcher": kind,
+            "weights": path.stem,
+            "weights_sha256": file_sha256(path),
+        }
+        if not is_matcher:
+            facts["input"] = "both views" if with_right else "left view"
+        if self.matcher is not None:
+            name, net, own = self._matched_by_other(path, config, facts)
+        else:
+            net = FakestereoNet.load(
+                path, config=config, answer=self.answer, allow_ood=self.allow_ood
+            )
+            name, own = path.stem, config_to_dict(config)
+            name += "-both" if with_right and not is_matcher else ""
+            name += "" if self.answer is None else f"-{self.answer}"
+        if with_right and net.matcher is None:
+            raise InputError(
+                f"{path}: answers depth of one image, and holds no matcher, which a pair needs. "
+                "Give weights with one, or sgbm."
+            )
+        if not with_right and net.synthesiser is not None:
+            facts["answer"] = net.synthesiser.config.answer
+            facts["scales"] = list(net.synthesiser.scales)
+        return Method(name, net, {**facts, **own}, with_right)
+
+    def _matched_by_other(
+        self, path: Path, config: MatcherConfig, facts: dict[str, Any]
+    ) -> tuple[str, FakestereoNet, dict[str, Any]]:
+        """Let OpenCV, or other weights, match the view of a generator; facts take their names."""
+        settings = config_to_dict(config)
+        if self.matcher == "sgbm":
+            name, sgbm = "sgbm", SGBMConfig(with_filled_holes=True)
+            matcher, settings = SGBMMatcher(sgbm), {**settings, **config_to_dict(sgbm)}
+        else:
+            assert self.matcher is not None
+            matcher = find_weights(self.matcher)
+            name = matcher.stem
+            facts["matcher_sha256"] = file_sha256(matcher)
+        facts["matcher"] += f" with {name}"
+        net = FakestereoNet.load(
+            path, matcher=matcher, config=config, answer="matched", allow_ood=self.allow_ood
+        )
+        return f"{path.stem}-{name}", net, settings
+
+    def packed(self) -> "MethodSource":
+        """Give the same with the weights in memory.
+
+        Raises:
+            InputError: other weights match the synthesised view.
+        """
+        if self.matcher not in (None, "sgbm"):
+            raise InputError(
+                f"--matcher {self.matcher}: --engine ray takes sgbm or the weights' own; make one "
+                "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence "
+                "L --out W'"
+            )
+        if not isinstance(self.weights, str):
+            return self
+        return replace(self, weights=Weights.read(self.weights))
+
+    def settings(self) -> dict[str, Any]:
+        """Say what decides the results; this machine need not have the workers' device."""
+        settings = replace(self, config=replace(self.config, device="cpu")).build().settings
+        return settings | ({"device": self.config.device} if "device" in settings else {})
+
+
+def named_method(word: str, config: MatcherConfig) -> Method:
+    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like.
+
+    ``own:NAME``, ``matched:NAME`` and ``joined:NAME`` say what depth of one image comes from,
+    ``quick:NAME`` and ``fine:NAME`` how much time the match of a real pair may take.
+    """
+    how, _, name = word.rpartition(":")
+    if how in get_args(Answer):
+        answer = cast("Answer", how)
+        return MethodSource(weights=name, config=config, with_right=False, answer=answer).build()
+    if how == "both":
+        return MethodSource(weights=name, config=config, with_right=True).build()
+    if how in get_args(Speed):
+        config = replace(config, speed=how)
+        method = MethodSource(weights=name, config=config, with_right=True).build()
+        return method._replace(name=f"{method.name}-{how}")
+    if how == "sgbm":
+        return MethodSource(weights=name, config=config, with_right=False, matcher="sgbm").build()
+    return MethodSource(weights=word, config=config).build()
+
+
+def sgbm_method(*, with_filled_holes: bool) -> Method:
+    """OpenCV's StereoSGBM with the settings of our tables."""
+    config = SGBMConfig(with_filled_holes=with_filled_holes)
+    net = FakestereoNet.load(matcher="sgbm", config=config)
+    name = "sgbm-filled" if with_filled_holes else "sgbm"
+    return Method(name, net, {"matcher": "sgbm", **config_to_dict(config)})
+
+
+def baseline_method(name: BaselineName, training: Dataset) -> Method:
+    """Fit a baseline to the truth of training frames."""
+    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
+    names = "\n".join(frame.name for frame in training.frames)
+    settings = {
+        "matcher": f"baseline: {name}",
+        "input": "left view" if name == "nearest" else "no image",
+        "train": training.name,
+        "train_frames": len(training),
+        "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
+    }
+
+    def show(frames: Sequence[int]) -> Iterable[int]:
+        return tqdm(frames, f"fit {name}", unit=" frames", disable=None)
+
+    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)

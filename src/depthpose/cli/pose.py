@@ -1,0 +1,161 @@
+"""``depthpose pose ...``."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from depthpose.cli.arguments import NewPath, NewPlace, View, WeightsName
+from depthpose.cli.engine import EngineOptions
+from depthpose.cli.pose_options import (
+    DataSetOptions,
+    EstimateOptions,
+    OneObjectOptions,
+    PoseMeasureOptions,
+    RegisterOptions,
+    SequenceOptions,
+    refuse_mixture,
+)
+from depthpose.core.errors import InputError
+from depthpose.pose.config import EstimateConfig, SymmetryRule
+
+
+def predict(
+    out: NewPlace,
+    weights: WeightsName = "parts",
+    inputs: OneObjectOptions = OneObjectOptions(),
+    dataset: DataSetOptions = DataSetOptions(),
+    estimates: EstimateOptions = EstimateOptions(),
+    register: RegisterOptions = RegisterOptions(),
+    view: View = None,
+    engine: EngineOptions = EngineOptions(),
+) -> int:
+    """The pose of known objects from clouds, depth images or a data set; or the reason for none.
+
+    poses.json holds for each input camera_from_model (metres), its covariance (about this answer
+    alone), its certainty, the alternatives that fit as well with their probabilities, the risk that
+    none of them is right, status and reason, and the seconds of each stage.
+    A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
+    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, if there
+    are alternatives depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
+    shows some of them in 3D, and every refusal. A rerun skips what is finished; other settings need
+    another --out; only files of the same run are overwritten. Processes of torchrun share the work.
+
+        depthpose pose predict --cloud part.ply --unit mm --object part --out out
+        depthpose pose predict --depth d.png --mask m.png --camera cam.json --out out
+        depthpose pose predict --depth d.png --camera cam.json --out out
+        depthpose pose predict --bop lm --split test --weights linemod.safetensors --out out
+        depthpose pose predict --method register --cad p.stl --unit mm --cloud p.ply --out out
+
+    Args:
+        out: folder for the results.
+        weights: of a pose network, by name or file ('depthpose weights list').
+        view: live shows each result in Rerun's viewer (an extra) as it comes; FILE.rrd records it.
+    """
+    from depthpose.cli.pose_frames import find_all
+    from depthpose.cli.pose_methods import source_of
+    from depthpose.cli.pose_predict import predict_dataset, predict_files
+
+    refuse_mixture(inputs, dataset)
+    source = source_of(weights, register, inputs.unit, dataset, estimates.config)
+    if dataset.bop is not None:
+        return predict_dataset(source, dataset, inputs.object, out, estimates.batch, view, engine)
+    if engine.is_ray:
+        from depthpose.cli.pose_ray import predict_on_ray
+
+        return predict_on_ray(inputs, source, estimates.batch, out, engine)
+    method = source.build()
+    if inputs.cloud is not None and not method.takes_clouds:
+        raise InputError(
+            f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
+            "--mask and --camera, or weights that vote"
+        )
+    if inputs.depth is not None and inputs.mask is None and inputs.camera is not None:
+        if view is not None:
+            raise InputError("--view shows inputs that have a mask; omit it, or give --mask")
+        return find_all(method, inputs, Path(out))
+    return predict_files(method, inputs, Path(out), estimates.batch, view)
+
+
+def evaluate(
+    bop: Path,
+    out: NewPath,
+    split: str = "test",
+    weights: tuple[WeightsName, ...] = (),
+    csv: tuple[Path, ...] = (),
+    predictions: tuple[Path, ...] = (),
+    objects: tuple[str, ...] = (),
+    adds: SymmetryRule = "declared",
+    estimates: PoseMeasureOptions = PoseMeasureOptions(vsd=True),
+) -> int:
+    """Measure poses on a BOP or Linemod_preprocessed data set, and write rows, a table and a page.
+
+    Predictions are made once, as files in OUT/predictions/METHOD_MASKS (poses.json and BOP's csv),
+    and measured from there; a second run measures without predicting anew. Several weights and
+    kinds of masks may be named at once: their rows share the table. What is not estimated, or
+    refused, counts as a failure.
+
+        depthpose pose evaluate --bop lm --split test --weights W.safetensors --out out/lm
+
+    Args:
+        bop: folder of the data set.
+        out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
+        split: train, test, ...
+        weights: files or names, of the method or of a baseline; also register (registration
+            without training) and open3d (Open3D's, an extra), which need no weights.
+        csv: BOP results of any method.
+        predictions: folders with poses.json.
+        objects: keep these alone, by name or number.
+        adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
+    """
+    from depthpose.cli.pose_evaluate import measure, open_instances
+    from depthpose.cli.pose_methods import find_masks, pose_methods, predict_all
+    from depthpose.core.config import config_to_dict
+    from depthpose.core.run import claim_folder
+    from depthpose.report.page import table_files
+
+    if not (weights or csv or predictions):
+        raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
+    dataset = open_instances(bop, split, objects, estimates.targets)
+    files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
+    rule = replace(estimates.evaluation, adds=adds)
+    # More objects, or all of the targets, may be asked for later.
+    about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
+    claim_folder(out, {"command": "pose evaluate", **about}, files)
+    methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
+    shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
+    paths = [predict_all(dataset, method, one, out) for method in methods for one in shown]
+    return measure(dataset, [*paths, *csv, *predictions], rule, out)
+
+
+def track(
+    out: NewPath,
+    weights: WeightsName = "parts",
+    frames: SequenceOptions = SequenceOptions(),
+    register: RegisterOptions = RegisterOptions(),
+) -> int:
+    """Follow a known object through depth images, clouds or the scenes of a data set.
+
+    Each frame starts from the pose of the one before and needs ICP alone. Where the depth
+    contradicts the pose, the object is detected again in that frame; where that fails too,
+    the frame is lost, and the next is searched. poses.json says of each frame which of the three it
+    was ("tracking"); else the files are those of 'pose predict'. Frames are taken in the order of
+    their names, numbers in them by value (2 before 10). A rerun begins anew; what an interrupted
+    one has found is in poses.json.
+
+        depthpose pose track --depth frames --camera cam.json --object mug --out out
+        depthpose pose track --bop lm --split test --weights linemod.safetensors --out out
+        depthpose pose track --method register --cad p.stl --cad-unit mm --cloud frames --out out
+
+    Args:
+        out: folder for the results.
+        weights: of a pose network, by name or file ('depthpose weights list').
+    """
+    from depthpose.cli.pose_frames import track_bop, track_folder
+    from depthpose.cli.pose_methods import source_of
+
+    frames.refuse_unusable()
+    config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
+    method = source_of(weights, register, frames.unit, frames, config).build()
+    if method.track is None:
+        raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
+    follow = track_folder if frames.bop is None else track_bop
+    return follow(method, frames, out)

@@ -1,0 +1,485 @@
+"""Pose methods, and masks of a data set, by their names on the command line."""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.engine import Weights
+from depthpose.cli.pose_options import DataSetOptions, RegisterOptions, SequenceOptions
+from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image, write_json
+from depthpose.core.rigid import Rigid
+from depthpose.core.run import claim_folder
+from depthpose.pose.baselines import DepthImageNet, FpfhConfig, FpfhEstimator
+from depthpose.pose.config import EstimateConfig, Unit
+from depthpose.pose.datasets import (
+    LAYOUTS,
+    BopDataset,
+    Detection,
+    Instance,
+    encode_rle,
+    object_names,
+    open_bop,
+    read_detections,
+    write_detections,
+)
+from depthpose.pose.datasets.parse import integer, read_rows
+from depthpose.pose.estimator import DepthImageRegressor, GeoPoseNet, Registration
+from depthpose.pose.estimator.prepare import AnyInput
+from depthpose.pose.mesh import FIXED_UNITS, unit_of
+from depthpose.pose.predictions import (
+    Job,
+    detection_jobs,
+    instance_jobs,
+    predict,
+    read_predictions,
+    results_name,
+    write_bop_results,
+)
+from depthpose.pose.segmentation import Segmenter
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.weights import read_pose_weights
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Masks:
+    """Which pixels a method is given: what to call them, and the jobs that they make."""
+
+    name: str
+    jobs: Callable[[Mapping[int, str]], list[Job[ViewInput]]]
+    settings: Mapping[str, Any]
+
+
+def find_masks(
+    kinds: Sequence[str], dataset: BopDataset, out: Path, device: str = "cpu"
+) -> list[Masks]:
+    """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights.
+
+    Args:
+        kinds: which masks.
+        dataset: whose images are used.
+        out: where a segmentation writes what it finds.
+        device: of a segmentation.
+
+    Raises:
+        InputError: one is none of these, or the data set came without predicted masks.
+    """
+    paths = [_path_of(kind) for kind in kinds]
+    files = [
+        (None, kind) if path is None else (path.parent, path.stem)
+        for kind, path in zip(kinds, paths, strict=True)
+    ]
+    masks: list[Masks] = []
+    for kind, path, name in zip(kinds, paths, distinct_names(files), strict=True):
+        settings: dict[str, Any] = {}
+        if path is not None:
+            is_list = path.suffix == ".json"
+            detections = (
+                read_detections(path) if is_list else _segmented(path, name, dataset, out, device)
+            )
+            jobs = partial(detection_jobs, dataset, detections=detections)
+            settings = {"masks_sha256": file_sha256(path)}
+        elif kind == "truth":
+            jobs = partial(instance_jobs, dataset)
+        else:
+            mask_of = LAYOUTS[dataset.layout].predicted_mask
+            if mask_of is None:
+                raise InputError(
+                    f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
+                    "them; give --masks a file of BOP detections, or weights of a segmentation"
+                )
+            jobs = partial(instance_jobs, dataset, mask_of=partial(mask_of, dataset.folder))
+            settings = {"masks_of": "segnet_results"}
+        masks.append(Masks(name=name, jobs=jobs, settings=settings))
+    return masks
+
+
+def mask_files(kinds: Sequence[str]) -> list[str]:
+    """Name masks as :func:`find_masks` takes them; files by what they hold.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    paths = [_path_of(kind) for kind in kinds]
+    return [
+        kind if path is None else named_file(path) for kind, path in zip(kinds, paths, strict=True)
+    ]
+
+
+def named_file(path: Path) -> str:
+    """Name a file with the start of its SHA-256: another one of that name is another name.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        return f"{path.name} {file_sha256(path)[:12]}"
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
+
+
+def of_dataset(dataset: BopDataset) -> dict[str, Any]:
+    """Settings that say which data set results are of, wherever its folder lies."""
+    return {
+        "dataset": dataset.folder.resolve().name,
+        "split": dataset.split,
+        "annotations_sha256": dataset.sha256[:12],
+    }
+
+
+def _path_of(kind: str) -> Path | None:
+    if kind in ("truth", "predicted"):
+        return None
+    return Path(kind) if kind.endswith(".json") else find_weights(kind)
+
+
+def _segmented(
+    path: Path, name: str, dataset: BopDataset, out: Path, device: str
+) -> list[Detection]:
+    """Segment the images that are not segmented yet, for every object that the weights know.
+
+    Other objects or images may be asked for next time: what is there stays, what lacks is added.
+    """
+    segmenter = Segmenter.load(path, device)
+    numbers = _numbers_of(segmenter, dataset, path)
+    home = out / "detections" / name
+    claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
+    file, record = home.parent / f"{name}.json", home / "images.json"
+    try:
+        rows = read_rows(record) if record.is_file() else []
+        done = {
+            (integer(row, "scene_id", str(record)), integer(row, "im_id", str(record)))
+            for row in rows
+        }
+        known = (
+            [d for d in read_detections(file) if (d.scene_id, d.image_id) in done] if done else []
+        )
+    except InputError:  # damaged or missing: all is segmented again
+        done, known = set(), []
+    images = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    left = [images[place] for place in sorted(images.keys() - done)]
+    if left:
+        known += _detect(segmenter, left, numbers)
+        write_detections(file, known)
+        places = sorted(done | images.keys())
+        write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
+    return known
+
+
+def _numbers_of(segmenter: Segmenter, dataset: BopDataset, path: Path) -> dict[str, int]:
+    """Find what a data set numbers each object of the weights: by its name, else by its number."""
+    names = object_names(dataset.folder)
+    by_name = {name: number for number, name in names.items()}
+    own = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
+    numbers = {
+        name: by_name.get(name, number)
+        for name, number in own.items()
+        if name in by_name or names.get(number) not in own
+    }
+    wanted = {instance.object_id for instance in dataset.instances}
+    lost = sorted(wanted - set(numbers.values()))
+    if len(lost) == len(wanted):
+        known = ", ".join(f"{name} ({number})" for name, number in own.items())
+        raise InputError(
+            f"{path}: segments {known}, but {dataset.folder} shows objects {lost}; give weights "
+            "of its objects"
+        )
+    if lost:
+        print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
+    return numbers
+
+
+def _detect(
+    segmenter: Segmenter, images: Sequence[Instance], numbers: Mapping[str, int]
+) -> Iterable[Detection]:
+    """Segment each picture once; what it took is its time."""
+    for shown in tqdm(images, "segmentation", disable=None, unit=" images"):
+        if shown.rgb is None:
+            raise InputError(f"{shown.name}: has no picture, and a segmentation needs pictures")
+        start = perf_counter()
+        objects = segmenter.segment(read_image(shown.rgb))
+        spent_s = perf_counter() - start
+        for name, masks in objects.masks.items():
+            for mask, score in zip(masks, objects.scores[name].tolist(), strict=True):
+                if name in numbers:
+                    yield Detection(
+                        scene_id=shown.scene_id,
+                        image_id=shown.image_id,
+                        object_id=numbers[name],
+                        score=score,
+                        segmentation=encode_rle(mask),
+                        seconds=spent_s,
+                    )
+
+
+def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
+    """Give each its own name; of equal ones, with as many folders above it as distinguish them.
+
+    Args:
+        files: the folder that something lies in, None where it lies in none, and its name.
+
+    Raises:
+        InputError: two of one name lie in one folder, or one is given twice.
+    """
+    parts = [(*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in files]
+    for some, count in Counter(parts).items():
+        if count > 1:
+            raise InputError(
+                f"{'/'.join(some[-2:])}: {count} that are given have this name, and their results "
+                "would be one; give it once, or rename a file"
+            )
+    names: list[str] = []
+    depths = [1] * len(parts)
+    for _ in range(max(map(len, parts), default=0)):
+        names = ["-".join(some[-depth:]) for some, depth in zip(parts, depths, strict=True)]
+        counts = Counter(names)
+        depths = [d + (counts[name] > 1) for d, name in zip(depths, names, strict=True)]
+    return names
+
+
+REGISTRATION = "open3d"
+"""The name of Open3D's features, RANSAC and ICP, where weights are named."""
+REGISTER = "register"
+"""The name of our own registration, which needs no training."""
+_SAME_DIAMETER = 0.05
+
+EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseMethod:
+    """An estimator, what to call it, the objects it knows, and what decides its results.
+
+    Attributes:
+        takes_clouds: whether it can do without a depth image.
+        find: gives the poses of named objects in a view without a mask; None: it cannot.
+        track: follows a named object through frames; None: it cannot.
+        holder: what knows the objects, in messages.
+    """
+
+    name: str
+    estimate_many: EstimateMany
+    takes_clouds: bool
+    models: Sequence[ObjectModel]
+    settings: Mapping[str, Any]
+    find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
+    track: Callable[[Iterable[AnyInput], str, Rigid | None], Iterator[PoseEstimate]] | None = None
+    holder: str = "weights"
+
+
+def pose_methods(
+    names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
+) -> list[PoseMethod]:
+    """Build the estimators of weights files of any kinds, given by their paths or by names.
+
+    Files of one name are distinguished by their folders.
+
+    Args:
+        names: of weights, or paths; ``register`` and ``open3d`` have none: they take models.
+        config: of the estimators that have weights.
+        models: what registration looks for.
+
+    Raises:
+        InputError: there are no such weights, they pose nothing, or are given twice.
+        MissingExtraError: registration is wanted, and Open3D is not installed.
+    """
+    takers = {REGISTRATION: _open3d, REGISTER: _register}
+    paths = [None if name in takers else find_weights(name) for name in names]
+    labels = distinct_names(
+        [(p.parent, p.stem) if p else (None, n) for p, n in zip(paths, names, strict=True)]
+    )
+    return [
+        _method(path, label, config) if path else takers[name](label, models, config)
+        for path, name, label in zip(paths, names, labels, strict=True)
+    ]
+
+
+def _open3d(name: str, models: Sequence[ObjectModel], _: EstimateConfig) -> PoseMethod:
+    if not models:
+        raise InputError(
+            f"{REGISTRATION}: it looks for the models of a data set; give --bop to 'pose evaluate'"
+        )
+    return PoseMethod(
+        name=name,
+        estimate_many=FpfhEstimator(models).estimate_many,
+        takes_clouds=False,
+        models=models,
+        settings={"kind": "registration", "fpfh": config_to_dict(FpfhConfig())},
+    )
+
+
+def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) -> PoseMethod:
+    if not models:
+        raise InputError(
+            "--method register looks for CAD files: give --cad part.stl --unit mm, or --bop, whose "
+            "models it takes"
+        )
+    net = Registration(models, config)
+    known: dict[str, str] = {}
+    for model in models:  # a shape is named by its bytes
+        digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
+        digest.update(model.faces.contiguous().numpy().tobytes())
+        known[model.name] = digest.hexdigest()[:16]
+    return PoseMethod(
+        name=name,
+        estimate_many=net.estimate_many,
+        takes_clouds=True,
+        models=models,
+        settings={"kind": REGISTER, "models": known, "estimate": config_to_dict(config)},
+        find=net.find_in,
+        track=net.track_in,
+        holder="models",
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MethodSource:
+    """What an estimator is made from, in this process or by the workers of an engine.
+
+    Attributes:
+        config: of the estimator.
+        weights: of a network, by name or file, or packed to travel; None: ``models`` are registered
+            without training.
+        models: what registration looks for.
+    """
+
+    config: EstimateConfig
+    weights: str | Weights | None = None
+    models: Sequence[ObjectModel] = ()
+
+    def build(self, device: str | None = None) -> PoseMethod:
+        """Build the estimator, on a device or on that of the config.
+
+        Raises:
+            InputError: as :func:`pose_methods`.
+        """
+        config = self.config if device is None else replace(self.config, device=device)
+        if self.weights is None:
+            return _register(REGISTER, self.models, config)
+        if isinstance(self.weights, str):
+            return pose_methods([self.weights], config)[0]
+        with self.weights.unpacked() as path:
+            return pose_methods([path], config)[0]
+
+    def packed(self) -> "MethodSource":
+        """Give the same with the weights in memory."""
+        if not isinstance(self.weights, str):
+            return self
+        return replace(self, weights=Weights.read(self.weights))
+
+
+def source_of(
+    weights: str,
+    register: RegisterOptions,
+    unit: Unit | None,
+    dataset: DataSetOptions | SequenceOptions,
+    config: EstimateConfig,
+) -> MethodSource:
+    """Say what the options of a command make an estimator from.
+
+    Args:
+        weights: of a network, by name or file.
+        register: whether CAD files alone are looked for, and which.
+        unit: of the CAD files, where ``register`` says none.
+        dataset: the data set that has its own models, if one is named.
+        config: of the estimator.
+
+    Raises:
+        InputError: options that do not go together, no unit, or a CAD file that cannot be read.
+    """
+    if register.method == "network" and register.cad:
+        raise InputError(
+            "--cad: weights know their own objects; add --method register, or train weights of "
+            "this part by 'depthpose pose train --cad'"
+        )
+    if register.cad_unit and not register.cad:
+        raise InputError("--cad-unit is the unit of --cad, and no CAD file is given; leave it out")
+    if register.cad and dataset.bop is not None:
+        raise InputError("--cad: the models of --bop are taken; leave --cad out")
+    # The unit of clouds is not that of CAD files that have their own.
+    has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in register.cad)
+    cad_unit = register.cad_unit or (None if has_own else unit)
+    for path in register.cad:
+        unit_of(path, cad_unit)
+    if register.method == "network":
+        return MethodSource(config=config, weights=weights)
+    if dataset.bop is not None:
+        models = tuple(open_bop(dataset.bop, dataset.split).objects.values())
+        return MethodSource(config=config, models=models)
+    models = Registration.load(*register.cad, unit=cad_unit).models if register.cad else ()
+    return MethodSource(config=config, models=tuple(models))
+
+
+def _method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+    known = read_pose_weights(path)
+    warn_of_terms(known.facts)
+    is_regressor = isinstance(known.network, DepthImageNet)
+    net = DepthImageRegressor(known, config) if is_regressor else GeoPoseNet(known, config)
+    suffix = "" if config.voting.method == "ransac" else "-least-squares"
+    suffix += "" if config.with_icp else "-without-icp"
+    facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
+    facts |= {"weights_sha256": file_sha256(path)}
+    return PoseMethod(
+        name=name + suffix,
+        estimate_many=net.estimate_many,
+        takes_clouds=not is_regressor,
+        models=known.models,
+        settings={**facts, "estimate": config_to_dict(config)},
+        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
+        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
+    )
+
+
+def predict_all(
+    dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
+) -> Path:
+    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv.
+
+    Returns:
+        The folder of the predictions.
+    """
+    jobs = masks.jobs(match_names(dataset, method.models))
+    home = out / "predictions" / f"{method.name}_{masks.name}"
+    settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
+    written = predict(method.estimate_many, jobs, home, settings, batch)
+    label = f"{method.name}, {masks.name} masks"
+    for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
+        pass
+    write_bop_results(home / results_name(dataset), read_predictions(home))
+    return home
+
+
+def match_names(dataset: BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
+    """Find what a method calls each object of a data set: by its name, else by its number.
+
+    Raises:
+        InputError: the method does not know an object, or means another one of that number.
+    """
+    by_name = {model.name: model for model in models}
+    by_number = {model.number: model for model in models}
+    names: dict[int, str] = {}
+    for number, own in dataset.objects.items():
+        model = by_name.get(own.name) or by_number.get(number)
+        if model is None:
+            known = ", ".join(f"{m.name} ({m.number})" for m in models)
+            raise InputError(
+                f"object {number} ({own.name}) is none of those the weights know: {known}. Leave "
+                "it out by --objects"
+            )
+        if abs(model.diameter_m / own.diameter_m - 1) > _SAME_DIAMETER:
+            raise InputError(
+                f"object {number} ({own.name}) is {own.diameter_m:.4f} m across, but the weights' "
+                f"{model.name} is {model.diameter_m:.4f} m: another object, or another unit"
+            )
+        names[number] = model.name
+    return names

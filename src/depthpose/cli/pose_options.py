@@ -1,0 +1,285 @@
+"""Options that several pose commands take: each is declared, and described, once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from depthpose.cli.arguments import Device, NewPath, Source, changed, group
+from depthpose.core.errors import InputError
+from depthpose.pose.config import (
+    DiameterTable,
+    EstimateConfig,
+    EvaluationConfig,
+    Unit,
+    VotingConfig,
+)
+
+Voting = Literal["ransac", "least-squares"]
+
+
+def voting_config(voting: Voting, hypotheses: int | None = None) -> VotingConfig:
+    """Give the config of a way to vote."""
+    method = "ransac" if voting == "ransac" else "least squares"
+    return changed(VotingConfig(method=method), hypotheses=hypotheses)
+
+
+@group
+class PoseDataOptions:
+    """The data set of a table or figure of poses."""
+
+    linemod: Path | None = None
+    """Linemod_preprocessed, or LineMOD in BOP's layout; masks are the annotated ones."""
+    bop: Path | None = None
+    """any other data set in BOP's layout."""
+    split: str = "test"
+    """of the data set: train, test, ..."""
+    objects: tuple[str, ...] = ()
+    """keep these alone, by name or number."""
+
+    @property
+    def folder(self) -> Path | None:
+        """The one data set that was named, if any.
+
+        Raises:
+            InputError: two were.
+        """
+        if self.linemod is not None and self.bop is not None:
+            raise InputError(
+                f"two data sets were named, {self.linemod} and {self.bop}; a table is of one."
+            )
+        if self.linemod is None and self.bop is None:
+            named = [f"--objects {' '.join(self.objects)}"] if self.objects else []
+            named += [f"--split {self.split}"] if self.split != "test" else []
+            if named:
+                raise InputError(
+                    f"{' and '.join(named)}: chooses from a data set, and none is named; give "
+                    "--linemod or --bop, or leave it out"
+                )
+        return self.linemod or self.bop
+
+
+@group
+class PoseMeasureOptions:
+    """How poses of a data set are estimated and measured."""
+
+    masks: tuple[str, ...] = ("truth",)
+    """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
+    or weights of a segmentation. Each is a row of its own."""
+    targets: Path | None = None
+    """a BOP list of targets, such as test_targets_bop19.json; by default all instances."""
+    diameters: DiameterTable = "bop"
+    """bop: as the data set declares them; pvnet: PVNet's table of LineMOD."""
+    voting: Voting = "ransac"
+    """how directions become keypoints."""
+    icp: bool = True
+    """refine each pose by ICP."""
+    vsd: bool = False
+    """measure VSD and BOP's average recall too, which takes most of the time."""
+    device: Device = "cpu"
+
+    @property
+    def estimate(self) -> EstimateConfig:
+        """Settings of the estimators."""
+        voting = voting_config(self.voting)
+        return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
+
+    @property
+    def evaluation(self) -> EvaluationConfig:
+        """Settings of the metrics."""
+        return EvaluationConfig(diameters=self.diameters, with_vsd=self.vsd)
+
+
+@group
+class PoseTableOptions(PoseMeasureOptions):
+    """How the poses of a table are estimated, measured and shown."""
+
+    pictures: int = 4
+    """instances that the page shows."""
+
+
+@group
+class OneObjectOptions:
+    """A cloud or a depth image of known objects, and what is known of it."""
+
+    cloud: Source | None = None
+    """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
+    or a folder of such files."""
+    depth: Source | None = None
+    """16-bit PNG in the camera's depth_unit_m, or a folder of them."""
+    mask: Source | None = None
+    """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
+    the names of the depth images. Without, the image is searched: its planes are removed, and each
+    region left is tried as every object, or as --object alone."""
+    camera: Path | None = None
+    """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
+    BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
+    object: str | None = None
+    """which of the objects that are known; of a data set its name or number, all by default."""
+    unit: Unit | None = None
+    """unit of clouds (default m), and of depth images whose camera file gives none."""
+
+
+@group
+class DataSetOptions:
+    """A data set, in place of --cloud and --depth."""
+
+    bop: Path | None = None
+    """folder of a data set in BOP's layout, or of Linemod_preprocessed."""
+    split: str = "test"
+    """of the data set."""
+    masks: str = "truth"
+    """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
+    file of BOP detections, or weights of a segmentation, by name or file."""
+
+
+@group
+class EstimateOptions:
+    """How poses are estimated."""
+
+    voting: Voting = "ransac"
+    """how a network's directions become keypoints."""
+    hypotheses: int = 128
+    """of RANSAC, for each keypoint of a network."""
+    icp: bool = True
+    """refine the voted pose by ICP."""
+    min_certainty: float = 0.9
+    """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
+    up_to_symmetry: bool = False
+    """copies of an object that look nearly alike are one answer, not alternatives."""
+    register_refused: bool = False
+    """what a network doubts is registered by its model alone, some tenths of a second each. For
+    clouds and masked images."""
+    batch: int = 16
+    """inputs in one call of the network."""
+    device: Device = "cpu"
+
+    @property
+    def config(self) -> EstimateConfig:
+        """Settings of the estimator, on the device of this process.
+
+        Raises:
+            InputError: a value is out of its range.
+        """
+        from depthpose.core.run import own_device  # --help must not load torch
+
+        if self.batch < 1:
+            raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
+        return EstimateConfig(
+            voting=voting_config(self.voting, self.hypotheses),
+            with_icp=self.icp,
+            min_certainty=self.min_certainty,
+            up_to_symmetry=self.up_to_symmetry,
+            register_refused=self.register_refused,
+            device=own_device(self.device),
+        )
+
+
+@group
+class RegisterOptions:
+    """Poses by a CAD file alone, without training."""
+
+    method: Literal["network", "register"] = "network"
+    """network: trained weights. register: the CAD file alone, a second or two for each part."""
+    cad: tuple[Source, ...] = ()
+    """of register: STL, PLY, OBJ or GLB files; an object has its file's name. A data set has its
+    own models."""
+    cad_unit: Unit | None = None
+    """of the CAD files; as --unit by default, and of GLB metres."""
+
+
+def refuse_mixture(inputs: OneObjectOptions, dataset: DataSetOptions) -> None:
+    """Refuse none of the three kinds of input, or several, and options of another kind.
+
+    Raises:
+        InputError: which, and the rule.
+    """
+    count = sum(word is not None for word in (inputs.cloud, inputs.depth, dataset.bop))
+    if count != 1:
+        raise InputError(
+            f"{count} of --cloud, --depth and --bop are given; give one: a cloud, a depth image "
+            "with --mask and --camera, or a data set"
+        )
+    beside = {"mask": inputs.mask, "camera": inputs.camera}
+    if dataset.bop is not None:
+        refuse_beside("--bop", {**beside, "unit": inputs.unit})
+    elif dataset != DataSetOptions():
+        raise InputError(
+            "--split and --masks are of a data set, and --bop names none; the mask of a depth "
+            "image is given by --mask"
+        )
+    elif inputs.cloud is not None:
+        refuse_beside("--cloud", beside)
+
+
+_WHY = {
+    "--bop": "a data set says its cameras and units itself, and its masks are chosen by --masks",
+    "--cloud": "a cloud is of the object alone, in the camera's frame",
+}
+"""What makes other options meaningless beside an input."""
+
+
+def refuse_beside(option: str, others: Mapping[str, object]) -> None:
+    """Refuse options that would be ignored beside an input.
+
+    Args:
+        option: of the input, a key of ``_WHY``.
+        others: the values of such options by name.
+
+    Raises:
+        InputError: the names of those that are given.
+    """
+    named = " and ".join(f"--{name}" for name, value in others.items() if value is not None)
+    if named:
+        raise InputError(f"{named} beside {option}: {_WHY[option]}; leave {named} out")
+
+
+@group
+class SequenceOptions:
+    """The frames, and what is followed in them."""
+
+    depth: Path | None = None
+    """folder of 16-bit PNG files, whole images without masks."""
+    camera: Path | None = None
+    """of the depth images; a JSON file, as for 'pose predict'."""
+    cloud: Path | None = None
+    """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone or of what is
+    about it too, which needs --first: the object is found in clouds of it alone."""
+    first: NewPath | None = None
+    """text file with the pose in the first frame, as far as it is known: the 4x4 matrix
+    camera_from_model, in metres; without it the object is looked for."""
+    bop: Path | None = None
+    """folder of a data set in BOP's layout; every object of each scene is followed that the weights
+    know (with --method register: that has a model there), or --object alone."""
+    split: str = "test"
+    """of the data set."""
+    object: str | None = None
+    """which of the known objects; of a data set its name or number."""
+    unit: Unit | None = None
+    """of the clouds, metres by default; of depth images, where their camera says none."""
+    min_certainty: float = 0.9
+    """below it a pose that is found is ambiguous, not ok, and so are those that follow from it."""
+    device: Device = "cpu"
+
+    def refuse_unusable(self) -> None:
+        """Refuse none of the three kinds of input, or several, options of others, and processes.
+
+        Raises:
+            InputError: which, and the rule.
+        """
+        from depthpose.core.run import find_rank
+
+        if sum(place is not None for place in (self.depth, self.cloud, self.bop)) != 1:
+            raise InputError("give one of --depth with --camera, --cloud and --bop")
+        if self.depth is not None and self.camera is None:
+            raise InputError("--depth needs --camera beside it")
+        if self.bop is not None:
+            refuse_beside("--bop", {"camera": self.camera, "unit": self.unit})
+            if self.first is not None:
+                raise InputError(
+                    "--first beside --bop: a data set has many sequences and one pose is given; "
+                    "leave --first out, or give the frames of one sequence by --depth"
+                )
+        if self.cloud is not None:
+            refuse_beside("--cloud", {"camera": self.camera})
+        if find_rank().world > 1:
+            raise InputError("a sequence is followed by one process; start one")

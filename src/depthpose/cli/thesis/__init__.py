@@ -1,1 +1,0 @@
-"""``depthpose reproduce ...`` and ``depthpose figure ...``: tables and figures of the thesis."""

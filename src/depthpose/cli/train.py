@@ -1,0 +1,447 @@
+"""``depthpose depth train``, ``depth calibrate`` and ``pose train``, and their progress."""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from depthpose.cli.arguments import (
+    Device,
+    NewPath,
+    Source,
+    View,
+    WeightsName,
+    changed,
+    group,
+)
+from depthpose.core.errors import InputError
+from depthpose.core.units import Unit
+from depthpose.depth.config import MatcherConfig
+
+if TYPE_CHECKING:  # --help must not load torch
+    from depthpose.core.loop import Progress
+    from depthpose.depth.train.config import (
+        AdaptTraining,
+        FinetuneTraining,
+        SelectTraining,
+        StereoTraining,
+        ViewTraining,
+    )
+    from depthpose.pose.train import DepthImageTraining, PoseTraining, SegmentationTraining
+
+    DepthConfig = ViewTraining | SelectTraining | StereoTraining | AdaptTraining | FinetuneTraining
+    PoseConfig = PoseTraining | DepthImageTraining | SegmentationTraining
+
+
+@group
+class TrainingOptions:
+    """How long a training goes, on what, and from which state."""
+
+    steps: int | None = None
+    """optimiser steps in place of the config's length."""
+    seed: int | None = None
+    """decides initial weights, order, random changes and dropout."""
+    device: Literal["auto", "cpu"] | None = None
+    """auto takes what accelerate finds; cpu takes no GPU."""
+    precision: Literal["fp32", "bf16", "fp16"] | None = None
+    """arithmetic of the forward pass."""
+    resume: bool = False
+    """go on from the state that OUT holds."""
+    finish: bool = False
+    """write weights and card of the state that OUT holds, without another step; Ctrl-C twice does
+    the same while it trains."""
+    view: View = None
+    """live draws the losses in Rerun's viewer (an extra); FILE.rrd records them."""
+
+    def read(
+        self,
+        path: Path | None,
+        kind: type,
+        default: object = None,
+        workers: int | None = None,
+    ) -> Any:  # noqa: ANN401 - an instance of kind
+        """Read the config of a training, or take its defaults, with what was said here.
+
+        Args:
+            path: of the config.
+            kind: its dataclass.
+            default: the config if none is named; None: the dataclass's own.
+            workers: processes that make samples beside the one that trains.
+
+        Raises:
+            InputError: a value is refused, or a warm-up longer than the config's own steps. A try
+                (``--steps``) may be shorter, and a run that goes on keeps its config.
+        """
+        from depthpose.core.config import read_config
+        from depthpose.core.loop import refuse_long_warmup  # --help must not load torch
+
+        config: Any = (default or kind()) if path is None else read_config(path, kind)
+        if not (self.resume or self.finish):
+            own = config.loop.steps
+            refuse_long_warmup(config, None if own is None else max(own, self.steps or 0))
+        loop = changed(
+            config.loop,
+            seed=self.seed,
+            device=self.device,
+            precision=self.precision,
+            workers=workers,
+        )
+        if self.steps is not None:
+            loop = dataclasses.replace(loop, steps=self.steps, epochs=None)
+        return dataclasses.replace(config, loop=loop)
+
+
+def _train(
+    run_stage: Callable[[Any, Any], Path], config: object, out: Path, options: TrainingOptions,
+    *, with_messages: bool,
+) -> int:  # fmt: skip
+    """Run a training, show how far it is, and print where its weights and their card are."""
+    from depthpose.core.loop import Run
+    from depthpose.core.run import find_rank
+
+    is_first = find_rank().rank == 0
+    with progress_bar(options.view) as on_step:
+        on_message = partial(print, flush=True) if with_messages and is_first else None
+        run = Run(
+            folder=out,
+            resume=options.resume,
+            finish=options.finish,
+            on_step=on_step,
+            on_message=on_message,
+        )
+        path = run_stage(config, run)
+    if is_first:
+        print(f"trained weights: {path}")
+        card = path.with_suffix(".md")
+        print(card.read_text() if card.is_file() else "", end="")
+    return 0
+
+
+@contextmanager
+def progress_bar(view: str | None = None) -> "Iterator[Callable[[Progress], None]]":
+    """A bar with time left and the latest numbers; with ``view``, curves of them in Rerun too."""
+    from tqdm import tqdm
+
+    from depthpose.core.run import find_rank
+    from depthpose.report.viewer import open_viewer
+
+    # Opened before the length is known; other processes than the first never show a step.
+    is_first = find_rank().rank == 0
+    is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
+    with (
+        tqdm(unit=" steps", disable=None if is_first else True) as bar,
+        open_viewer(view if is_first else None) as viewer,
+    ):
+        lines = Lines() if is_logged else None
+
+        def show(progress: "Progress") -> None:
+            if bar.total is None:
+                bar.reset(progress.steps)
+                bar.initial = bar.n = progress.step - 1
+            bar.update(progress.step - bar.n)
+            if progress.numbers:
+                bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
+            if viewer is not None:
+                viewer.show_step(progress)
+            if lines is not None:
+                lines.show(progress)
+
+        yield show
+
+
+class Lines:
+    """A line a minute, for a log: the first step, the last, and what is left between them.
+
+    Args:
+        every_s: seconds between two lines.
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, every_s: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self._every_s, self._clock = every_s, clock
+        self._began: tuple[int, float] | None = None
+        self._last_s = 0.0
+        self._numbers: dict[str, float] = {}
+
+    def show(self, progress: "Progress") -> None:
+        """Print a line where one is due; the latest numbers stand in it."""
+        now_s = self._clock()
+        self._numbers = progress.numbers or self._numbers
+        is_end = progress.step >= progress.steps
+        if self._began is None:
+            self._began = (progress.step, now_s)
+        elif not is_end and now_s - self._last_s < self._every_s:
+            return
+        self._last_s = now_s
+        first, began_s = self._began
+        said = [f"step {progress.step} of {progress.steps}"]
+        if first < progress.step < progress.steps:
+            left_s = (progress.steps - progress.step) * (now_s - began_s) / (progress.step - first)
+            said.append(f"{left_s / 60:.0f} min left")
+        said += [f"{name} {value:.4g}" for name, value in self._numbers.items()]
+        print(", ".join(said), flush=True)
+
+
+_LOOKED_AT = 20
+"""Held-out pairs of a folder, by default."""
+
+
+@group
+class PairsOptions:
+    """What a training learns from."""
+
+    data: tuple[Source, ...] = ()
+    """folders of pairs; they replace the config's."""
+    held_out: tuple[Source, ...] = ()
+    """folders of pairs for validation alone; 20 of each, evenly spaced, unless the config says
+    otherwise."""
+
+    def applied(self, config: "DepthConfig") -> "DepthConfig":
+        """Give the config of a training with these folders.
+
+        Raises:
+            InputError: the stage takes no held-out pairs.
+        """
+        from depthpose.depth.config import PairsConfig
+        from depthpose.depth.train.config import AdaptTraining, StereoTraining
+
+        pairs = changed(config.pairs, folders=self.data or None)
+        if not self.held_out:
+            return dataclasses.replace(config, pairs=pairs)
+        if isinstance(config, AdaptTraining):
+            raise InputError(
+                "--held-out has no meaning for 'adapt', which holds out a share of the pairs "
+                "itself (validation_share in the config); leave it out."
+            )
+        # A generator is measured at the focal length of its own rig, whatever it is trained on.
+        focal_px = pairs.focal_px if isinstance(config, StereoTraining) else None
+        held_out = config.held_out or PairsConfig(
+            focal_px=focal_px, truth=pairs.truth, limit=_LOOKED_AT
+        )
+        held_out = dataclasses.replace(held_out, folders=self.held_out)
+        return dataclasses.replace(config, pairs=pairs, held_out=held_out)
+
+
+@group
+class BeginningOptions:
+    """Weights that a training begins with."""
+
+    generator: WeightsName | None = None
+    """finetune: weights of the generator to begin with."""
+    matcher: WeightsName | None = None
+    """finetune: weights whose matcher matches the synthesised view, by name or file; they are not
+    changed."""
+    start: WeightsName | None = None
+    """view, select, stereo, adapt: weights to begin with; adapt takes 'default' by default."""
+    encoder: WeightsName | None = None
+    """select, stereo with a light network: weights of the encoder to begin with, of 'depthpose
+    weights import efficientnet-lite0'."""
+
+    def applied(self, config: "DepthConfig", stage: str) -> "DepthConfig":
+        """Give the config of a stage with these weights.
+
+        Raises:
+            InputError: the stage takes none of these.
+        """
+        settings = {field.name for field in dataclasses.fields(config)}
+        if stage != "finetune":
+            settings -= {"generator", "matcher"}
+        for name, value in vars(self).items():
+            if value is not None and name not in settings:
+                raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
+        return changed(config, **vars(self))
+
+
+def train_depth(
+    stage: tyro.conf.Positional[Literal["view", "select", "stereo", "adapt", "finetune"]],
+    out: NewPath,
+    config: Path | None = None,
+    pairs: PairsOptions = PairsOptions(),
+    beginning: BeginningOptions = BeginningOptions(),
+    training: TrainingOptions = TrainingOptions(),
+) -> int:
+    """Train a generator, a matcher, or a generator through a matcher, in stages.
+
+        view      the thesis's generator, a U-Net (pix2pix) for the right view; needs pairs
+        select    a generator that warps the left image to the right view, and estimates depth
+                  itself; needs pairs with truth
+        stereo    the matcher; needs pairs with truth
+        adapt     a trained matcher to your rig; needs its pairs with calibration, no truth. A fifth
+                  of them is held out, and weights are written only if these fit better and
+                  synthetic streets no worse
+        finetune  either generator through the frozen matcher; needs weights of both
+
+    A config holds every setting; the options below change what they name. The run folder keeps
+    config, metrics, pictures, TensorBoard and the last state: --resume goes on from there, whatever
+    stopped the training, and ends with the weights of a run that nothing stopped. Several GPUs or
+    machines: 'accelerate launch -m depthpose depth train ...'.
+
+        depthpose depth train view --config configs/depth/view.yaml --data kitti --out runs/view
+
+    Args:
+        stage: what is trained: view, select, stereo, adapt or finetune.
+        out: the run folder.
+        config: YAML with what differs from the thesis's settings.
+    """
+    from depthpose.depth.train import STAGES
+
+    kind, run_stage = STAGES[stage]
+    settings = beginning.applied(pairs.applied(training.read(config, kind)), stage)
+    return _train(run_stage, settings, out, training, with_messages=False)
+
+
+def calibrate(
+    weights: tyro.conf.Positional[WeightsName],
+    data: list[Path],
+    out: NewPath,
+    alarm_share: float = 0.01,
+    split: str | None = None,
+    device: Device = "cpu",
+) -> int:
+    """Set below which confidence an image is refused as out of distribution.
+
+    The mean confidence is measured on images like those of the training. The threshold below which
+    'depth predict' refuses is set so that a share of them is refused. Tensors stay as they are.
+
+        depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
+
+    Args:
+        weights: weights with a generator that selects, by name or file.
+        data: folders of such images: KITTI raw, object, 2012/2015, or plain folders of pairs.
+        out: the file of the calibrated weights.
+        alarm_share: share of these images that may be refused.
+        split: name or file of a split, for the first folder.
+    """
+    from tqdm import tqdm
+
+    from depthpose.core.checkpoint import find_weights
+    from depthpose.core.run import refuse_to_replace
+    from depthpose.depth import out_of_distribution
+    from depthpose.depth.datasets import join_datasets, open_dataset
+    from depthpose.depth.estimator import FakestereoNet
+
+    refuse_to_replace(out)
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: end the name in .safetensors")
+    path = find_weights(weights)
+    parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
+    dataset = join_datasets(parts)
+    out_of_distribution.refuse_share(len(dataset), alarm_share)
+    net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
+    shown = tqdm(range(len(dataset)), unit=" images", disable=None)
+    known = out_of_distribution.measure_image_confidence(net, map(dataset.read_input, shown))
+    least = out_of_distribution.calibrate(path, known, alarm_share, out)
+    print(f"{len(known)} images: mean confidence {min(known):.3f} to {max(known):.3f}")
+    print(f"refused below {least:.3f}; calibrated weights: {out}")
+    return 0
+
+
+_START = "parts"
+"""The weights that ship and may go with any licence."""
+_NOTHING = "nothing"
+"""The word for no weights."""
+
+
+@group
+class LearntOptions:
+    """What is learnt, and from what."""
+
+    cad: tuple[Source, ...] = ()
+    """model files; one network learns them all."""
+    unit: Unit | None = None
+    """of the numbers in the files."""
+    symmetries: Literal["none", "found"] | None = None
+    """found: detect symmetries of the part and count equivalent poses as one; by default they are
+    only printed."""
+    data: Source | None = None
+    """folder of a data set; it takes the place of the config's, for models and frames."""
+    what: Literal["pose", "segmentation", "depth-image", "pointnet"] = "pose"
+    """pose: the network of directions; segmentation: the masks for it; depth-image and pointnet:
+    baselines."""
+    start: WeightsName | None = None
+    """weights to begin with, by name or file. A CAD file without a config begins with 'parts';
+    'nothing' begins anew and takes twice the steps."""
+
+    def default(self) -> "PoseTraining | None":
+        """Give the settings of a training without a config, where they are not the network's."""
+        from depthpose.pose.train.config import own_part
+
+        is_own = self.what == "pose" and self.cad and self.start != _NOTHING
+        return own_part(self.start or _START) if is_own else None
+
+    def applied(self, config: "PoseConfig") -> "PoseConfig":
+        """Give the config of a training with these.
+
+        Raises:
+            InputError: the training takes no CAD files, or learns from no data set.
+        """
+        from depthpose.pose.train import SegmentationTraining  # --help must not load torch
+
+        if self.start is not None:
+            start = None if self.start == _NOTHING else self.start
+            config = dataclasses.replace(config, start=start)
+        if self.cad or self.unit or self.symmetries:
+            if isinstance(config, SegmentationTraining):
+                raise InputError(
+                    "--cad has no meaning for 'segmentation', which learns from pictures: make "
+                    "them by 'depthpose data make objects --cad ...' and name the folder in the "
+                    "config"
+                )
+            models = changed(config.models, cad=self.cad or None, unit=self.unit)
+            if self.cad:  # they take the place of a data set's models
+                models = dataclasses.replace(models, bop=None, objects=(), parts=())
+            is_found = None if self.symmetries is None else self.symmetries == "found"
+            models = changed(models, with_found_symmetries=is_found)
+            config = dataclasses.replace(config, models=models)
+        if self.data is None:
+            return config
+        changes = {}
+        if (models := getattr(config, "models", None)) is not None and models.bop is not None:
+            changes["models"] = dataclasses.replace(models, bop=self.data)
+        for part in ("frames", "images", "held_out"):
+            if hasattr(getattr(config, part, None), "folder"):
+                changes[part] = dataclasses.replace(getattr(config, part), folder=self.data)
+        if not changes:
+            raise InputError(
+                f"--data {self.data}: the config learns from no data set; see --cad and --what"
+            )
+        return dataclasses.replace(config, **changes)
+
+
+def train_pose(
+    out: NewPath,
+    config: Path | None = None,
+    learnt: LearntOptions = LearntOptions(),
+    workers: int | None = None,
+    training: TrainingOptions = TrainingOptions(),
+) -> int:
+    """Train a network on your CAD file, or by a config.
+
+    Views of the object are rendered while it trains: no photograph is needed. At the end the
+    whole is measured on held-out views; OUT holds the weights with the model in them, their card,
+    config, metrics and states. A training that stopped goes on with
+    --resume; --finish, or Ctrl-C twice, writes weights of the steps so far. Without a terminal a
+    line is printed each minute.
+
+        depthpose pose train --cad part.stl --unit mm --out my_part
+        depthpose pose predict --cloud scan.ply --unit mm --weights my_part/pose.safetensors ...
+
+    Args:
+        out: the run folder.
+        config: YAML with what differs from the defaults.
+        workers: processes that render views beside the one that trains.
+    """
+    from depthpose.pose.mesh import unit_of
+    from depthpose.pose.train import STAGES
+
+    kind, run_stage = STAGES[learnt.what]
+    settings = training.read(config, kind, default=learnt.default(), workers=workers)
+    for path in learnt.cad:
+        unit_of(path, learnt.unit)
+    return _train(run_stage, learnt.applied(settings), out, training, with_messages=True)
