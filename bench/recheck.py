@@ -1,4 +1,4 @@
-"""Run the quick tables of docs/results.md again, and list every number that has changed.
+"""Run the quick tables of docs/results.md and docs/experiments again; list what has changed.
 
     DEPTHPOSE_DATA=SAMPLES python bench/recheck.py [--only NAME ...] [--out out/bench/recheck]
 
@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "docs/results.md"
+DATA = "experiments/data.md"
+"""Page of the protocols and ports."""
 _PSMNET = (
     "depthpose weights import psmnet SAMPLES/reference/psmnet/published_kitti2015.tar "
     "--align-corners true --out OUT/psmnet.safetensors"
@@ -50,18 +51,19 @@ _STEREO = {**_SGBM, "PSMNet, published KITTI-2015 weights": {"method": "psmnet"}
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of results.md, and the commands that reproduce it.
+    """A printed table, and the commands that reproduce it.
 
     Attributes:
         name: for ``--only``.
-        after: text of results.md; the table is the first one below it.
+        after: text of the page; the table is the first one below it.
         commands: run in order; SAMPLES and OUT are replaced by folders.
         files: JSON rows that they write, under OUT.
-        numbers: columns that are compared, by name in results.md and in the rows.
+        numbers: columns that are compared, by name on the page and in the rows.
         key: columns that identify a row, besides the first.
         rows: values in the rows for each name in the first column; other names are not compared.
             None: it is a column of the rows itself, named in ``key``.
         tolerance: share of a number by which another processor may change it.
+        page: below ``docs``.
     """
 
     name: str
@@ -72,6 +74,11 @@ class Table:
     key: Mapping[str, str] = field(default_factory=dict)
     rows: Mapping[str, Mapping[str, str]] | None = None
     tolerance: float = 0.002
+    page: str = "results.md"
+
+    def printed(self) -> list[dict[str, str]]:
+        """Read it from its page: cells by column, without marks."""
+        return printed_rows((ROOT / "docs" / self.page).read_text(), self.after)
 
 
 def _stereo(name: str, after: str, data: str, protocols: Sequence[str], **more: Any) -> Table:  # noqa: ANN401
@@ -83,7 +90,7 @@ def _stereo(name: str, after: str, data: str, protocols: Sequence[str], **more: 
     files = tuple(f"{name}/{protocol}/rows.json" for protocol in protocols)
     numbers = {**_DEPTH, **more.pop("numbers", {**_DELTAS, "AUSE": "ause"})}
     return Table(name=name, after=after, commands=(_PSMNET, *runs), files=files, numbers=numbers,
-                 rows=_STEREO, **more)  # fmt: skip
+                 rows=_STEREO, page=DATA, **more)  # fmt: skip
 
 
 TABLES = (
@@ -164,7 +171,8 @@ TABLES = (
     ),
     Table(
         name="votes",
-        after="### Voting",
+        after="## Voting",
+        page="experiments/poses-by-geometry.md",
         commands=("python bench/voting_speed.py --points 500 2000 5000",),
         files=("out/bench/voting_speed.json",),
         numbers={"error, mm": "error_mm"},
@@ -201,7 +209,6 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/bench/recheck"))
     arguments = parser.parse_args()
     samples = os.environ.get("DEPTHPOSE_DATA", "")
-    text = RESULTS.read_text()
     moved = 0
     for table in TABLES:
         if arguments.only and table.name not in arguments.only:
@@ -210,7 +217,7 @@ def main() -> int:
             print(f"{table.name}: skipped, for $DEPTHPOSE_DATA names no samples", flush=True)
             continue
         rows = run(table, arguments.out.resolve(), samples)
-        differences, compared, left_out = compare(table, printed_rows(text, table.after), rows)
+        differences, compared, left_out = compare(table, table.printed(), rows)
         moved += len(differences)
         print(f"{table.name}: {compared} numbers, {len(differences)} moved", flush=True)
         print("".join(f"  {line}\n" for line in differences), end="")
@@ -236,7 +243,7 @@ def _execute(command: str, out: Path) -> None:
 
 def printed_rows(text: str, after: str) -> list[dict[str, str]]:
     """Read the first Markdown table below a part of a text: cells by column, without marks."""
-    assert text.count(after) == 1, f"{after!r} stands {text.count(after)} times in results.md"
+    assert text.count(after) == 1, f"{after!r} stands {text.count(after)} times"
     lines = text[text.index(after) :].splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("|"))
     last = next((k for k in range(first, len(lines)) if not lines[k].startswith("|")), len(lines))
