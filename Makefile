@@ -7,8 +7,13 @@ READY := .venv/.ready
 # Real samples for the tests that need them; those tests skip, and say so, where there are none.
 export DEPTHPOSE_DATA ?= $(wildcard $(CURDIR)/../shared/data)
 
-# Test files side by side, one thread each: threads of torch in every worker would fight for cores.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+# Tests side by side, one thread each: threads of torch in every worker would fight for cores. Who
+# has none left takes some of another's; the slow ones share what a file sets up, and stay together.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8
+# Shapes and types of every call, checked while tests run: slower, so the quick tests do without,
+# unless 'make test TYPES=1' (as .ci/run has it).
+TYPES ?=
+CHECKED := --jaxtyping-packages=depthpose,beartype.beartype
 
 .PHONY: all setup demo test test-slow check docs bench clean
 all: check test
@@ -35,10 +40,10 @@ demo: $(DEMO)
 	$(BIN)/depthpose demo --out $(OUT)/demo
 
 test: $(READY)
-	$(PYTEST)
+	$(PYTEST) --dist worksteal $(if $(TYPES),$(CHECKED))
 
 test-slow: $(READY)
-	$(PYTEST) -m slow
+	$(PYTEST) --dist loadfile $(CHECKED) -m slow
 
 check: $(READY)
 	$(BIN)/ruff format --check .

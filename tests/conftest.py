@@ -1,5 +1,7 @@
 import contextlib
+import fcntl
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -19,12 +21,21 @@ def real() -> Path:
 
 @pytest.fixture(scope="session")
 def after_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which ``depthpose demo`` has run."""
+    """A folder in which ``depthpose demo`` has run: once for all processes, a copy for each."""
     from depthpose.cli import main
 
     folder = tmp_path_factory.mktemp("demo")
-    with contextlib.chdir(folder):
-        assert main(["demo"]) == 0
+    home = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        home = home.parent
+    with (home / "demo.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        made = home / "demo-made"
+        if not (made / "out/demo/report.html").is_file():
+            made.mkdir(exist_ok=True)
+            with contextlib.chdir(made):
+                assert main(["demo"]) == 0
+    shutil.copytree(made, folder, dirs_exist_ok=True)
     return folder
 
 
@@ -45,8 +56,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# Nothing of a test stays in the user's cache, nor comes from there.
-os.environ["DEPTHPOSE_CACHE"] = tempfile.mkdtemp(prefix="depthpose-cache-")
+# Nothing of a test stays in the user's cache, nor comes from there. Processes of one run share what
+# is computed of a model once: they inherit the folder of the one that starts them.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ["DEPTHPOSE_CACHE"] = tempfile.mkdtemp(prefix="depthpose-cache-")
 
 # One thread each, as 'make test' has it: sums of several threads are added in another order, and a
 # short training may then end elsewhere. Programs that a test starts inherit it.

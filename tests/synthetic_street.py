@@ -5,7 +5,8 @@ is a function of the surface point alone, so both views of the pair see the same
 x right, y down, z forward, metres, origin at the left camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -66,7 +67,7 @@ class Hit:
 
 
 def make_street(scale: float = 1.0) -> StereoSample:
-    """Draw the pair and its exact disparity.
+    """Draw the pair and its exact disparity; each size once in a process.
 
     Args:
         scale: size of the images as a share of KITTI's 1242 x 375.
@@ -74,6 +75,21 @@ def make_street(scale: float = 1.0) -> StereoSample:
     Returns:
         A sample with camera, both images, and disparity and depth of the left one (NaN: sky).
     """
+    street = _drawn(scale)
+    given, truth = street.input, street.truth
+    assert given.right is not None
+    assert truth.disparity_px is not None
+    assert truth.depth_m is not None
+    left, right = given.left.clone(), given.right.clone()
+    disparity_px, depth_m = truth.disparity_px.clone(), truth.depth_m.clone()
+    return StereoSample(
+        input=replace(given, left=left, right=right),
+        truth=replace(truth, disparity_px=disparity_px, depth_m=depth_m),
+    )
+
+
+@cache
+def _drawn(scale: float) -> StereoSample:
     rig = _kitti_like_rig(scale)
     solids = _street_solids()
     left, right = (_draw_view(rig, solids, x_m) for x_m in (0.0, rig.baseline_m))

@@ -79,21 +79,32 @@ def test_pairs_without_calibration_are_refused(tmp_path: Path) -> None:
         list(label_pairs(brightness_matcher(), open_dataset(folder), LabelConfig(), tmp_path, {}))
 
 
-def test_the_command_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_pairs(tmp_path / "pairs", (0.25,))
-    assert main(["data", "label", str(folder), "--out", str(tmp_path / "out")]) == 0
-    assert "1 pairs labelled, " in capsys.readouterr().out
-    assert (tmp_path / "out/disp_occ/00.png").is_file()
-
-
 @pytest.mark.parametrize("keep", [0, 1000], ids=["no image", "cut off"])
-def test_a_pair_that_cannot_be_read_stops_no_other(
-    keep: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, out = write_pairs(tmp_path / "pairs", (0.2, 0.2)), tmp_path / "out"
+def test_a_pair_that_cannot_be_read_stops_no_other(keep: int, tmp_path: Path) -> None:
+    folder, out = write_pairs(tmp_path / "pairs", (0.1, 0.1)), tmp_path / "out"
     damaged = folder / "left/00.png"
     whole = damaged.read_bytes()
     damaged.write_bytes(whole[:keep])
+    failures: list[InputError] = []
+
+    def label() -> list[str]:
+        made = label_pairs(brightness_matcher(), open_dataset(folder), LabelConfig(), out, {},
+                           failures=failures)  # fmt: skip
+        return [name for name, _ in made]
+
+    assert label() == ["01"]
+    assert [str(failure).partition(": ")[0] for failure in failures] == [str(damaged)]
+    damaged.write_bytes(whole)
+    assert label() == ["00"]
+
+
+def test_the_command_says_what_it_did_and_what_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = write_pairs(tmp_path / "pairs", (0.15, 0.15)), tmp_path / "out"
+    damaged = folder / "left/00.png"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:1000])
     words = ["data", "label", str(folder), "--out", str(out)]
     assert main(words) == 1
     said = capsys.readouterr()

@@ -44,7 +44,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def streets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """KITTI's raw layout with LiDAR, sky and a calibration for each date."""
     folder = tmp_path_factory.mktemp("streets") / "raw"
-    made = ["data", "make", "streets", "--out", str(folder), "--number", "3", "--scale", "0.1"]
+    made = ["data", "make", "streets", "--out", str(folder), "--number", "2", "--scale", "0.1"]
     assert main([*made, "--with-lidar"]) == 0
     return folder
 

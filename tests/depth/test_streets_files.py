@@ -1,5 +1,6 @@
 """Made streets on disk: written, checked, resumed, and read as KITTI is read."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -72,23 +73,21 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
 
 def test_one_date_has_one_calibration(tmp_path: Path) -> None:
     drive = "2100_02_01_drive_0001_sync"
-    for scale in (0.1, 0.12):
-        frame = draw_street(StreetsConfig(scale=scale), 0)
-        raw = RawFrame(
-            left=frame.left,
-            right=frame.right,
-            rig=frame.rig,
-            disparity_px=frame.disparity_px,
-            occluded=frame.occluded,
-            is_sky=frame.is_sky,
-            points=None,
-            camera_from_velodyne=camera_from_velodyne(),
-        )
-        if scale == 0.1:
-            write_raw_frame(tmp_path, drive, 3, raw)
-        else:
-            with pytest.raises(InputError, match="another rig or scale"):
-                write_raw_frame(tmp_path, drive, 4, raw)
+    frame = draw_street(StreetsConfig(scale=0.05), 0)
+    raw = RawFrame(
+        left=frame.left,
+        right=frame.right,
+        rig=frame.rig,
+        disparity_px=frame.disparity_px,
+        occluded=frame.occluded,
+        is_sky=frame.is_sky,
+        points=None,
+        camera_from_velodyne=camera_from_velodyne(),
+    )
+    write_raw_frame(tmp_path, drive, 3, raw)
+    other = replace(raw, rig=replace(raw.rig, baseline_m=0.6))
+    with pytest.raises(InputError, match="another rig or scale"):
+        write_raw_frame(tmp_path, drive, 4, other)
     assert has_raw_frame(tmp_path, drive, 3)
     assert has_calibration(tmp_path, drive[:10])
     left = tmp_path / drive[:10] / drive / "image_02/data/0000000003.png"

@@ -210,19 +210,19 @@ def test_a_diameter_is_the_largest_distance() -> None:
     assert exact_diameter(points) == pytest.approx(float(torch.cdist(points, points).max()))
     flat = points * torch.tensor([1, 1, 0])
     assert exact_diameter(flat) == pytest.approx(float(torch.cdist(flat, flat).max()))
+    assert exact_diameter(torch.cat([points, points])) == exact_diameter(points)
     assert exact_diameter(points[:2]) == pytest.approx(float((points[0] - points[1]).norm()))
 
 
 def test_the_diameter_of_a_large_smooth_hull_is_found_in_directions() -> None:
-    """Some 16,000 corners, all on the hull."""
-    turns = torch.linspace(0, 2 * math.pi, 181)[:-1]
+    """8,100 corners, all on the hull: more than are compared each with each."""
+    turns = torch.linspace(0, 2 * math.pi, 91)[:-1]
     rings = torch.linspace(0.01, math.pi - 0.01, 90)
     up, around = torch.meshgrid(rings, turns, indexing="ij")
     ball = torch.stack([up.sin() * around.cos(), up.sin() * around.sin(), up.cos()], -1)
     points = ball.reshape(-1, 3) * torch.tensor([0.1, 0.2, 0.25])
     points = points @ rotation_by(torch.tensor([0.3, 1.0, 0.2])).mT
     assert exact_diameter(points) == pytest.approx(0.5 * math.cos(0.01), rel=5e-4)
-    assert exact_diameter(torch.cat([points, points])) == exact_diameter(points)
 
 
 def test_a_stray_vertex_is_no_surface() -> None:
