@@ -71,7 +71,7 @@ class SelectionGenerator(nn.Module):
             )
         return self.decode(self.encoder(image))
 
-    def decode(self, features: list[Float[Tensor, "b c _ _"]]) -> tuple[Logits, Logits]:
+    def decode(self, features: list[Float[Tensor, "b _ _ _"]]) -> tuple[Logits, Logits]:
         """Answer the logits of both views by what the encoder saw."""
         *skips, deepest = features
         x = self.top(deepest)
@@ -81,17 +81,19 @@ class SelectionGenerator(nn.Module):
         return left, right
 
     def find_street(self, deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, " b"] | None:
-        """Answer how probable a street is, which upright has sky above and a road below.
-
-        A logistic regression on three moments of each feature over the rows.
-        """
+        """Answer how probable a street is, by a logistic regression; None where that is lacking."""
         if self.street is None:
             return None
+        return self.street(self.street_features(deepest))[:, 0].sigmoid()
+
+    @staticmethod
+    def street_features(deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, "b c3"]:
+        """Answer three moments over the rows: a street has its sky above and its road below."""
         rows = deepest.shape[2]
         y = (2 * torch.arange(rows, device=deepest.device) + 1) / rows - 1
         row = deepest.float().mean(3)
-        moments = [(row * weight).mean(2) for weight in (torch.ones_like(y), y, 1.5 * y**2 - 0.5)]
-        return self.street(torch.cat(moments, 1))[:, 0].sigmoid()
+        weights = (torch.ones_like(y), y, 1.5 * y**2 - 0.5)
+        return torch.cat([(row * weight).mean(2) for weight in weights], 1)
 
 
 def make_planes(config: SelectionConfig) -> Planes:
