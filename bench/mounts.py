@@ -27,7 +27,7 @@ from depthpose.depth.synthetic.sensor import draw_sensors, expose
 from depthpose.depth.synthetic.stage import prepare
 from depthpose.depth.synthetic.view import draw_light, look
 from depthpose.depth.types import StereoInput
-from depthpose.report.tables import markdown_table, write_table
+from depthpose.report.page import markdown_table, write_table
 
 WIDTH, HEIGHT = 640, 360
 HEIGHTS_M, TILTS_DEG, FOVS_DEG = (1.2, 1.65, 2.5), (-5, 0, 5), (50, 80, 110)

@@ -37,7 +37,7 @@ from depthpose.depth.synthetic.stage import prepare
 from depthpose.depth.synthetic.view import draw_light, look
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
-from depthpose.report.tables import markdown_table
+from depthpose.report.page import markdown_table
 
 ROWS, COLUMNS = 224, 480
 
