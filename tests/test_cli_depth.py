@@ -187,7 +187,7 @@ def test_a_threshold_is_chosen_on_a_folder(
     assert main(["depth", "calibrate", *words]) == 2
     assert "3 images cannot say what refuses 0.01 of them" in capsys.readouterr().err
     assert main(["depth", "calibrate", *words, "--alarm-share", "0.5"]) == 0
-    assert "3 images: mean confidence 1.000 to 1.000" in capsys.readouterr().out
+    assert "3 images: confidence 1.000 to 1.000" in capsys.readouterr().out
     assert read_checkpoint(out).config["least_confidence"] == pytest.approx(1.0, abs=1e-3)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tests.depth.constant_selection import BASELINE_M, FOCAL_PX, sure_of
+from tests.depth.constant_selection import BASELINE_M, FOCAL_PX, of_all_kinds, sure_of
 from torch import Tensor, nn
 
 import depthpose
@@ -21,18 +21,17 @@ from depthpose.depth.config import (
     GeneratorConfig,
     MatcherConfig,
     PSMNetConfig,
-    SelectionConfig,
     SGBMConfig,
     Speed,
 )
 from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.estimator.inputs import as_tensor
-from depthpose.depth.estimator.rig import check_distribution, join_matches
+from depthpose.depth.estimator.rig import join_matches
 from depthpose.depth.out_of_distribution import calibrate, measure_image_confidence, refuse_share
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Ground, Match, StereoInput
+from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.weights import read_generator, write_depth_weights
 
 
@@ -475,13 +474,13 @@ def unsure(least: float) -> SelectionGenerator:
 
 def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     image, lens = torch.rand(3, 40, 60), camera(60, 40, FOCAL_PX)
-    known = FakestereoNet(None, make_synthesiser(unsure(0.45))).estimate(image, lens)
+    known = FakestereoNet(None, make_synthesiser(unsure(0.65))).estimate(image, lens)
     assert known.image_confidence == pytest.approx(0.7)
     assert known.warning == ""
-    synthesiser = make_synthesiser(unsure(0.7))
-    # One disparity everywhere is a wall, and without a road it must be surer.
+    synthesiser = make_synthesiser(unsure(0.8))
     with pytest.raises(
-        InputError, match=r"cup: out of .* \(no road is seen, .* below 0\.80\), .* allow_ood=True"
+        InputError,
+        match=r"cup: out of .* \(mean confidence 0\.70, below 0\.80\), .* allow_ood=True",
     ):
         FakestereoNet(None, synthesiser).estimate(image, lens, name="cup")
     guess = FakestereoNet(None, synthesiser, allow_ood=True).estimate(image, lens, name="cup")
@@ -489,20 +488,27 @@ def test_an_image_unlike_the_known_is_refused_or_warned_of() -> None:
     torch.testing.assert_close(guess.depth_m, known.depth_m)
 
 
-@pytest.mark.parametrize(
-    ("height_m", "tilt_deg", "is_refused"),
-    [(1.6, -2.0, False), (9.0, 0.0, True), (1.6, 20.0, True)],
-)
-def test_with_a_road_an_image_may_be_less_sure(
-    height_m: float, tilt_deg: float, is_refused: bool
-) -> None:
-    road = Ground(height_m=height_m, tilt_deg=tilt_deg, roll_deg=0.0, share=0.8, height_std_m=0.02,
-                  tilt_std_deg=0.1)  # fmt: skip
-    found = DepthEstimate(depth_m=None, disparity_px=torch.ones(2, 2), image_confidence=0.57,
-                          ground=road)  # fmt: skip
-    config = SelectionConfig(least_confidence=0.6)
-    said = check_distribution("a", found, config, allow_ood=True).warning
-    assert bool(said) == is_refused
+def test_how_probable_a_street_is_decides_where_the_weights_know_it() -> None:
+    """A layer that tells an image from itself upside down refuses the one and answers the other."""
+    torch.manual_seed(0)
+    upright = torch.full((3, 64, 96), 0.5)
+    upright[:, :24] = torch.rand(3, 24, 96)
+    images = [upright, upright.flip(1)]
+    network = of_all_kinds()
+    rows = [network.encoder(image[None])[-1][0].mean(2).double() for image in images]
+    y = torch.linspace(-0.5, 0.5, 2).double()
+    weights = torch.stack([torch.ones(2).double(), y, (3 * y**2 - 1) / 2])
+    first, second = (torch.einsum("cr,mr->mc", row, weights).flatten() / 2 for row in rows)
+    across = 40 * (first - second) / (first - second).square().sum()
+    network.config = replace(network.config, with_street=True, least_confidence=0.5)
+    network.street = nn.Linear(len(across), 1)
+    network.street.weight = nn.Parameter(across[None].float())
+    network.street.bias = nn.Parameter(-(across @ (first + second))[None].float() / 2)
+    net = FakestereoNet(None, make_synthesiser(network, speed="quick"), allow_ood=True)
+    street, other = net.estimate_many(images, camera(96, 64, FOCAL_PX))
+    assert (street.image_confidence, street.warning) == (pytest.approx(1.0, abs=1e-3), "")
+    assert other.image_confidence == pytest.approx(0.0, abs=1e-3)
+    assert "(probability of a street 0.00, below 0.50)" in other.warning
 
 
 def test_without_a_camera_a_photograph_is_asked_for_its_exif(tmp_path: Path) -> None:

@@ -161,10 +161,15 @@ def test_depth_from_one_image_is_the_estimators_at_every_size(exported: Path) ->
 def test_weights_that_refuse_unlike_images_are_exported(selection: Path) -> None:
     """The scenes of the proof are unlike what such weights were trained on."""
     generator = of_all_kinds()
-    generator.config = dataclasses.replace(generator.config, least_confidence=0.99)
+    generator.config = dataclasses.replace(
+        generator.config, least_confidence=0.99, with_street=True
+    )
+    generator.street = torch.nn.Linear(3 * generator.encoder.channels[-1], 1)
     write_depth_weights(selection / "strict.safetensors", generator=generator, facts=TERMS)
     words = ["--weights", str(selection / "strict.safetensors")]
     assert main(["export", "depth", *words, "--out", str(selection / "d.onnx")]) == 0
+    rows = json.loads((selection / "d.proof.json").read_text())["differences"]
+    assert "image_confidence" in {row["output"] for row in rows}
 
 
 @pytest.mark.slow

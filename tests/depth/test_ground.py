@@ -86,21 +86,38 @@ def test_what_is_no_road_is_none(depth_m: Float[Tensor, "200 400"]) -> None:
 
 
 @pytest.mark.parametrize(
-    "mount", [{"mount_height_m": 2.4}, {"mount_height_m": 2.4, "tilt_deg": -3.0}]
+    ("mount", "height_m"),
+    [
+        ({"mount_height_m": 2.4}, 1.6 * math.sqrt(1.5)),
+        ({"mount_height_m": 2.4, "tilt_deg": -3.0}, 2.4),
+    ],
+    ids=["half of the way, as sizes say the other half", "the plane is known"],
 )
-def test_a_known_height_scales_depth_and_disparity_and_not_the_sky(mount: dict[str, float]) -> None:
+def test_a_known_height_scales_depth_and_disparity_and_not_the_sky(
+    mount: dict[str, float], height_m: float
+) -> None:
     given = estimate(road(1.6, -3, 0))
     found = scale_by_mount(given, seen(**mount))
     assert found.ground is not None
-    assert found.ground.height_m == pytest.approx(2.4, rel=1e-3)
-    truth = estimate(road(2.4, -3, 0)).depth_m
+    assert found.ground.height_m == pytest.approx(height_m, rel=1e-3)
+    truth = estimate(road(height_m, -3, 0)).depth_m
     assert found.depth_m is not None and truth is not None  # noqa: PT018
     near = truth < 20
     torch.testing.assert_close(found.depth_m[near], truth[near], rtol=2e-3, atol=0)
     torch.testing.assert_close(
-        found.disparity_px[100:], given.disparity_px[100:] / 1.5, rtol=2e-3, atol=0
+        found.disparity_px[100:], given.disparity_px[100:] * 1.6 / height_m, rtol=2e-3, atol=0
     )
     torch.testing.assert_close(found.disparity_px[:20], given.disparity_px[:20])
+
+
+def test_what_stands_on_a_known_plane_keeps_its_size() -> None:
+    depth_m = road(1.6, -3, 0)
+    wall = (slice(100, 150), slice(150, 250))
+    depth_m[wall] = 3.0
+    found = scale_by_mount(estimate(depth_m), seen(mount_height_m=2.4, tilt_deg=-3.0))
+    assert found.depth_m is not None
+    standing = torch.full((50, 100), 3.0 * math.sqrt(1.5))
+    torch.testing.assert_close(found.depth_m[wall], standing, rtol=2e-3, atol=0)
 
 
 def test_a_known_tilt_corrects_a_wrong_one() -> None:

@@ -244,9 +244,9 @@ def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
 def test_a_start_may_refuse_unlike_images_and_what_comes_of_it_does_not_yet(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:
-    """``depth calibrate`` chooses that limit after a training: the start's says nothing of it."""
+    """What tells streets, and its limit, are found after a training: the start's say nothing."""
     start = tmp_path / "start.safetensors"
-    careful = SelectionGenerator(dataclasses.replace(TINY, least_confidence=0.5))
+    careful = SelectionGenerator(dataclasses.replace(TINY, least_confidence=0.5, with_street=True))
     write_depth_weights(start, generator=careful, facts={})
     loop = dataclasses.replace(LOOP, steps=1)
     config = SelectTraining(generator=TINY, start=str(start), pairs=pairs, loop=loop)

@@ -77,11 +77,12 @@ class ScaleOptions:
     """What sets the metres of single images."""
 
     camera_height: float | None = None
-    """height of the camera above the road in metres: depth is scaled so that the road in it is so
-    far below ("mount_height_m" of a camera file)."""
+    """height of the camera above the road in metres: with --camera-tilt the road gets the depth of
+    that plane; what stands on it, and all without a tilt, is scaled half of the way to it, since
+    its size says another scale ("mount_height_m" of a camera file)."""
     camera_tilt: float | None = None
     """tilt of the camera in degrees, negative downwards, for --camera-height ("tilt_deg" of a
-    camera file); without it that of the road in the depth is taken."""
+    camera file)."""
     known_distance: str | None = None
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
     sets the scale of each image in place of the camera's height."""

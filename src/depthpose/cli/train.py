@@ -306,8 +306,9 @@ def calibrate(
 ) -> int:
     """Set below which confidence an image is refused as out of distribution.
 
-    The mean confidence is measured on images like those of the training. The threshold below which
-    'depth predict' refuses is set so that a share of them is refused. Tensors stay as they are.
+    The confidence (of weights that know streets how probable one is, else the mean over the image)
+    is measured on images like those of the training. The threshold below which 'depth predict'
+    refuses is set so that a share of them is refused. Tensors stay as they are.
 
         depthpose depth calibrate mine.safetensors --data my_pairs --out mine-calibrated.safetensors
 
@@ -337,7 +338,7 @@ def calibrate(
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
     known = out_of_distribution.measure_image_confidence(net, map(dataset.read_input, shown))
     least = out_of_distribution.calibrate(path, known, alarm_share, out)
-    print(f"{len(known)} images: mean confidence {min(known):.3f} to {max(known):.3f}")
+    print(f"{len(known)} images: confidence {min(known):.3f} to {max(known):.3f}")
     print(f"refused below {least:.3f}; calibrated weights: {out}")
     return 0
 

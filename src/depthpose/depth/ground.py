@@ -19,7 +19,8 @@ _STRIPS = 8
 _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
 _MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, 10))
-_ROAD_TILT_DEG = 15.0
+_ON_PLANE, _FARTHEST_M = 0.15, 200.0
+"""What is off the plane by less, in the logarithm of depth, lies on it; by twice as much, not."""
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance is known."""
 
@@ -66,13 +67,6 @@ def fit_ground(depth_m: Float[Tensor, "h w"], camera: Camera) -> Ground | None:
     )  # fmt: skip
 
 
-def is_road(ground: Ground | None) -> bool:
-    """Whether a ground lies as deep and as level below the camera as roads do below vehicles."""
-    return (
-        ground is not None and 0.8 < ground.height_m < 4 and abs(ground.tilt_deg) < _ROAD_TILT_DEG
-    )
-
-
 def _lower_points(
     depth_m: Float[Tensor, "h w"], camera: Camera
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Int[Tensor, " n"]]:
@@ -109,9 +103,10 @@ def _angles(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
 
 
 def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
-    """Find the ground and, where the camera's height is known, make its height that one.
+    """Find the ground and, where the camera's height is known, correct the scale by it.
 
-    With a tilt too the plane is known, and the scale is the median over the ground.
+    How large things look says another scale, so that the square root of the ground's factor is
+    taken. With a tilt too the plane is known, and what lies on the ground gets its depth.
 
     Args:
         found: an estimate of one image.
@@ -130,22 +125,28 @@ def scale_by_mount(found: DepthEstimate, image: StereoInput) -> DepthEstimate:
             f"{name}: no road is seen in its lower part, so a camera height of "
             f"{camera.mount_height_m:g} m cannot set the scale; omit it, or give --known-distance"
         )
-    factor = camera.mount_height_m / ground.height_m
-    if camera.tilt_deg is not None:
-        rays, inverse, _ = _lower_points(found.depth_m, camera)
-        tilt, roll = math.radians(camera.tilt_deg), math.radians(ground.roll_deg)
-        down = [-math.sin(roll), math.cos(roll) * math.cos(tilt), -math.cos(roll) * math.sin(tilt)]
-        known = rays @ torch.tensor(down, dtype=torch.float64) / camera.mount_height_m
-        own = rays @ _plane(ground)
-        is_on = ((own / inverse - 1).abs() < _INLIER) & (known > 0)
-        if int(is_on.sum()) < 30:
-            raise InputError(
-                f"{name}: the road that is seen lies above the horizon of a tilt of "
-                f"{camera.tilt_deg:g} degrees; the estimate says {ground.tilt_deg:.1f}. Negative "
-                "is down; correct it, or omit it"
-            )
-        factor = float((inverse[is_on] / known[is_on]).median())
-    return rescale(found, factor, fit=ground)
+    if camera.tilt_deg is None:
+        return rescale(found, (camera.mount_height_m / ground.height_m) ** 0.5, fit=ground)
+    mounted = replace(ground, height_m=camera.mount_height_m, tilt_deg=camera.tilt_deg)
+    rays, inverse, _ = _lower_points(found.depth_m, camera)
+    known = rays @ _plane(mounted)
+    is_on = ((rays @ _plane(ground) / inverse - 1).abs() < _INLIER) & (known > 0)
+    if int(is_on.sum()) < 30:
+        raise InputError(
+            f"{name}: the road that is seen lies above the horizon of a tilt of "
+            f"{camera.tilt_deg:g} degrees; the estimate says {ground.tilt_deg:.1f}. Negative "
+            "is down; correct it, or omit it"
+        )
+    factor = (inverse[is_on] / known[is_on]).median() ** 0.5
+    height, width = found.depth_m.shape
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], 2).double() @ torch.linalg.inv(camera.K).T
+    depth_m = found.depth_m.cpu().double()
+    off = (rays @ _plane(ground) * depth_m).log().abs()
+    on_plane = (2 - off / _ON_PLANE).clamp(0, 1).nan_to_num(0.0)
+    to_plane = 1 / (rays @ _plane(mounted)).clamp(min=1 / _FARTHEST_M) / depth_m
+    changed = factor ** (1 - on_plane) * to_plane**on_plane
+    return replace(rescale(found, changed.to(found.depth_m)), ground=mounted)
 
 
 def _plane(ground: Ground) -> Float[Tensor, "3"]:
@@ -154,11 +155,13 @@ def _plane(ground: Ground) -> Float[Tensor, "3"]:
     return plane / plane.norm() / ground.height_m
 
 
-def rescale(found: DepthEstimate, factor: float, *, fit: Ground | None = None) -> DepthEstimate:
+def rescale(
+    found: DepthEstimate, factor: float | Float[Tensor, "h w"], *, fit: Ground | None = None
+) -> DepthEstimate:
     """Multiply the depth of an estimate by ``factor``, and divide its disparity; not the sky's."""
     assert found.depth_m is not None
     ground = found.ground if fit is None else fit
-    if ground is not None:
+    if ground is not None and not isinstance(factor, Tensor):
         ground = replace(
             ground, height_m=ground.height_m * factor, height_std_m=ground.height_std_m * factor
         )

@@ -1,4 +1,4 @@
-"""Images out of distribution for a generator, by its own mean confidence."""
+"""Below which confidence of a generator an image is out of its distribution."""
 
 import math
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ _KIND = "selection"
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
-    """Give the mean confidence of each image that the generator is given, 0..1.
+    """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``).
 
     Args:
         net: with a generator that selects, and ``allow_ood``.

@@ -115,8 +115,9 @@ class DepthEstimate:
         confidence: 0..1, or None.
         right: the synthesised right view, or None where a real one was given.
         is_sky: where the image shows the sky, or None where the weights do not know it.
-        image_confidence: mean confidence of the generator over the image, 0..1: low for images out
-            of distribution. None for pairs, and where the generator has no confidence.
+        image_confidence: how probable it is that the image shows a street, or by weights that do
+            not say that the mean confidence of the generator, 0..1: low for images out of
+            distribution. None for pairs, and where the generator has no confidence.
         ground: the road, of one image alone; None where none was found.
         warning: why the whole estimate is doubtful, such as an image unlike those that the
             weights know, or a pair of which it cannot be told whether it is rectified; else empty.

@@ -90,9 +90,12 @@ class SelectionConfig:
     """Where depth comes from: the distribution of the left view; the matcher on left and drawn
     right view; or both, weighed by their confidence."""
 
+    with_street: bool = False
+    """Has a layer that reads off the encoder's features how surely the image shows a street."""
+
     least_confidence: float = 0.0
-    """Mean confidence below which an image is out of distribution; 0: not checked.
-    'depthpose depth calibrate' finds it."""
+    """Probability of a street below which an image is out of distribution, or mean confidence where
+    ``with_street`` is false; 0: not checked. 'depthpose depth calibrate' finds it."""
 
     virtual_focal_px: float = 372.0
     """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""

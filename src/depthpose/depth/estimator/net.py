@@ -296,12 +296,12 @@ class FakestereoNet:
         found = [scale_by_mount(one, image) for one, image in zip(found, images, strict=True)]
         if drawn.confidence is None:
             return found
-        known = [float(confidence.mean()) for confidence in drawn.confidence]
+        known = drawn.confidence.mean((1, 2)) if drawn.street is None else drawn.street
         return [
             check_distribution(
-                image.name, replace(one, image_confidence=mean), rig, allow_ood=self.allow_ood
+                image.name, replace(one, image_confidence=sure), rig, allow_ood=self.allow_ood
             )
-            for image, one, mean in zip(images, found, known, strict=True)
+            for image, one, sure in zip(images, found, known.tolist(), strict=True)
         ]
 
     def _disparities(

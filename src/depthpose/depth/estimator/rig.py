@@ -23,15 +23,12 @@ from depthpose.depth.disparity import (
     resized_map,
     resized_match,
 )
-from depthpose.depth.ground import is_road
 from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
 from depthpose.depth.stereo.enlargement import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 
-_ROAD_RELIEF, _NO_ROAD_EXCESS = 0.05, 0.1
-"""By how much the least mean confidence is lower where a road is seen, and higher where none is."""
 SKY_M = 10_000.0
 """What the disparity of the sky says: protocols take a disparity of zero for none, or for near."""
 _LEAST_SKY = 0.002
@@ -146,8 +143,7 @@ def check_distribution(
 
     Args:
         name: of the image, for the error.
-        found: its estimate, with the mean confidence of the image (0..1) and the ground that was
-            found in its depth.
+        found: its estimate, with the confidence of the whole image (0..1).
         config: of the generator, with the least of it.
         allow_ood: add a ``warning`` in place of refusing.
 
@@ -156,15 +152,13 @@ def check_distribution(
     """
     assert found.image_confidence is not None
     least = config.least_confidence if isinstance(config, SelectionConfig) else 0.0
-    has_road = is_road(found.ground)
-    if least:
-        least = least - _ROAD_RELIEF if has_road else min(least + _NO_ROAD_EXCESS, 0.99)
     if found.image_confidence >= least:
         return found
+    is_street = isinstance(config, SelectionConfig) and config.with_street
     said = (
-        f"out of distribution for these weights ({'a' if has_road else 'no'} road is seen, and the "
-        f"mean confidence is {found.image_confidence:.2f}, below {least:.2f}), so its depth is a "
-        "guess"
+        f"out of distribution for these weights ("
+        f"{'probability of a street' if is_street else 'mean confidence'} "
+        f"{found.image_confidence:.2f}, below {least:.2f}), so its depth is a guess"
     )
     if not allow_ood:
         raise InputError(

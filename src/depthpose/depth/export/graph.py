@@ -51,7 +51,8 @@ def image_graph(weights: DepthWeights) -> Graph:
     Inputs ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
     images). Outputs ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
     ``confidence`` (each batch, height, width) and ``right``, the drawn view; of networks that know
-    the sky ``is_sky`` too (batch, height, width; bool).
+    the sky ``is_sky`` too (batch, height, width; bool), of weights that know streets
+    ``image_confidence`` (batch), how probable one is.
 
     Raises:
         InputError: a network is missing, or the generator is stochastic (dropout at test time).
@@ -83,6 +84,8 @@ def image_graph(weights: DepthWeights) -> Graph:
         graph.output("is_sky", is_sky, np.bool_, _MAPS)
     _output_maps(graph, depth_m, disparity_px, confidence)
     graph.output("right", resized_image(seen.right, full), np.float32, _IMAGES)
+    if seen.street is not None:
+        graph.output("image_confidence", seen.street, np.float32, ("batch",))
     return graph
 
 

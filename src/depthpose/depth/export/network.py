@@ -112,15 +112,18 @@ class DynamicSelection(nn.Module):
         super().__init__()
         self.generator = generator
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Maps, Maps, Maps, Maps, Maps]:
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
         """Give log of disparity, sky and confidence of the left view; the first two of the right.
 
-        Disparity is counted in pixels of the image's width.
+        Disparity is counted in pixels of the image's width. Where the weights know streets, how
+        probable one is follows, (b,).
         """
+        features = self.generator.encoder(image)
         left, right = (
-            read_logits(logits, self.generator.planes) for logits in self.generator(image)
+            read_logits(logits, self.generator.planes) for logits in self.generator.decode(features)
         )
-        return *left, *right[:2]
+        street = self.generator.find_street(features[-1])
+        return *left, *right[:2], *(() if street is None else (street,))
 
 
 def gathered_volume(
@@ -141,6 +144,7 @@ class DrawnValues:
     disparity_px: Value | None = None
     confidence: Value | None = None
     is_sky: Value | None = None
+    street: Value | None = None
 
 
 def drawn(left: Value, generator: Generator) -> DrawnValues:
@@ -179,8 +183,9 @@ def _selected(left: Value, generator: SelectionGenerator) -> DrawnValues:
     image = _mirrored(resized_image(left, even), even, multiple)
     example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
     network = network_model(DynamicSelection(generator).eval(), [example], multiple)
-    found = [m.slice([0, 0], even / 2, [1, 2]) for m in left.graph.call(network, image)]
-    log_px, sky, sure, right_log_px, right_sky = (resized_map(m, size) for m in found)
+    found = left.graph.call(network, image)
+    maps = [m.slice([0, 0], even / 2, [1, 2]) for m in found[:5]]
+    log_px, sky, sure, right_log_px, right_sky = (resized_map(m, size) for m in maps)
     scale = ratio(size, even)
     is_sky = sky.op("Greater", np.float32(0.5))
     known = sure * (sky * np.float32(-1) + np.float32(1))
@@ -191,6 +196,7 @@ def _selected(left: Value, generator: SelectionGenerator) -> DrawnValues:
         disparity_px=log_px.op("Exp") * scale,
         confidence=is_sky.op("Where", sky, known),
         is_sky=is_sky,
+        street=found[5] if generator.config.with_street else None,
     )
 
 

@@ -27,6 +27,7 @@ _LIMITS = {
     # A disparity is near the answer or not: where one lies on that border, confidence jumps.
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
+    "image_confidence": Limit(value=1e-3),
 }
 _FLIPS = 1e-3
 """Share of pixels that may be sky in one answer alone, with all that follows from it."""
@@ -124,6 +125,7 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
     net = FakestereoNet(matcher, synthesiser, allow_ood=True)
     selects = isinstance(weights.generator, SelectionGenerator)
     sky = ("is_sky",) if selects or _sees_sky(weights.matcher) else ()
+    street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
     for size in _SIZES:
         scenes, _ = _scenes(*size)
         images = _under_sky(scenes) if sky else scenes
@@ -132,7 +134,7 @@ def _image_cases(weights: DepthWeights) -> Iterator[Case]:
         inputs = {"image": images.numpy(), "K": camera.K.numpy()}
         # A depth beyond all bounds, or none, is a matter of the last bit of a disparity near zero.
         found = net.estimate_many(given)
-        case = _case(inputs, found, ("depth_m", *_PAIR_OUTPUTS, "right", *sky))
+        case = _case(inputs, found, ("depth_m", *_PAIR_OUTPUTS, "right", *sky, *street))
         is_near = case.expected["disparity_px"] >= _LEAST_PX
         where = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
         yield dataclasses.replace(case, where=where)
@@ -170,7 +172,8 @@ def _case(
     inputs: dict[str, np.ndarray], found: list[DepthEstimate], outputs: tuple[str, ...]
 ) -> Case:
     expected = {
-        name: torch.stack([getattr(one, name) for one in found]).numpy() for name in outputs
+        name: torch.stack([torch.as_tensor(getattr(one, name)) for one in found]).numpy()
+        for name in outputs
     }
     shape = next(iter(inputs.values())).shape
     return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)

@@ -54,6 +54,8 @@ class SelectionGenerator(nn.Module):
             for above, skip, width in zip(inputs, skips, widths, strict=True)
         )
         self.head = nn.Conv2d(widths[-1], 2 * (self.config.planes + 1), 1)
+        deepest = self.encoder.channels[-1]
+        self.street = nn.Linear(3 * deepest, 1) if self.config.with_street else None
         self.register_buffer("planes", make_planes(self.config), persistent=False)
 
     def forward(self, image: Images) -> tuple[Logits, Logits]:
@@ -67,12 +69,31 @@ class SelectionGenerator(nn.Module):
                 "the selecting generator takes sides that are multiples of 32 px, got "
                 f"{image.shape[-2]}x{image.shape[-1]}; pad them, as its synthesiser does"
             )
-        *skips, deepest = self.encoder(image)
+        return self.decode(self.encoder(image))
+
+    def decode(self, features: list[Float[Tensor, "b _ _ _"]]) -> tuple[Logits, Logits]:
+        """Answer the logits of both views by what the encoder saw."""
+        *skips, deepest = features
         x = self.top(deepest)
         for level, skip in zip(self.decoder, reversed(skips), strict=True):
             x = level(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
         left, right = self.head(x).chunk(2, 1)
         return left, right
+
+    def find_street(self, deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, " b"] | None:
+        """Answer how probable a street is, by a logistic regression; None where that is lacking."""
+        if self.street is None:
+            return None
+        return self.street(self.street_features(deepest))[:, 0].sigmoid()
+
+    @staticmethod
+    def street_features(deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, "b c3"]:
+        """Answer three moments over the rows: a street has its sky above and its road below."""
+        rows = deepest.shape[2]
+        y = (2 * torch.arange(rows, device=deepest.device) + 1) / rows - 1
+        row = deepest.float().mean(3)
+        weights = (torch.ones_like(y), y, 1.5 * y**2 - 0.5)
+        return torch.cat([(row * weight).mean(2) for weight in weights], 1)
 
 
 def make_planes(config: SelectionConfig) -> Planes:
@@ -92,11 +113,13 @@ class Selected:
         disparity_px: the expectation in the logarithm, sky left out.
         sky: probability of the sky.
         sure: probability of what lies within 15 % of the disparity, sky left out.
+        street: probability that the image shows a street; None where the weights do not say.
     """
 
     disparity_px: Float[Tensor, "b h w"]
     sky: Float[Tensor, "b h w"]
     sure: Float[Tensor, "b h w"]
+    street: Float[Tensor, " b"] | None = None
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
@@ -148,6 +171,7 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
         mean([view.disparity_px.log() for view in views]).exp(),
         mean([view.sky for view in views]),
         first.sure,
+        first.street,
     )
 
 

@@ -1,6 +1,6 @@
 """The generators with pre- and post-processing: any size, [0, 1], test-time norm."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -40,12 +40,14 @@ class SynthesisedViews:
             where it has none.
         confidence: 0 (guess) to 1 (sure) of that.
         is_sky: where the left view shows the sky.
+        street: probability that the left view shows a street; None where the generator cannot say.
     """
 
     right: Float[Tensor, "b 3 h w"]
     disparity_px: Float[Tensor, "b h w"] | None = None
     confidence: Float[Tensor, "b h w"] | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None
+    street: Float[Tensor, " b"] | None = None
 
 
 @runtime_checkable
@@ -120,6 +122,7 @@ class SelectionSynthesiser:
             "confidence": seen.confidence,
             "is_sky": seen.is_sky,
         }
+        parts |= {} if seen.street is None else {"street": seen.street}
         return SynthesisedViews(**{name: part.to(left.device) for name, part in parts.items()})
 
 
@@ -182,10 +185,11 @@ def select_views(
     rows = _even(_near_multiple(height, multiple, ROWS_SHARE))
     columns = _even(_near_multiple(width, multiple, COLUMNS_SHARE))
     padded = pad_to_multiple(_resized(left, rows, columns), multiple)
-    kept = (logits[..., : rows // 2, : columns // 2] for logits in generator(padded))
+    features = generator.encoder(padded)
+    kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     scale = size[1] / columns
     first, second = (select(part, generator.planes * scale, size) for part in kept)
-    return first, second
+    return replace(first, street=generator.find_street(features[-1])), second
 
 
 def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:

@@ -14,9 +14,9 @@ from depthpose.depth.synthesis import Generator
 from depthpose.depth.train.config import SelectTraining, StereoTraining
 from depthpose.depth.weights import read_matcher
 
-_FREE_OF_WEIGHTS = ("max_disparity_px", "least_confidence")
-"""Settings that no weight depends on: a matcher searches any disparities in the same way, and below
-which confidence images are refused is chosen after a training, by ``depth calibrate``."""
+_FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
+"""Settings that the weights of a training do not depend on: a matcher searches any disparities in
+the same way, and which images are refused is found after a training."""
 _CAN_BE_ADDED = ("with_agreement", "with_refinement", "with_sky")
 """Parts that begin with next to no effect, so weights without them can be trained on with them."""
 
@@ -53,7 +53,8 @@ def start_from(network: Generator | StereoNetwork, found: nn.Module, source: str
                 f"{source}: was trained with {setting} = {given[setting]!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
-    network.load_state_dict(network.state_dict() | found.state_dict())
+    own = network.state_dict()
+    network.load_state_dict(own | {k: t for k, t in found.state_dict().items() if k in own})
 
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:

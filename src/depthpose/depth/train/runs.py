@@ -166,8 +166,9 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
                 "'depth train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
-    if isinstance(generator, SelectionGenerator):  # the limit is chosen anew, by depth calibrate
-        generator.config = replace(generator.config, least_confidence=0.0)
+    if isinstance(generator, SelectionGenerator):  # what is refused is found anew
+        generator.config = replace(generator.config, least_confidence=0.0, with_street=False)
+        generator.street = None
     matcher = read_matcher(find_weights(config.matcher))
     config = _at_virtual_focal(config, generator.config)
     rig_m = generator.config.virtual_baseline_m
