@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
-from depthpose.depth.synthesis.selection import (
+from depthpose.depth.synthesis.networks import (
     log_expectation,
     make_planes,
     mix_shifts,

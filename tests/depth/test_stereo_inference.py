@@ -22,10 +22,19 @@ from depthpose.depth.stereo import (
     psmnet,
     tile_change_px,
 )
-from depthpose.depth.stereo.network_matcher import lower_where_disagreeing, pad_top_right
-from depthpose.depth.stereo.plan import PSMNetFootprint, Tiling, match_tiles
-from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
-from depthpose.depth.stereo.volume import Size, expected_disparity
+from depthpose.depth.stereo.kinds import PSMNetFootprint
+from depthpose.depth.stereo.network_matcher import (
+    Tiling,
+    lower_where_disagreeing,
+    match_tiles,
+    pad_top_right,
+)
+from depthpose.depth.stereo.psmnet import (
+    Size,
+    concatenation_volume,
+    expected_disparity,
+    soft_argmin,
+)
 from depthpose.depth.types import Match
 
 SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4, 2))
@@ -318,7 +327,7 @@ def test_unknown_device_is_refused() -> None:
 
 _PSMNET = """
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
-from depthpose.depth.stereo.plan import PSMNetFootprint
+from depthpose.depth.stereo.kinds import PSMNetFootprint
 network = PSMNet().eval()
 footprint = PSMNetFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
 least = footprint.estimate_bytes()
@@ -326,7 +335,7 @@ least = footprint.estimate_bytes()
 _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
-from depthpose.depth.stereo.plan import LightFootprint
+from depthpose.depth.stereo.kinds import LightFootprint
 network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
 footprint = LightFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
 least = footprint.estimate_bytes()

@@ -24,23 +24,24 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
-from depthpose.depth.stereo.enlargement import (
+from depthpose.depth.stereo.kinds import LightFootprint
+from depthpose.depth.stereo.light import (
     Refinement,
     Seen,
     ViewFeatures,
     agreement_around,
     agreement_of_neighbours,
+    confidence_near,
+    correlation_volume,
     enlarge,
+    mean_of_all,
+    mean_of_best,
 )
-from depthpose.depth.stereo.light import correlation_volume
 from depthpose.depth.stereo.matcher import CameraMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
-from depthpose.depth.stereo.plan import LightFootprint
-from depthpose.depth.stereo.scores import confidence_near, mean_of_all, mean_of_best
 from depthpose.depth.train import StereoTask
-from depthpose.depth.train.begin import make_matcher_network
 from depthpose.depth.train.config import StereoTraining
-from depthpose.depth.train.runs import train_stereo
+from depthpose.depth.train.runs import make_matcher_network, train_stereo
 from depthpose.depth.weights import read_matcher, write_depth_weights
 
 SMALL = LightConfig(

@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig, Speed
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import SelectionSynthesiser
-from depthpose.depth.synthesis.selection import Selected, average
+from depthpose.depth.synthesis.networks import Selected, average
 from depthpose.depth.types import StereoInput
 
 

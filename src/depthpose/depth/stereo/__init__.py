@@ -1,12 +1,20 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
+from depthpose.depth.stereo.kinds import (
+    MATCHERS,
+    LightMatcher,
+    MatcherKind,
+    PSMNetMatcher,
+    make_matcher,
+)
 from depthpose.depth.stereo.light import LightStereo
-from depthpose.depth.stereo.light_matcher import LightMatcher
 from depthpose.depth.stereo.matcher import (
     CallableMatcher,
     CameraMatcher,
     Matcher,
+    SGBMMatcher,
     check_pair,
+    fill_holes,
 )
 from depthpose.depth.stereo.network_matcher import (
     NetworkMatcher,
@@ -16,10 +24,7 @@ from depthpose.depth.stereo.network_matcher import (
     with_usable_precision,
 )
 from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
 from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
-from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, make_matcher
-from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
 
 __all__ = [
     "MATCHERS",

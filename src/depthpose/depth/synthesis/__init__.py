@@ -1,12 +1,12 @@
 """Left image to right image: a U-Net (pix2pix), or selection of disparities (Deep3D)."""
 
-from depthpose.depth.synthesis.generator import (
+from depthpose.depth.synthesis.networks import (
     PatchDiscriminator,
     PixelDiscriminator,
+    SelectionGenerator,
     UNetGenerator,
     make_discriminator,
 )
-from depthpose.depth.synthesis.selection import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import (
     Generator,
     SelectionSynthesiser,

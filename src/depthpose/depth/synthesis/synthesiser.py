@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from depthpose.core.arrays import check_image
 from depthpose.core.devices import usable_device
 from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
-from depthpose.depth.synthesis.generator import UNetGenerator
-from depthpose.depth.synthesis.selection import (
+from depthpose.depth.synthesis.networks import (
     Selected,
     SelectionGenerator,
+    UNetGenerator,
     average,
     select,
     shift_left,

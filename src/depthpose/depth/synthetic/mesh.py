@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from depthpose.depth.synthetic.materials import NUMBER, Color, Number, Surface, Values
+from depthpose.depth.synthetic.textures import NUMBER, Color, Number, Surface, Values
 
 Rotation = Float[np.ndarray, "3 3"]
 

@@ -9,8 +9,13 @@ from depthpose.depth.train.runs import (
     train_stereo,
     train_view,
 )
-from depthpose.depth.train.select import SelectionSamples, SelectTask
-from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
+from depthpose.depth.train.stages import (
+    FinetuneTask,
+    SelectionSamples,
+    SelectTask,
+    StereoTask,
+    ViewTask,
+)
 
 __all__ = [
     "STAGES",
