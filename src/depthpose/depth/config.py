@@ -370,7 +370,11 @@ class SGBMConfig:
     """
 
     num_disparities: int = 192
-    """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16."""
+    """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16.
+
+    Where the principal points of a rig differ by ``d = cx_right - cx_left``, its views are first
+    moved by this difference, so disparities grow by d: for a range given of the images as they are
+    (Middlebury's ``ndisp``), take d more."""
 
     block_size: int = 3
     """Side of the matched window [px], odd."""
@@ -416,8 +420,9 @@ class SGBMConfig:
 
 
 Answer = Literal["own", "matched", "joined"]
-"""Where depth of one image comes from: the generator's own disparity, that of the matcher on left
-and drawn right view, or both, weighed by their confidence."""
+"""Where the disparity of one image comes from. own: the generator, which estimates disparity beside
+the right view (no matcher runs). matched: the matcher, on the image and the right view that the
+generator drew. joined: the mean of both, weighed by their confidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -449,13 +454,13 @@ class GeneratorConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if self.width < 1:
-            raise InputError(f"width must be 1 or more channels, got {self.width}; take 64")
-        if not 2 <= self.levels <= 10:
-            raise InputError(f"levels must be 2 .. 10, got {self.levels}; take 8")
-        if self.test_mode not in ("running", "batch"):
-            raise InputError(f"test_mode must be 'running' or 'batch', got {self.test_mode!r}")
-        _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
+        check_settings(
+            self,
+            width="[1, inf)",
+            levels="[2, 10]",
+            virtual_focal_px="(0, inf)",
+            virtual_baseline_m="(0, inf)",
+        )
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -497,8 +502,7 @@ class SelectionConfig:
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
-    """Where depth comes from: the distribution of the left view; the matcher on left and drawn
-    right view; or both, weighed by their confidence."""
+    """Where depth of one image comes from: see :data:`Answer`."""
 
     least_confidence: float = 0.0
     """Mean confidence below which an image is out of distribution; 0: not checked.
@@ -516,41 +520,25 @@ class SelectionConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that the network cannot have."""
-        if not 0 < self.encoder_width <= 4:
-            raise InputError(f"encoder_width must be above 0, at most 4; got {self.encoder_width}")
-        if self.encoder_kind != "efficientnet-lite0":
-            raise InputError(f"encoder_kind must be efficientnet-lite0, got {self.encoder_kind!r}")
-        if min(self.widths) < 1 or self.planes < 2:
+        check_settings(
+            self,
+            encoder_width="(0, 4]",
+            widths="[1, inf)",
+            planes="[2, inf)",
+            disparity_px="(0, inf)",
+            least_confidence="[0, 1)",
+            virtual_focal_px="(0, inf)",
+            virtual_baseline_m="(0, inf)",
+            scales="[1, 4]",
+        )
+        if self.disparity_px[0] >= self.disparity_px[1]:
             raise InputError(
-                f"widths must be 1 or more channels and planes 2 or more, got {self.widths} and "
-                f"{self.planes}"
+                f"disparity_px must be a range, the smaller end first, got {self.disparity_px}"
             )
-        if not 0 < self.disparity_px[0] < self.disparity_px[1]:
-            raise InputError(
-                f"disparity_px must be a range of positive disparities, got {self.disparity_px}"
-            )
-        if self.answer not in ("own", "matched", "joined"):
-            raise InputError(f"answer must be own, matched or joined, got {self.answer!r}")
-        if not 0 <= self.least_confidence < 1:
-            raise InputError(
-                f"least_confidence must be from 0 to below 1, got {self.least_confidence}"
-            )
-        if self.scales[:1] != (1.0,) or not all(1 <= scale <= 4 for scale in self.scales):
-            raise InputError(
-                "scales must begin with 1, the others from 1 to 4; take (1.0, 1.4), got "
-                f"{self.scales}"
-            )
-        _check_rig(self.virtual_focal_px, self.virtual_baseline_m)
+        if self.scales[:1] != (1.0,):
+            raise InputError(f"scales must begin with 1; take (1.0, 1.4), got {self.scales}")
 
     @property
     def side_multiple_px(self) -> int:
         """Both sides of an image are multiples of this [px]."""
         return 32
-
-
-def _check_rig(focal_px: float, baseline_m: float) -> None:
-    if focal_px <= 0 or baseline_m <= 0:
-        raise InputError(
-            f"the virtual rig needs a positive focal length and baseline, got {focal_px} px and "
-            f"{baseline_m} m"
-        )

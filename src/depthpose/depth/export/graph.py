@@ -130,8 +130,8 @@ class DynamicLightStereo(nn.Module):
         self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"]
     ) -> tuple[Maps, ...]:
         """Give disparity [px], confidence and, with that class, the sky of normalised images."""
-        reach = self.network.config.max_disparity_px
-        read = self.network.read(left, right, reach, with_confidence=True)
+        max_disparity_px = self.network.config.max_disparity_px
+        read = self.network.read(left, right, max_disparity_px, with_confidence=True)
         assert read.confidence is not None
         sky = () if read.sky is None else ((read.sky > 0.5).float(),)
         return read.heads[-1], read.confidence, *sky

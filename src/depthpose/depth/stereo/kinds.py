@@ -327,7 +327,7 @@ class LightMatcher(NetworkMatcher):
     fine_pixels = 650_000
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
     most_enlarged = 1.5
-    most_reach = 1.75
+    most_disparities = 1.75
 
     def __init__(self, network: LightStereo, config: MatcherConfig | None = None) -> None:
         super().__init__(network.config, config)

@@ -121,16 +121,19 @@ def agreement_around(
 ) -> Float[Tensor, "b _ h2 w2"]:
     """Give the cosine of each group of features at half size at five disparities about one [px]."""
     near, far = unit_groups(left, groups), unit_groups(right, groups).flatten(1, 2)
-    moved = (_moved(far, half_px + offset) for offset in _OFFSETS)
-    return torch.cat([(near * m.unflatten(1, near.shape[1:3])).sum(2) for m in moved], 1)
+    cosines = []
+    for offset in _OFFSETS:
+        moved = _moved(far, half_px + offset).unflatten(1, near.shape[1:3])
+        cosines.append((near * moved).sum(2))
+    return torch.cat(cosines, 1)
 
 
 def _moved(
     right: Float[Tensor, "b c h2 w2"], shift: Float[Tensor, "b h2 w2"]
 ) -> Float[Tensor, "b c h2 w2"]:
     """Give each pixel of the left view what lies ``shift`` to the left of it in the right one."""
-    h, w = right.shape[2:]
-    columns, lines = (torch.arange(n, device=right.device).float() for n in (w, h))
+    lines = torch.arange(right.shape[2], device=right.device).float()
+    columns = torch.arange(right.shape[3], device=right.device).float()
     # The last index as a tensor: the exporter to ONNX takes no quotient of unknown sizes.
     rows = (2 * lines / lines[-1:] - 1)[:, None]
     x = 2 * (columns - shift) / columns[-1:] - 1
@@ -160,18 +163,17 @@ class Refinement(nn.Module):
         assert self.correction.bias is not None
         nn.init.zeros_(self.correction.bias)
 
-    def forward(self, seen: Seen, found_px: Maps) -> Maps:
-        """Correct a disparity of the left view [px]."""
-        assert seen.right_half is not None
-        four = F.pixel_unshuffle(found_px.detach()[:, None], 2) / 2
+    def forward(self, enlarged_px: Maps, left_half: Features, right_half: Features) -> Maps:
+        """Correct a disparity of the left view [px] by features of both views at half size."""
+        four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
         middle = four.mean(1)
-        left, right = self.compared(seen.left.half), self.compared(seen.right_half)
+        left, right = self.compared(left_half), self.compared(right_half)
         alike = agreement_around(left.float(), right.float(), middle, self.groups)
-        x = torch.cat([alike, seen.left.half.float(), four - middle[:, None]], 1).to(left)
+        x = torch.cat([alike, left_half.float(), four - middle[:, None]], 1).to(left)
         for layer in self.layers:
             x = F.relu(layer(x))
-        correction_px = F.pixel_shuffle(self.correction(x).to(found_px), 2)[:, 0]
-        corrected = found_px.detach() + correction_px
+        correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
+        corrected = enlarged_px.detach() + correction_px
         return corrected if self.training else corrected.clamp_min(LEAST_PX)
 
 
@@ -488,7 +490,11 @@ class LightStereo(StereoNetwork):
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
         found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
-        heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
+        heads = (found_px,)
+        if self.refinement is not None:
+            parts = (found_px, seen.left.half, seen.right_half)
+            half_rows = None if self.rows is None else 2 * self.rows
+            heads = (found_px, by_rows(self.refinement, parts, halo=5, rows=half_rows))
         if coarse_px is None:
             heads = heads[-1:]
         else:
@@ -526,19 +532,6 @@ class LightStereo(StereoNetwork):
 
         parts = (quarters, seen.left.half, seen.left.levels[0], seen.right_half)
         return by_rows(enlarged, parts, halo=2, rows=self.rows)
-
-    def refine(self, found_px: Maps, seen: Seen) -> Maps:
-        """Correct an enlarged disparity, where the network has that part."""
-        refinement = self.refinement
-        if refinement is None:
-            return found_px
-
-        def refined(found_px: Maps, left_half: Features, right_half: Features) -> Maps:
-            return refinement(Seen(ViewFeatures(left_half, ()), right_half), found_px)
-
-        half = None if self.rows is None else 2 * self.rows
-        parts = (found_px, seen.left.half, seen.right_half)
-        return by_rows(refined, parts, halo=5, rows=half)
 
     def scores(
         self,

@@ -82,7 +82,7 @@ class NetworkMatcher(ABC):
     """Pixels of a fine match at most."""
     most_enlarged: ClassVar[float] = 1.0
     """Times the size of the images at which a fine match may be."""
-    most_reach: ClassVar[float] = 1.5
+    most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
 
     def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
@@ -136,7 +136,7 @@ class NetworkMatcher(ABC):
             return self._match_alike(pairs, self.network_config)
         size, trained = self.work_size(camera), self.network_config
         # A larger size needs more disparities; the same filters look through them.
-        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_reach)
+        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
         steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
         network = replace(trained, max_disparity_px=steps * trained.step_px)
         resized = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
@@ -268,14 +268,14 @@ Image = Float[Tensor, "3 h w"]
 class Tiling(NamedTuple):
     """Size of a tile's own part, what neighbours share, and what lies to the left besides [px].
 
-    A left pixel at x matches a right one at x - disparity, so each tile sees ``reach`` more
-    columns on its left than it answers for.
+    A left pixel at x matches a right one at x - disparity, so each tile sees
+    ``max_disparity_px`` more columns on its left than it answers for.
     """
 
     rows: int
     columns: int
     overlap: int
-    reach: int
+    max_disparity_px: int
 
 
 class Span(NamedTuple):
@@ -294,7 +294,7 @@ def match_tiles(
     total = left.new_zeros(4, h, w)
     with_confidence = with_sky = True
     for y in _spans(h, tiling.rows, tiling.overlap, 0):
-        for x in _spans(w, tiling.columns, tiling.overlap, tiling.reach):
+        for x in _spans(w, tiling.columns, tiling.overlap, tiling.max_disparity_px):
             tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
             inner = (_inside(y), _inside(x))
             weight = (y.weight[:, None] * x.weight).to(left)
@@ -318,7 +318,7 @@ def _inside(span: Span) -> slice:
     return slice(first, first + span.counted.stop - span.counted.start)
 
 
-def _spans(length: int, step: int, overlap: int, reach: int) -> list[Span]:
+def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[Span]:
     spans = []
     for own_first in range(0, length, step):
         own_stop = min(own_first + step, length)
@@ -328,5 +328,7 @@ def _spans(length: int, step: int, overlap: int, reach: int) -> list[Span]:
         rising = (at - own_first + overlap) / ramp if own_first else torch.ones_like(at)
         falling = (own_stop + overlap - at) / ramp if own_stop < length else torch.ones_like(at)
         weight = rising.clamp(0, 1) * falling.clamp(0, 1)
-        spans.append(Span(slice(max(first - reach, 0), stop), slice(first, stop), weight))
+        spans.append(
+            Span(slice(max(first - max_disparity_px, 0), stop), slice(first, stop), weight)
+        )
     return spans

@@ -43,36 +43,24 @@ def by_rows(
     """
     if rows is None:
         return function(*inputs)
-    given = [x.shape[-2] for x in inputs if x is not None]
-    height, whole = min(given), into
+    height, whole = min(x.shape[-2] for x in inputs if x is not None), into
     for first in range(0, height, rows):
         stop = min(first + rows, height)
         before, after = max(first - halo, 0), min(stop + halo, height)
-        some = function(*(_rows_of(x, height, before, after) for x in inputs))
+        pieces = []
+        for x in inputs:
+            times = 1 if x is None else x.shape[-2] // height
+            pieces.append(None if x is None else x[..., times * before : times * after, :])
+        some = function(*pieces)
         times = some.shape[-2] // (after - before)
-        if whole is None:
-            whole = _empty_like(some, times * height)
+        if whole is None:  # in the order of memory that convolutions of volumes like
+            order = torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format
+            size = (*some.shape[:-2], times * height, some.shape[-1])
+            whole = torch.empty(size, dtype=some.dtype, device=some.device, memory_format=order)
         own = some[..., times * (first - before) : times * (stop - before), :]
         whole[..., times * first : times * stop, :] = own
     assert whole is not None, "there are rows"
     return whole
-
-
-def _rows_of(x: Tensor | None, height: int, first: int, stop: int) -> Tensor | None:
-    if x is None:
-        return None
-    times = x.shape[-2] // height
-    return x[..., times * first : times * stop, :]
-
-
-def _empty_like(some: Tensor, height: int) -> Tensor:
-    """Make room for all rows, in the order of memory that convolutions of volumes like."""
-    return torch.empty(
-        (*some.shape[:-2], height, some.shape[-1]),
-        dtype=some.dtype,
-        device=some.device,
-        memory_format=torch.channels_last_3d if some.ndim == 5 else torch.contiguous_format,
-    )
 
 
 WINDOW_PX = 2.0

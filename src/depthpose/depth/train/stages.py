@@ -91,14 +91,14 @@ class StereoTask:
         """One update: match and compare."""
         views = normalise(batch.left), normalise(batch.right)
         heads, sky = self.matcher.forward_with_sky(*views)
-        reach, sky_weight = self.matcher.config.max_disparity_px, self.config.sky_weight
+        max_disparity_px, sky_weight = self.matcher.config.max_disparity_px, self.config.sky_weight
         heads = tuple(head.float() for head in heads)
-        facts = {"epe": mean_error_px(heads[-1], batch.left_px, reach)}
+        facts = {"epe": mean_error_px(heads[-1], batch.left_px, max_disparity_px)}
         if sky is None:
-            loss = heads_loss(heads, batch.left_px, reach, sky_weight=sky_weight)
+            loss = heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
         else:
             error = sky_loss(sky.float(), batch.left_px)
-            loss = heads_loss(heads, batch.left_px, reach) + sky_weight * error
+            loss = heads_loss(heads, batch.left_px, max_disparity_px) + sky_weight * error
             facts["sky"] = error.detach()
         yield Update("matcher", loss, facts)
 
@@ -210,9 +210,9 @@ class ViewTask:
             discriminator(left, right), discriminator(left, drawn.detach()), mode
         )
         yield Update("discriminator", d_loss, {})
-        fooled = adversarial_loss(discriminator(left, drawn), mode, is_real=True)
-        loss = fooled + self.config.l1_weight * l1
-        yield Update("generator", loss, {"l1": l1.detach(), "adversarial": fooled.detach()})
+        adversarial = adversarial_loss(discriminator(left, drawn), mode, is_real=True)
+        loss = adversarial + self.config.l1_weight * l1
+        yield Update("generator", loss, {"l1": l1.detach(), "adversarial": adversarial.detach()})
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
@@ -262,11 +262,11 @@ class FinetuneTask:
         """One update: draw, match, compare with the truth."""
         drawn = draw_right(self.generator, batch.left)
         (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
-        reach = self.matcher.config.max_disparity_px
+        max_disparity_px = self.matcher.config.max_disparity_px
         found_px = found_px.float()
-        loss = disparity_loss(found_px, batch.left_px, reach)
+        loss = disparity_loss(found_px, batch.left_px, max_disparity_px)
         l1 = l1_loss(2 * drawn, 2 * batch.right)
-        facts = {"epe": mean_error_px(found_px, batch.left_px, reach), "l1": l1.detach()}
+        facts = {"epe": mean_error_px(found_px, batch.left_px, max_disparity_px), "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
 
     @torch.no_grad()
