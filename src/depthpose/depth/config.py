@@ -502,7 +502,9 @@ class SelectionConfig:
     """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
 
     answer: Answer = "own"
-    """Where depth of one image comes from: see :data:`Answer`."""
+    """Where depth of one image comes from. own: the generator's disparity of the left view;
+    matched: the matcher, on the image and the right view that the generator drew; joined: the mean
+    of both, weighed by their confidence."""
 
     least_confidence: float = 0.0
     """Mean confidence below which an image is out of distribution; 0: not checked.

@@ -118,23 +118,16 @@ class LightFootprint(Footprint):
         kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
         # Both views in float32: at this size, normalised, padded.
         images = 6 * 3 * 4 * self.height * self.width
-        stages = (self._volume_bytes(pixels, slab_pixels), self._weights_bytes(slab_pixels))
-        return int(MARGIN * (images + kept + max(stages))) + OVERHEAD_BYTES // 2
-
-    def _volume_bytes(self, pixels: int, slab_pixels: int) -> int:
-        """A volume at quarter size, the smaller ones, and three of the rows at a time."""
+        # A volume at quarter size, the smaller ones, and three of the rows at a time.
         widest = max(self.config.groups, self.config.volume_widths[0])
         voxel_bytes = widest * (self.config.max_disparity_px // 4) * self.dtype.itemsize
-        return voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
-
-    def _weights_bytes(self, pixels: int) -> int:
-        """Weights that enlarge maps, thrice, and what they are made of at half size.
-
-        The refinement takes less.
-        """
+        volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
+        # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
+        # takes less.
         joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
         compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
-        return pixels * (joined + compared + 3 * 4 * 36 * 4)
+        weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
+        return int(MARGIN * (images + kept + max(volumes, weights))) + OVERHEAD_BYTES // 2
 
 
 Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
@@ -170,14 +163,11 @@ def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
         conv.bias = nn.Parameter(bias)
         layer.norm = nn.Identity()
     for parameter in features.parameters():
-        cast_ = parameter.data.to(like)
-        parameter.data = cast_.contiguous(memory_format=_memory_format(cast_))
+        values = parameter.data.to(like)
+        order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
+        parameter.data = values.contiguous(memory_format=order)
         parameter.requires_grad_(False)
     return features
-
-
-def _memory_format(x: Tensor) -> torch.memory_format:
-    return torch.channels_last if x.ndim == 4 else torch.contiguous_format
 
 
 def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:

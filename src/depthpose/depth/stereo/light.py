@@ -543,7 +543,12 @@ class LightStereo(StereoNetwork):
 
         Scores are float32 at least: 8 bits would round the expectation to whole pixels.
         """
-        self._check_size(left)
+        h, w = left.shape[-2:]
+        if h % 32 or w % 32:
+            raise InputError(
+                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
+                "pair, as LightMatcher does"
+            )
         near, far = self.features(left), self.features(right)
         described = self.describe(near.levels[0]), self.describe(far.levels[0])
         compares = self.config.with_agreement or self.config.with_refinement
@@ -553,11 +558,3 @@ class LightStereo(StereoNetwork):
         scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), Seen(near, right_half)
-
-    def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
-        h, w = image.shape[-2:]
-        if h % 32 or w % 32:
-            raise InputError(
-                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
-                "pair, as LightMatcher does"
-            )

@@ -87,9 +87,18 @@ class CallableMatcher:
                 or without a single value.
         """
         check_pair(left, right)
-        answer = self.function(self._given(left), self._given(right))
-        disparity_px = _as_map(answer)
-        size = tuple(left.shape[-2:])
+        views = (left, right)
+        if self.with_numpy_images:
+            views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
+        answer = self.function(*views)
+        if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
+            answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
+        if not isinstance(answer, Tensor) or answer.is_complex():
+            raise InputError(
+                f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
+                f"array of disparities"
+            )
+        disparity_px, size = answer.detach().to(torch.float32), tuple(left.shape[-2:])
         if tuple(disparity_px.shape) != size:
             raise InputError(
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
@@ -97,9 +106,6 @@ class CallableMatcher:
             )
         _check_values(disparity_px)
         return Match(disparity_px=disparity_px)
-
-    def _given(self, image: Tensor) -> Tensor | np.ndarray:
-        return image.permute(1, 2, 0).cpu().numpy() if self.with_numpy_images else image
 
 
 def check_pair(left: object, right: object) -> None:
@@ -119,17 +125,6 @@ def check_pair(left: object, right: object) -> None:
 
 def _size(image: Tensor) -> str:
     return f"{image.shape[-2]}x{image.shape[-1]}"
-
-
-def _as_map(answer: object) -> Tensor:
-    if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
-        answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
-    if not isinstance(answer, Tensor) or answer.is_complex():
-        raise InputError(
-            f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
-            f"array of disparities"
-        )
-    return answer.detach().to(torch.float32)
 
 
 def _check_values(disparity_px: Tensor) -> None:
@@ -227,14 +222,9 @@ def fill_holes(disparity_px: Tensor) -> Tensor:
     padded = torch.nn.functional.pad(values, (0, 1), value=torch.inf)
     before = before.where(before >= 0, values.shape[1])
     filled = torch.minimum(padded.gather(1, before), padded.gather(1, after))
-    return filled[_nearest_true(valid.any(1))]
-
-
-def _nearest_true(flags: Tensor) -> Tensor:
-    """For each place of ``flags``, ``(n,)``, the nearest place that is true."""
-    places = torch.arange(len(flags), device=flags.device)
-    true_places = places[flags]
-    return true_places[(places[:, None] - true_places).abs().argmin(1)]
+    rows = torch.arange(len(valid), device=valid.device)
+    filled_rows = rows[valid.any(1)]
+    return filled[filled_rows[(rows[:, None] - filled_rows).abs().argmin(1)]]
 
 
 def _opencv_image(image: Tensor) -> np.ndarray:

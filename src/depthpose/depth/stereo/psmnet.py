@@ -378,8 +378,13 @@ class PSMNet(StereoNetwork):
         Raises:
             InputError: the images' size does not suit the network.
         """
-        self._check_size(left)
-        size = (self.config.max_disparity_px, left.shape[-2], left.shape[-1])
+        (h, w), least = left.shape[-2:], self.config.min_side_px
+        if h % 16 or w % 16 or min(h, w) < least:
+            raise InputError(
+                f"PSMNet takes sides that are multiples of 16 and at least {least} px, got "
+                f"{h}x{w}; pad the pair, as PSMNetMatcher does"
+            )
+        size = (self.config.max_disparity_px, h, w)
         costs = self.costs(left, right)
         align = self.config.align_corners
         return tuple(
@@ -430,15 +435,6 @@ class PSMNet(StereoNetwork):
             cost = by_rows(head, (x,), halo=2, rows=self.rows)
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
-
-    def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
-        h, w = image.shape[-2:]
-        least = self.config.min_side_px
-        if h % 16 or w % 16 or min(h, w) < least:
-            raise InputError(
-                f"PSMNet takes sides that are multiples of 16 and at least {least} px, got "
-                f"{h}x{w}; pad the pair, as PSMNetMatcher does"
-            )
 
 
 def _initialise(module: nn.Module) -> None:

@@ -53,11 +53,9 @@ class UNetGenerator(nn.Module):
             return _Level(nn.ConvTranspose2d(inputs, 3, 4, 2, 1), with_norm=False)
         outputs = widths[level - 1]
         conv = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=False)
-        return _Level(conv, with_norm=True, dropout=0.5 if self._has_dropout(level) else 0.0)
-
-    def _has_dropout(self, level: int) -> bool:
-        """The three inner blocks between full widths, without the innermost itself."""
-        return 5 <= level + 1 < self.config.levels and self.config.with_dropout
+        # The three inner blocks between full widths, without the innermost itself.
+        has_dropout = 5 <= level + 1 < self.config.levels and self.config.with_dropout
+        return _Level(conv, with_norm=True, dropout=0.5 if has_dropout else 0.0)
 
     def forward(self, left: Images) -> Images:
         """Draw the right view of each image.
@@ -65,7 +63,12 @@ class UNetGenerator(nn.Module):
         Raises:
             InputError: a side is no multiple of ``2 ** levels``.
         """
-        self._check_size(left)
+        side = self.config.side_multiple_px
+        if left.shape[-2] % side or left.shape[-1] % side:
+            raise InputError(
+                f"the generator of {self.config.levels} levels takes sides that are multiples of "
+                f"{side} px, got {left.shape[-2]}x{left.shape[-1]}; pad them, as Synthesiser does"
+            )
         skips: list[Tensor] = []
         x = left
         for level, down in enumerate(self.down):
@@ -76,14 +79,6 @@ class UNetGenerator(nn.Module):
             if level:
                 x = torch.cat([skips[level - 1], x], 1)
         return torch.tanh(x)
-
-    def _check_size(self, image: Images) -> None:
-        side = self.config.side_multiple_px
-        if image.shape[-2] % side or image.shape[-1] % side:
-            raise InputError(
-                f"the generator of {self.config.levels} levels takes sides that are multiples of "
-                f"{side} px, got {image.shape[-2]}x{image.shape[-1]}; pad them, as Synthesiser does"
-            )
 
 
 class _Level(nn.Module):
@@ -289,15 +284,9 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     shares = torch.stack([first.disparity_px < _NEAR_LIMIT * limit_px for limit_px in limits_px])
     shares[0] = True
     shares = shares / shares.sum(0)
-
-    def mean(parts: list[Tensor]) -> Tensor:
-        return (shares * torch.stack(parts)).sum(0)
-
-    return Selected(
-        mean([view.disparity_px.log() for view in views]).exp(),
-        mean([view.sky for view in views]),
-        first.sure,
-    )
+    log_px = torch.stack([view.disparity_px.log() for view in views])
+    sky = torch.stack([view.sky for view in views])
+    return Selected((shares * log_px).sum(0).exp(), (shares * sky).sum(0), first.sure)
 
 
 def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from depthpose.core.camera import StereoRig, crop_camera, resize_camera
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, join
 from depthpose.depth.synthetic.models import add_ball, add_leaves
 from depthpose.depth.synthetic.road import Place, Road, add_ground, add_roadside, bend, draw_road
 from depthpose.depth.synthetic.textures import Color, Surface, Values
@@ -130,12 +130,17 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     add_roadside(builder, rng, road)
     add_traffic(builder, rng, road)
     street = bend(builder.finish(), road)
-    hills = MeshBuilder()
-    _add_hills(hills, rng)
-    mesh = _join_far(street, hills.finish())
+    far = MeshBuilder()
+    _add_hills(far, rng)
+    hills = far.finish()
+    hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
     rotation, position = _mount(rng, mount_height_m)
+    turn = rotation.T.astype(np.float32)
+    mesh = join([street, hills])
+    corners = (mesh.corners - position.astype(np.float32)) @ turn
+    mesh = replace(mesh, corners=corners, normals=mesh.normals @ turn)
     return StreetScene(
-        mesh=_seen_from(mesh, rotation, position),
+        mesh=mesh.part(corners[:, :, 2].max(1) > -12),  # far behind nothing casts a seen shadow
         markings=_draw_markings(rng, road),
         weather=draw_weather(rng),
         camera_from_world=rotation,
@@ -155,26 +160,6 @@ def _mount(
     about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
     position = np.array([rng.normal(0, 0.05), -height_m + rng.normal(0, 0.04), 0.0])
     return about_z @ about_x @ about_y, position
-
-
-def _seen_from(
-    mesh: Mesh, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
-) -> Mesh:
-    turn = rotation.T.astype(np.float32)
-    corners = (mesh.corners - position.astype(np.float32)) @ turn
-    moved = replace(mesh, corners=corners, normals=mesh.normals @ turn)
-    # What is far behind casts no shadow that is seen.
-    kept = corners[:, :, 2].max(1) > -12
-    return moved.part(kept)
-
-
-def _join_far(street: Mesh, hills: Mesh) -> Mesh:
-    thing = hills.thing + street.thing.max() + 1
-    both = {
-        name: (getattr(street, name), getattr(hills, name)) for name in Mesh.__dataclass_fields__
-    }
-    both["thing"] = (street.thing, thing)
-    return Mesh(**{name: np.concatenate(parts) for name, parts in both.items()})
 
 
 def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
