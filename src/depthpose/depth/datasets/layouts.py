@@ -432,7 +432,7 @@ class RawFrame:
 
 def has_raw_frame(folder: Path, drive: str, number: int) -> bool:
     """Whether a frame is there, and every file of it as it was written."""
-    last = _disparity_file(folder, drive, number).relative_to(folder).as_posix()
+    last = f"{drive[:10]}/{drive}/disp_occ/{number:010d}.png"
     return is_whole(folder, f"{drive}/{number:010d}", [last])
 
 
@@ -476,10 +476,6 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     write_disparity_png(new("disp_noc"), seen_by_both)
     write_disparity_png(new("disp_occ"), frame.disparity_px)
     note_result(folder, f"{drive}/{name}", written)
-
-
-def _disparity_file(folder: Path, drive: str, number: int) -> Path:
-    return folder / drive[:10] / drive / "disp_occ" / f"{number:010d}.png"
 
 
 def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:

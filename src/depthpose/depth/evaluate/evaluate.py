@@ -238,7 +238,12 @@ def measure_frame(
     prepared = prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
-    return _measure(prepared, rule, caps_m) or "no truth within the caps and the crop"
+    if rule.truth == "disparity":
+        by_cap = [_measure_disparity(prepared)]
+    else:
+        by_cap = [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
+    measured = [one for one in by_cap if one is not None]
+    return measured or "no truth within the caps and the crop"
 
 
 def summarise(
@@ -288,15 +293,6 @@ def summarise(
     )
 
 
-def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[Measured]:
-    """Measure by each cap within which there is truth."""
-    if rule.truth == "disparity":
-        found = [_measure_disparity(prepared)]
-    else:
-        found = [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
-    return [one for one in found if one is not None]
-
-
 def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured | None:
     compared = compare_depth(prepared, rule, cap_m)
     mask, counted = _count(prepared, compared, cap_m)
@@ -334,11 +330,7 @@ def _count(
         return mask, None
     share = float(mask.sum() / counts.sum())
     counted = Measured(
-        frame=prepared.frame.name,
-        cap_m=cap_m,
-        pixels=int(mask.sum()),
-        coverage=share,
-        metrics={},
+        frame=prepared.frame.name, cap_m=cap_m, pixels=int(mask.sum()), coverage=share, metrics={}
     )
     return mask, counted
 

@@ -534,10 +534,7 @@ class LightStereo(StereoNetwork):
         return by_rows(enlarged, parts, halo=2, rows=self.rows)
 
     def scores(
-        self,
-        left: Float[Tensor, "b 3 h w"],
-        right: Float[Tensor, "b 3 h w"],
-        max_disparity_px: int,
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int
     ) -> tuple[Scores, Seen]:
         """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
 

@@ -198,13 +198,7 @@ def _add_frames(
     low, high = windows[:, 0, 1], windows[:, 2, 1]
     middle, bar = (left + right) / 2, 0.07
     cells = lambda x0, x1, y0, y1: np.stack(  # noqa: E731
-        [
-            np.stack([x0, y0], 1),
-            np.stack([x1, y0], 1),
-            np.stack([x1, y1], 1),
-            np.stack([x0, y1], 1),
-        ],
-        1,
+        [np.stack(corner, 1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1
     )
     frames = np.concatenate(
         [

@@ -288,7 +288,10 @@ def draw_sensors(
 def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
     """Take a picture: RGB in [0, 1], in steps of 1/255."""
     signal = light.permute(2, 0, 1) * torch.tensor(sensor.exposure)[:, None, None]
-    signal = signal * _vignette(signal, sensor.vignette)
+    height, width = signal.shape[1:]
+    y = torch.linspace(-1, 1, height)[:, None] * height / width
+    x = torch.linspace(-1, 1, width)[None]
+    signal = signal * (1 - sensor.vignette * (x**2 + y**2) / 1.1)
     signal = _blurred(_with_glare(signal, sensor.glare), sensor.blur)
     generator = torch.Generator().manual_seed(sensor.noise_seed)
     shot, dark = sensor.noise
@@ -299,13 +302,6 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h 
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
     return picture if sensor.jpeg_quality is None else through_jpeg(picture, sensor.jpeg_quality)
-
-
-def _vignette(signal: Float[Tensor, "3 h w"], loss: float) -> Float[Tensor, "h w"]:
-    height, width = signal.shape[1:]
-    y = torch.linspace(-1, 1, height)[:, None] * height / width
-    x = torch.linspace(-1, 1, width)[None]
-    return 1 - loss * (x**2 + y**2) / 1.1
 
 
 def _with_glare(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h w"]:
@@ -437,15 +433,10 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     if index < 0:
         raise InputError(f"index is {index}, but frames are counted from 0; take another")
     rig, mount_height_m = street_rig(config, index)
-    scene = _make_scene(config, index, mount_height_m)
-    return draw_scene(scene, rig, config, (config.seed, index))
-
-
-def _make_scene(config: StreetsConfig, index: int, mount_height_m: float) -> StreetScene:
     seed = (config.seed, index)
-    if np.random.default_rng([75, *seed]).random() < config.clutter_share:
-        return make_clutter(seed)
-    return make_scene(seed, mount_height_m)
+    is_clutter = np.random.default_rng([75, *seed]).random() < config.clutter_share
+    scene = make_clutter(seed) if is_clutter else make_scene(seed, mount_height_m)
+    return draw_scene(scene, rig, config, seed)
 
 
 def draw_scene(
@@ -463,7 +454,11 @@ def draw_scene(
     rng = np.random.default_rng([73, *seed])
     stage = prepare(scene, rig.width * rig.height)
     left = look(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
-    right = _look_right(stage, rig, rng.normal(0, 1) * config.rectification_error_px)
+    # The right camera, whose rows are off by a fraction of a pixel as real ones are.
+    K = rig.K.clone()
+    K[0, 2] += rig.cx_right_minus_left_px
+    K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
+    right = look(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
     light, other_light = (
         draw_light(stage, sight, with_antialiasing=config.with_antialiasing)
         for sight in (left, right)
@@ -484,15 +479,6 @@ def draw_scene(
         lidar_points=points,
         rig=rig,
     )
-
-
-def _look_right(stage: Stage, rig: StereoRig, rows_px: float) -> Sight:
-    """See with the right camera, whose rows are off by a fraction of a pixel as real ones are."""
-    K = rig.K.clone()
-    K[0, 2] += rig.cx_right_minus_left_px
-    K[1, 2] += rows_px
-    eye = torch.tensor([rig.baseline_m, 0.0, 0.0])
-    return look(stage, K, (rig.height, rig.width), eye)
 
 
 def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, between
 from depthpose.depth.synthetic.textures import Color, Number, Surface, Values
 
 
@@ -190,10 +190,7 @@ def _conifer(builder: MeshBuilder, rng: np.random.Generator, leaves: tuple[int, 
 
 
 def _clump(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    where: tuple,
-    leaves: tuple[int, Number],
+    builder: MeshBuilder, rng: np.random.Generator, where: tuple, leaves: tuple[int, Number]
 ) -> None:
     """A dark core that occludes what is behind, and leaves about it."""
     centre, radii = where
@@ -257,11 +254,8 @@ def add_wood_edge(
     builder.begin_thing()
     surface = Surface("leaf", (0.3 * r, 0.3 * g, 0.3 * b), 3.0, int(rng.integers(3)))
     for low, high in pairwise(range(len(rows))):
-        places = (np.stack([along, -up[row]], 1) for row in (low, high))
-        faces, uv = (
-            np.stack([a[:-1], a[1:], c[1:], c[:-1]], 1)
-            for a, c in ((points[low], points[high]), tuple(places))
-        )
+        below, above = (np.stack([along, -up[row]], 1) for row in (low, high))
+        faces, uv = between(points[low], points[high]), between(below, above)
         shade = rng.uniform(0.4, 1.3, (count - 1, 1))
         builder.quads(faces, uv, surface, tint=shade * np.asarray(surface.tint))
     leaf = surface._replace(tint=(0.6 * r, 0.6 * g, 0.6 * b))

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from depthpose.core.camera import StereoRig, crop_camera, resize_camera
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, join
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, Rotation, between, join
 from depthpose.depth.synthetic.models import add_ball, add_leaves
 from depthpose.depth.synthetic.road import Place, Road, add_ground, add_roadside, bend, draw_road
 from depthpose.depth.synthetic.textures import Color, Surface, Values
@@ -174,9 +174,7 @@ def _add_hills(builder: MeshBuilder, rng: np.random.Generator) -> None:
     high = np.stack([x, -height, z], 1)
     along = np.arange(len(angle)) * 12.0
     under, over = np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1)
-    faces, uv = (
-        np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1) for a, b in ((low, high), (under, over))
-    )
+    faces, uv = between(low, high), between(under, over)
     surface = Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2)))
     builder.quads(faces, uv, surface)
 
@@ -463,11 +461,7 @@ _BACKDROPS = (_ground, _wall, _box_inside)
 
 
 def _sheet(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    corner: Values,
-    along: Values,
-    up: Values,
+    builder: MeshBuilder, rng: np.random.Generator, corner: Values, along: Values, up: Values
 ) -> None:
     builder.begin_thing()
     builder.rectangle(corner, along, up, _surface(rng, rng.uniform(0.5, 4)))

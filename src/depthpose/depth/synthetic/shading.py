@@ -312,10 +312,9 @@ def _dot(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"]) -> Float[Tensor
 
 def _stain(stage: Stage, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Unevenness over metres, which hides that textures repeat."""
-    field, (x, y) = textures().stains, stage.scene.weather.shift
-    column = ((points[:, 0] * 0.021 + points[:, 1] * 0.013 + x) * SIDE_PX).long() % SIDE_PX
-    row = ((points[:, 2] * 0.021 + y) * SIDE_PX).long() % SIDE_PX
-    return 1 + 0.07 * field.flatten().index_select(0, row * SIDE_PX + column)
+    x, y = stage.scene.weather.shift
+    u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + x
+    return 1 + 0.07 * _looked_up(textures().stains, u, points[:, 2] * 0.021 + y)
 
 
 def _sunlight(
@@ -391,9 +390,8 @@ def _clouds(
     weather = stage.scene.weather
     is_sky = height > -0.02
     far = towards / height.clamp(min=0.03)[:, None]
-    column = ((far[:, 0] * 0.05 + weather.shift[0]) * SIDE_PX).long() % SIDE_PX
-    row = ((far[:, 2] * 0.05 + weather.shift[1]) * SIDE_PX).long() % SIDE_PX
-    density = textures().clouds.flatten().index_select(0, row * SIDE_PX + column)
+    u, v = far[:, 0] * 0.05 + weather.shift[0], far[:, 2] * 0.05 + weather.shift[1]
+    density = _looked_up(textures().clouds, u, v)
     cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud))
     return cover * (height * 6).clamp(0, 1), is_sky
 
@@ -420,7 +418,7 @@ def paint_road(
     x, s = place_m.unbind(1)
     width_m, length_m = foot[0], foot[0] / foot[1].clamp(min=0.02)
     cover = _cover(scene.markings, x, s, (width_m, length_m))
-    wear = torch.sigmoid(3 * (_field(x * 0.13, s * 0.13) + 1.4))
+    wear = torch.sigmoid(3 * (_looked_up(textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
     worn = albedo * _wear(scene, x, s)[:, None]
     return torch.lerp(worn, worn.new_tensor([0.8, 0.8, 0.77]).expand_as(worn), paint)
@@ -474,6 +472,7 @@ def _wear(scene: StreetScene, x: Tensor, s: Tensor) -> Float[Tensor, " n"]:
     return factor * (1 - 0.35 * seam * (scene.weather.shift[1] > 0.5))
 
 
-def _field(u: Tensor, v: Tensor) -> Tensor:
+def _looked_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Values of a field of noise, which repeats, at places in tiles."""
     column, row = (u * SIDE_PX).long() % SIDE_PX, (v * SIDE_PX).long() % SIDE_PX
-    return textures().stains.flatten().index_select(0, row * SIDE_PX + column)
+    return field.flatten().index_select(0, row * SIDE_PX + column)

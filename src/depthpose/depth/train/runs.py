@@ -12,14 +12,7 @@ from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, wa
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
-from depthpose.core.loop import (
-    LoopConfig,
-    Run,
-    Task,
-    held_out_text,
-    releases_folder,
-    write_card,
-)
+from depthpose.core.loop import LoopConfig, Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import refuse_common

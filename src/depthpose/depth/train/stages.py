@@ -52,10 +52,7 @@ class StereoTask:
     """Smooth L1 on all heads (eq. 2.6)."""
 
     def __init__(
-        self,
-        matcher: StereoNetwork,
-        config: StereoTraining,
-        held_out: TrainingPairs | None,
+        self, matcher: StereoNetwork, config: StereoTraining, held_out: TrainingPairs | None
     ) -> None:
         self.config, self.held_out = config, held_out
         self.matcher = matcher
@@ -113,9 +110,7 @@ class StereoTask:
 
 
 def validate_pairs(
-    matcher: StereoNetwork,
-    held_out: TrainingPairs,
-    draw: Callable[[Tensor], Tensor] | None = None,
+    matcher: StereoNetwork, held_out: TrainingPairs, draw: Callable[[Tensor], Tensor] | None = None
 ) -> ValidationResult:
     """Disparity error of a matcher on held-out pairs, or on right views that ``draw`` draws.
 
@@ -151,9 +146,7 @@ def validate_pairs(
 
 @torch.no_grad()
 def match_whole(
-    matcher: StereoNetwork,
-    left: Float[Tensor, "3 h w"],
-    right: Float[Tensor, "3 h w"],
+    matcher: StereoNetwork, left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"] | None]:
     """Match one pair of any size with the network as it stands [px]; say where it sees the sky."""
     device = next(matcher.parameters()).device
