@@ -132,9 +132,10 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        if camera is None or self.network_config.work_focal_px is None:
-            return self._match_alike(pairs, self.network_config)
-        size, trained = self.work_size(camera), self.network_config
+        trained = self.network_config
+        if camera is None or trained.work_focal_px is None:
+            return self._match_alike(pairs, trained)
+        size = self.work_size(camera)
         # A larger size needs more disparities; the same filters look through them.
         larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
         steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
