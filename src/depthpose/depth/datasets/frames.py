@@ -22,8 +22,13 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_text import Matrix, kitti_matrix, kitti_size, plain_facts
-from depthpose.core.camera.facts import CameraFacts, Size, camera_from_facts, facts_from_projections
+from depthpose.core.camera.camera_file import Matrix, kitti_matrix, kitti_size, plain_facts
+from depthpose.core.camera.pinhole import (
+    CameraFacts,
+    Size,
+    camera_from_facts,
+    facts_from_projections,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     MAP_SUFFIXES,

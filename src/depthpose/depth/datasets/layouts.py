@@ -32,7 +32,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.files.shards import SOURCE
+from depthpose.core.files.store import SOURCE
 from depthpose.core.results import is_whole, note_result
 from depthpose.depth.datasets.frames import Frame
 

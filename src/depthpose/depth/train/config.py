@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from depthpose.core.config_values import check_settings
+from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
