@@ -22,10 +22,9 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.ground import scale_by_mount
+from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, look
 from depthpose.depth.synthetic.scene import make_scene
-from depthpose.depth.synthetic.sensor import draw_sensors, expose
-from depthpose.depth.synthetic.stage import prepare
-from depthpose.depth.synthetic.view import draw_light, look
+from depthpose.depth.synthetic.shading import prepare
 from depthpose.depth.types import StereoInput
 from depthpose.report.page import markdown_table, write_table
 

@@ -37,7 +37,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import make_matcher
 from depthpose.depth.synthesis import SelectionGenerator, SynthesisedViews
-from depthpose.depth.synthesis.selection import mix_shifts
+from depthpose.depth.synthesis.networks import mix_shifts
 from depthpose.depth.synthesis.synthesiser import SelectionSynthesiser
 from depthpose.depth.train import STAGES
 from depthpose.depth.train.config import SelectTraining, ViewTraining

@@ -27,7 +27,7 @@ from depthpose.depth.stereo import (
     psmnet_from_published,
 )
 from depthpose.depth.stereo.network_matcher import pad_top_right
-from depthpose.depth.stereo.volume import Size, expected_disparity
+from depthpose.depth.stereo.psmnet import Size, expected_disparity
 from depthpose.depth.weights import read_matcher
 
 Pair = tuple[Tensor, Tensor]

@@ -30,11 +30,10 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.synthesis.synthesiser import pad_to_multiple
-from depthpose.depth.synthetic.materials import NUMBER
+from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, look
 from depthpose.depth.synthetic.scene import make_scene
-from depthpose.depth.synthetic.sensor import draw_sensors, expose
-from depthpose.depth.synthetic.stage import prepare
-from depthpose.depth.synthetic.view import draw_light, look
+from depthpose.depth.synthetic.shading import prepare
+from depthpose.depth.synthetic.textures import NUMBER
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.report.page import markdown_table

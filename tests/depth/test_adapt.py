@@ -256,7 +256,7 @@ def test_views_that_are_changed_apart_are_refused() -> None:
     changed = PairsConfig(augment=AugmentConfig(per_view=DegradeConfig()))
     with pytest.raises(InputError, match="changes each view on its own"):
         AdaptTraining(pairs=changed)
-    with pytest.raises(InputError, match="validation_share must be above 0"):
+    with pytest.raises(InputError, match=r"validation_share must be in \(0, 1\), got 1.0"):
         AdaptTraining(validation_share=1.0)
     with pytest.raises(InputError, match="one above 0"):
         AdaptTraining(photometric_weight=0.0, smooth_weight=0.0, label_weight=0.0)

@@ -23,7 +23,7 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
-from depthpose.depth.export.network import (
+from depthpose.depth.export.graph import (
     DynamicLightStereo,
     DynamicPSMNet,
     DynamicSelection,
@@ -77,9 +77,7 @@ def selection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
     """Folder with ``w.safetensors``: a generator that selects, without a matcher."""
-    monkeypatch.setattr(
-        "depthpose.depth.export.network.network_model", lambda *_: selection_network
-    )
+    monkeypatch.setattr("depthpose.depth.export.graph.network_model", lambda *_: selection_network)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 

@@ -34,8 +34,7 @@ from depthpose.depth.stereo import MATCHERS, MatcherKind, StereoNetwork
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune
-from depthpose.depth.train.select import SelectionSample, SelectTask
-from depthpose.depth.train.stages import StereoTask
+from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import DepthWeights, read_depth_weights, write_depth_weights
 

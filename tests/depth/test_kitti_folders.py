@@ -20,7 +20,7 @@ from depthpose.depth.datasets import (
     open_dataset,
     read_split,
 )
-from depthpose.depth.datasets.calibration import read_object_calibration, read_plain_calibration
+from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
 
 W, H = 20, 12
 P2 = "700 0 10 45 0 700 6 0.2 0 0 1 0.003"

@@ -7,7 +7,7 @@ import torch
 
 from depthpose.core.files import write_map
 from depthpose.depth.datasets import lidar_truth, open_dataset, project_lidar
-from depthpose.depth.datasets.calibration import LidarDepth
+from depthpose.depth.datasets.frames import LidarDepth
 from depthpose.depth.evaluate import evaluate
 
 FRONT = np.array([[0.0, -10, 0, 0], [0, 0, -10, 0], [1, 0, 0, 0]])  # u = -10 y/x, v = -10 z/x

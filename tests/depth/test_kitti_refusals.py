@@ -11,7 +11,7 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_disparity_png, write_image, write_map
 from depthpose.depth.datasets import check_dataset, lidar_truth, open_dataset, read_split
-from depthpose.depth.datasets.calibration import read_object_calibration
+from depthpose.depth.datasets.frames import read_object_calibration
 
 W, H = 20, 12
 P2, P3 = "700 0 10 45 0 700 6 0.2 0 0 1 0.003", "700 0 10 -325 0 700 6 2.2 0 0 1 0.003"

@@ -130,7 +130,7 @@ def test_unknown_truth_gives_the_selecting_losses_no_nan() -> None:
 @pytest.mark.parametrize("name", ["sky_weight", "encoder_rate"])
 @pytest.mark.parametrize("value", [-0.1, 1.1])
 def test_a_weight_that_is_no_share_is_refused(name: str, value: float) -> None:
-    with pytest.raises(InputError, match=rf"{name} must be from 0 to 1, got {value}"):
+    with pytest.raises(InputError, match=rf"{name} must be in \[0, 1\], got {value}"):
         config_from_dict({name: value}, StereoTraining, source="here")
 
 
@@ -143,5 +143,5 @@ def test_a_weight_that_is_no_share_is_refused(name: str, value: float) -> None:
     ],
 )
 def test_what_cannot_train_is_refused(name: str, value: int, kind: type, least: int) -> None:
-    with pytest.raises(InputError, match=rf"{name} must be {least} or more, got {value}"):
+    with pytest.raises(InputError, match=rf"{name} must be in \[{least}, inf\), got {value}"):
         config_from_dict({name: value}, kind, source="here")

@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.encoder import LiteEncoder, import_encoder, read_encoder
 from depthpose.depth.synthesis import SelectionGenerator, make_synthesiser
-from depthpose.depth.synthesis.selection import (
+from depthpose.depth.synthesis.networks import (
     log_expectation,
     make_planes,
     mix_shifts,
@@ -189,10 +189,10 @@ def test_another_checkpoint_is_no_encoder(tmp_path: Path, change, message: str) 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"encoder_width": 0.0}, "encoder_width must be above 0"),
-        ({"planes": 1}, "planes 2 or more"),
-        ({"disparity_px": (4.0, 2.0)}, "range of positive disparities"),
-        ({"virtual_focal_px": 0.0}, "positive focal length"),
+        ({"encoder_width": 0.0}, r"encoder_width must be in \(0, 4\], got 0.0"),
+        ({"planes": 1}, r"planes must be in \[2, inf\), got 1"),
+        ({"disparity_px": (4.0, 2.0)}, "disparity_px must be a range, the smaller end first"),
+        ({"virtual_focal_px": 0.0}, r"virtual_focal_px must be in \(0, inf\), got 0.0"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(changes: dict[str, Any], message: str) -> None:

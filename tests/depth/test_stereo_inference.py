@@ -17,15 +17,24 @@ from depthpose.depth.config import MatcherConfig, PSMNetConfig
 from depthpose.depth.stereo import (
     PSMNet,
     PSMNetMatcher,
-    folding,
+    kinds,
     normalise,
     psmnet,
     tile_change_px,
 )
-from depthpose.depth.stereo.network_matcher import lower_where_disagreeing, pad_top_right
-from depthpose.depth.stereo.plan import PSMNetFootprint, Tiling, match_tiles
-from depthpose.depth.stereo.psmnet import concatenation_volume, soft_argmin
-from depthpose.depth.stereo.volume import Size, expected_disparity
+from depthpose.depth.stereo.kinds import PSMNetFootprint
+from depthpose.depth.stereo.network_matcher import (
+    Tiling,
+    lower_where_disagreeing,
+    match_tiles,
+    pad_top_right,
+)
+from depthpose.depth.stereo.psmnet import (
+    Size,
+    concatenation_volume,
+    expected_disparity,
+    soft_argmin,
+)
 from depthpose.depth.types import Match
 
 SMALL = PSMNetConfig(max_disparity_px=32, width=4, blocks=(1, 2, 1, 1), pools=(4, 2))
@@ -82,13 +91,13 @@ def test_without_onednn_operators_the_answer_is_the_same(monkeypatch: pytest.Mon
         raise RuntimeError("no such operator")
 
     for operator in ("_onednn_convolved", "_onednn_transposed"):
-        monkeypatch.setattr(folding, operator, refuse)
-    folding.has_onednn_operators.cache_clear()
+        monkeypatch.setattr(kinds, operator, refuse)
+    kinds.has_onednn_operators.cache_clear()
     try:
         documented = PSMNetMatcher(network).match(left, right)
-        assert not folding.has_onednn_operators()
+        assert not kinds.has_onednn_operators()
     finally:
-        folding.has_onednn_operators.cache_clear()
+        kinds.has_onednn_operators.cache_clear()
     assert len(calls) == torch.backends.mkldnn.is_available()
     assert torch.allclose(by_name.disparity_px, documented.disparity_px, atol=1e-3)
     assert by_name.confidence is not None
@@ -102,20 +111,20 @@ def test_an_onednn_operator_that_answers_otherwise_is_not_used(
     def wrong(volume: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(volume)
 
-    monkeypatch.setattr(folding, "_onednn_transposed", wrong)
-    folding.has_onednn_operators.cache_clear()
+    monkeypatch.setattr(kinds, "_onednn_transposed", wrong)
+    kinds.has_onednn_operators.cache_clear()
     try:
-        assert not folding.has_onednn_operators()
+        assert not kinds.has_onednn_operators()
     finally:
-        folding.has_onednn_operators.cache_clear()
+        kinds.has_onednn_operators.cache_clear()
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 6, 10, 64])
 def test_any_number_of_rows_gives_one_answer_in_double_precision(rows: int) -> None:
     network = random_network(SMALL).double()
     left, right = torch.rand(2, 2, 3, 80, 96, dtype=torch.float64)
-    folded = folding.fold_volumes(copy.deepcopy(network), left)
-    folding.fold_features(folded.features, left)
+    folded = kinds.fold_volumes(copy.deepcopy(network), left)
+    kinds.fold_features(folded.features, left)
     folded.rows = rows
     with torch.no_grad():
         found_px, expected_px = (one(left, right)[-1] for one in (folded, network))
@@ -318,7 +327,7 @@ def test_unknown_device_is_refused() -> None:
 
 _PSMNET = """
 from depthpose.depth.stereo import PSMNet, PSMNetMatcher as Matcher
-from depthpose.depth.stereo.plan import PSMNetFootprint
+from depthpose.depth.stereo.kinds import PSMNetFootprint
 network = PSMNet().eval()
 footprint = PSMNetFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
 least = footprint.estimate_bytes()
@@ -326,7 +335,7 @@ least = footprint.estimate_bytes()
 _LIGHT = """
 from depthpose.depth.config import LightConfig
 from depthpose.depth.stereo import LightMatcher as Matcher, LightStereo
-from depthpose.depth.stereo.plan import LightFootprint
+from depthpose.depth.stereo.kinds import LightFootprint
 network = LightStereo(LightConfig(with_agreement=True, with_refinement=True)).eval()
 footprint = LightFootprint(config=network.config, height=256, width=1024, dtype=torch.float32)
 least = footprint.estimate_bytes()

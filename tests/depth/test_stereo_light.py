@@ -24,23 +24,22 @@ from depthpose.depth.config import (
 )
 from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, make_matcher, normalise
-from depthpose.depth.stereo.enlargement import (
+from depthpose.depth.stereo.kinds import LightFootprint
+from depthpose.depth.stereo.light import (
     Refinement,
-    Seen,
-    ViewFeatures,
     agreement_around,
     agreement_of_neighbours,
+    confidence_near,
+    correlation_volume,
     enlarge,
+    mean_of_all,
+    mean_of_best,
 )
-from depthpose.depth.stereo.light import correlation_volume
 from depthpose.depth.stereo.matcher import CameraMatcher
 from depthpose.depth.stereo.network_matcher import pad_top_right
-from depthpose.depth.stereo.plan import LightFootprint
-from depthpose.depth.stereo.scores import confidence_near, mean_of_all, mean_of_best
 from depthpose.depth.train import StereoTask
-from depthpose.depth.train.begin import make_matcher_network
 from depthpose.depth.train.config import StereoTraining
-from depthpose.depth.train.runs import train_stereo
+from depthpose.depth.train.runs import make_matcher_network, train_stereo
 from depthpose.depth.weights import read_matcher, write_depth_weights
 
 SMALL = LightConfig(
@@ -170,16 +169,15 @@ def test_what_the_refinement_corrects_learns_by_a_loss_of_its_own() -> None:
     torch.manual_seed(0)
     refinement = Refinement().train()
     torch.nn.init.normal_(refinement.correction.weight)
-    half, level = torch.randn(2, 16, 16, 32), torch.zeros(2, 8, 8, 16)
-    seen = Seen(ViewFeatures(half, (level,) * 4), half.flip(-1))
+    half = torch.randn(2, 16, 16, 32)
     found_px = torch.rand(2, 32, 64, requires_grad=True)
-    refinement(seen, found_px).square().sum().backward()
+    refinement(found_px, half, half.flip(-1)).square().sum().backward()
     assert found_px.grad is None
     gradient = refinement.get_parameter("compared.conv.weight").grad
     assert gradient is not None
     assert bool(gradient.any())
     with torch.no_grad():
-        corrected = refinement.eval()(seen, torch.zeros(2, 32, 64))
+        corrected = refinement.eval()(torch.zeros(2, 32, 64), half, half.flip(-1))
     assert float(corrected.min()) == pytest.approx(0.01), "depth is finite and positive"
     assert float(corrected.max()) > 0.01
 

@@ -19,17 +19,14 @@ from depthpose.depth.synthetic import (
     camera_from_velodyne,
     draw_scene,
     draw_street,
-    furniture,
     kitti_rig,
     make_clutter,
     make_scene,
-    people,
-    roadside,
-    vegetation,
-    vehicles,
+    road,
+    traffic,
 )
+from depthpose.depth.synthetic.dataset import draw_sensors
 from depthpose.depth.synthetic.road import draw_road
-from depthpose.depth.synthetic.sensor import draw_sensors
 
 PLAIN = StreetsConfig(scale=0.25, jpeg_share=0.0, rectification_error_px=0.0)
 
@@ -95,11 +92,8 @@ def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(module, name, note)
 
     for module, names in {
-        people: ("walker", "rider"),
-        vehicles: ("vehicle",),
-        vegetation: ("tree", "bush", "hedge"),
-        furniture: ("lamp", "sign", "fence"),
-        roadside: ("add_house",),
+        traffic: ("walker", "rider", "vehicle"),
+        road: ("tree", "bush", "hedge", "lamp", "sign", "fence", "add_house"),
     }.items():
         for name in names:
             counted(module, name)

@@ -31,7 +31,7 @@ from depthpose.depth.train import (
     train_select,
 )
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining
-from depthpose.depth.train.select import SelectionSample, SelectionSamples
+from depthpose.depth.train.stages import SelectionSample, SelectionSamples
 from depthpose.depth.weights import read_depth_weights, read_generator, write_depth_weights
 
 __all__ = ["folder", "held_folder", "pairs"]  # fixtures
@@ -297,8 +297,8 @@ def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"more_share": 1.5}, "more_share must be from 0 to 1"),
-        ({"view_weight": -1.0}, "view_weight must be 0 or more"),
+        ({"more_share": 1.5}, r"more_share must be in \[0, 1\], got 1.5"),
+        ({"view_weight": -1.0}, r"view_weight must be in \[0, inf\), got -1"),
     ],
 )
 def test_weights_that_are_none_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -38,7 +38,7 @@ from depthpose.core.files import (
 from depthpose.core.loop import read_metrics
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.datasets import read_split
-from depthpose.depth.datasets.calibration import read_plain_calibration
+from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
 from depthpose.pose.datasets import read_mask

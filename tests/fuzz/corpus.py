@@ -40,7 +40,7 @@ from depthpose.core.loop import read_metrics
 from depthpose.core.run import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.datasets import RawFrame, open_dataset, read_split, write_raw_frame
-from depthpose.depth.datasets.calibration import read_object_calibration, read_plain_calibration
+from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES

@@ -1,5 +1,8 @@
 """Disparity to depth and back, warping, the left-right check, and maps at other sizes."""
 
+from collections.abc import Callable
+from dataclasses import fields
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -157,6 +160,12 @@ def resize_image(
     shrinks = height < image.shape[1] or width < image.shape[2]
     resized = F.interpolate(image[None], (height, width), mode="bilinear", antialias=shrinks)
     return resized[0].clamp(0, 1)
+
+
+def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
+    """Give a match with each map that it has changed alike."""
+    maps = {field.name: getattr(match, field.name) for field in fields(match)}
+    return Match(**{name: change(values) for name, values in maps.items() if values is not None})
 
 
 def resized_match(match: Match, height: int, width: int) -> Match:

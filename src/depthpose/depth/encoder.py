@@ -137,8 +137,13 @@ def encoder_from_published(state: Mapping[str, Tensor]) -> LiteEncoder:
     Raises:
         InputError: names or shapes are not those of the network.
     """
-    renamed = {_our_name(name): tensor for name, tensor in state.items()}
-    kept = {name: t for name, t in renamed.items() if not name.startswith(_OF_THE_CLASSIFIER)}
+    kept = {}
+    for published, tensor in state.items():
+        name = published
+        for pattern, ours in _NAMES:
+            name = re.sub(pattern, ours, name)
+        if not name.startswith(_OF_THE_CLASSIFIER):
+            kept[name] = tensor
     encoder = LiteEncoder()
     load_weights(encoder, Checkpoint(kind=KIND, config={}, state=kept), "the checkpoint")
     return encoder.eval()
@@ -190,9 +195,3 @@ _NAMES = (
     (r"^_blocks\.(\d+)\._bn1\.", r"blocks.\1.depthwise.norm."),
     (r"^_blocks\.(\d+)\._bn2\.", r"blocks.\1.project.norm."),
 )
-
-
-def _our_name(published: str) -> str:
-    for pattern, ours in _NAMES:
-        published = re.sub(pattern, ours, published)
-    return published

@@ -221,22 +221,22 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     metres = read_map(depth_m) if depth_m.is_file() else None
     if metres is None and isinstance(camera, StereoRig):
         metres = depth_from_disparity(disparity_px, camera)
+    plane = None
+    if ground.is_file():
+        content = read_json(ground)
+        if not isinstance(content, dict):
+            kind = type(content).__name__
+            raise InputError(f"{ground}: holds no ground, but {kind}; predict again")
+        plane = config_from_dict(content, Ground, source=str(ground))
     return DepthEstimate(
         depth_m=metres,
         disparity_px=disparity_px,
         confidence=read_confidence(folder, name),
         right=read_image(right) if right.is_file() else None,
         is_sky=read_sky(folder, name),
-        ground=_read_ground(ground) if ground.is_file() else None,
+        ground=plane,
         warning=read_text(warning).strip() if warning.is_file() else "",
     )
-
-
-def _read_ground(path: Path) -> Ground:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no ground, but {type(content).__name__}; predict again")
-    return config_from_dict(content, Ground, source=str(path))
 
 
 def predict(

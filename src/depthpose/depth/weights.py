@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor, nn
 
 from depthpose.core.checkpoint import (
     Checkpoint,
@@ -62,18 +61,16 @@ def read_depth_weights(path: Path) -> DepthWeights:
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, str(path)) if is_both else {checkpoint.kind: checkpoint}
-    built = {kind: _build(part, str(path)) for kind, part in parts.items()}
+    built: dict[str, Any] = {}
+    for kind, part in parts.items():
+        kind_of_config, make = _networks()[kind]
+        config = config_from_dict(part.config, kind_of_config, source=str(path))
+        built[kind] = build_network(partial(make, config), part, str(path)).eval()
     return DepthWeights(
         generator=next((built[kind] for kind in _GENERATORS if kind in built), None),
         matcher=next((built[kind] for kind in MATCHERS if kind in built), None),
         facts=checkpoint.facts,
     )
-
-
-def _build(part: Checkpoint, source: str) -> Any:  # noqa: ANN401 - any network of this package
-    kind_of_config, kind_of_network = _networks()[part.kind]
-    config = config_from_dict(part.config, kind_of_config, source=source)
-    return build_network(lambda: kind_of_network(config), part, source).eval()
 
 
 def read_generator(path: Path) -> Generator:
@@ -117,12 +114,14 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
-    parts: dict[str, Any] = {
-        _kind_of(part): part for part in (generator, matcher) if part is not None
-    }
+    parts: dict[str, Any] = {}
+    for part in (generator, matcher):
+        for kind, (_, network) in _networks().items():
+            if isinstance(part, network):
+                parts[kind] = part
     assert parts, "a weights file holds a network at least"
-    states = {name: _state(module, with_half=with_half) for name, module in parts.items()}
-    configs = {name: config_to_dict(module.config) for name, module in parts.items()}
+    states = {k: half_state(part) if with_half else part.state_dict() for k, part in parts.items()}
+    configs = {kind: config_to_dict(part.config) for kind, part in parts.items()}
     if len(parts) == 1:
         kind = next(iter(parts))
         config, state = configs[kind], states[kind]
@@ -130,10 +129,6 @@ def write_depth_weights(
         kind, config = BOTH, configs
         state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
-
-
-def _kind_of(network: nn.Module) -> str:
-    return next(kind for kind, (_, made) in _networks().items() if isinstance(network, made))
 
 
 def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
@@ -157,7 +152,3 @@ def _split(checkpoint: Checkpoint, source: str) -> dict[str, Checkpoint]:
             "generator and a matcher; the file is damaged."
         )
     return parts
-
-
-def _state(module: nn.Module, *, with_half: bool) -> dict[str, Tensor]:
-    return half_state(module) if with_half else module.state_dict()

@@ -1,16 +1,178 @@
-"""Folders to frames: which layout this is, and where each frame's parts lie."""
+"""Layouts of folders: recognised, packed into tar shards, and KITTI's raw layout written."""
 
+import hashlib
+import io
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+import re
+import tarfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields
 from functools import partial
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
-from depthpose.core.files import MAP_SUFFIXES
+from depthpose.core.files import (
+    MAP_SUFFIXES,
+    atomic_write,
+    cache_folder,
+    read_bytes,
+    read_json,
+    read_text,
+    write_disparity_png,
+    write_image,
+    write_json,
+)
+from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.files.store import SOURCE
+from depthpose.core.results import is_whole, note_result
 from depthpose.depth.datasets.frames import Frame
-from depthpose.depth.datasets.packed import packed_frames
+
+INDEX = "index.json"
+"""What a packed data set holds; written last."""
+_CALIBRATION = "calibration"
+_PARTS = ("left", "right", "velodyne", "scan", "depth", "disparity", "disparity_noc", "sky")
+_URL = re.compile(r"([a-z][a-z0-9+]+):/+(?=[^/])")
+
+
+def pack_frames(
+    frames: list[Frame], out: Path, shard_bytes: int, show: Callable[[str], object] = lambda _: None
+) -> int:
+    """Copy frames into tar shards, in WebDataset's form, and give the number of shards.
+
+    Files are copied as they are, so that what is trained on shards has the weights that it would
+    have from the folder. ``KEY.left.png`` and the like lie in ``000000.tar``, calibration in
+    ``calibration/``, and ``index.json`` says where each frame's parts are. A shard is written whole
+    or not at all, the index last; a second call writes everything again.
+
+    Args:
+        frames: what is packed, in order.
+        out: a folder of its own.
+        shard_bytes: a shard is closed when it has this many.
+        show: called with the name of each frame.
+
+    Raises:
+        InputError: a file is missing or damaged, or the disk refuses.
+    """
+    rows: list[dict[str, Any]] = []
+    kept: dict[Path, str] = {}
+    shards = 0
+    for number, group in groupby(_numbered(frames, shard_bytes), key=lambda pair: pair[0]):
+        name = f"{number:06d}.tar"
+        with atomic_write(out / name) as part, tarfile.open(part, "w") as tar:
+            for _, frame in group:
+                key = f"{len(rows):08d}"
+                row = {"name": frame.name, "style": frame.style}
+                row |= {what: f"{name}/{file}" for what, file in _add(tar, key, frame)}
+                if frame.calibration is not None:
+                    row["calibration"] = _keep(frame.calibration, out, kept)
+                rows.append(row)
+                show(frame.name)
+        shards += 1
+    write_json(out / INDEX, {"frames": rows})
+    return shards
+
+
+def packed_frames(folder: Path) -> Iterator[Frame]:
+    """List the frames of a packed data set; none where there is no index.
+
+    Raises:
+        InputError: the index is damaged.
+    """
+    index = folder / INDEX
+    if not index.is_file():
+        return
+    known = {field.name for field in fields(Frame)}
+    found = read_json(index)
+    rows = found.get("frames") if isinstance(found, dict) else None
+    if not isinstance(rows, list):
+        return  # an index of somebody else
+    for number, row in enumerate(rows):
+        is_row = isinstance(row, dict) and {"name", "style", "left"} <= set(row) <= known
+        if not is_row or not all(isinstance(value, str) for value in row.values()):
+            raise InputError(f"{index}: frame {number} is not as 'depthpose data pack' writes it")
+        paths = {k: folder / v for k, v in row.items() if k not in ("name", "style")}
+        if not all(path.resolve().is_relative_to(folder.resolve()) for path in paths.values()):
+            raise InputError(f"{index}: frame {number} names a file outside of the folder")
+        yield Frame(name=row["name"], style=row["style"], **paths)
+
+
+def local_folder(folder: Path | str) -> Path:
+    """Give the folder itself; for a URL, a local one to which its shards come as they are read.
+
+    It is in ``$DEPTHPOSE_CACHE``, by default ``~/.cache/depthpose``.
+
+    Raises:
+        InputError: the store does not answer, or holds no packed data set there.
+    """
+    text = str(folder)
+    if _URL.match(text) is None:
+        return Path(folder)
+    url = _URL.sub(r"\1://", text, count=1).rstrip("/")  # a Path has made one slash of two
+    here = cache_folder() / "shards" / hashlib.sha256(url.encode()).hexdigest()[:16]
+    _fetch_small(url, here)
+    write_json(here / SOURCE, {"url": url})
+    return here
+
+
+def _fetch_small(url: str, here: Path) -> None:
+    """Fetch calibration and, last, the index."""
+    from depthpose.core.files.store import exists, fetch, join, list_tree  # fsspec takes time
+
+    if not exists(join(url, INDEX)):
+        raise InputError(f"{url}: holds no {INDEX}; 'depthpose data pack' makes one")
+    for name, of_file in list_tree(join(url, _CALIBRATION)).items():
+        if ".." not in Path(name).parts:
+            fetch(of_file, here / _CALIBRATION / name)
+    fetch(join(url, INDEX), here / INDEX)
+
+
+def _numbered(frames: list[Frame], shard_bytes: int) -> Iterator[tuple[int, Frame]]:
+    """Say which shard each frame goes into."""
+    number, size = 0, 0
+    for frame in frames:
+        if size >= shard_bytes:
+            number, size = number + 1, 0
+        size += sum(path.stat().st_size for _, path in _files(frame))
+        yield number, frame
+
+
+def _files(frame: Frame) -> Iterator[tuple[str, Path]]:
+    for part in _PARTS:
+        path = getattr(frame, part)
+        if path is not None:
+            yield part, path
+
+
+def _add(tar: tarfile.TarFile, key: str, frame: Frame) -> Iterator[tuple[str, str]]:
+    """Copy the files of a frame; give what each is, and its name."""
+    for part, path in _files(frame):
+        data = read_bytes(path)
+        member = tarfile.TarInfo(f"{key}.{part}{path.suffix.lower()}")
+        member.size = len(data)
+        tar.addfile(member, io.BytesIO(data))
+        yield part, member.name
+
+
+def _keep(calibration: Path, out: Path, kept: dict[Path, str]) -> str:
+    """Copy the calibration of a frame, once."""
+    if calibration not in kept:
+        kept[calibration] = place = f"{_CALIBRATION}/{len(kept):06d}"
+        if calibration.is_file():
+            kept[calibration] = place = f"{place}{calibration.suffix}"
+            write_bytes(out / place, read_bytes(calibration))
+        else:  # KITTI raw: the folder of a date
+            for file in sorted(calibration.glob("calib_*.txt")):
+                write_bytes(out / place / file.name, read_bytes(file))
+    return kept[calibration]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,3 +400,110 @@ def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
         return []
     found = (path for path in folder.iterdir() if not path.name.startswith("."))
     return sorted(path for path in found if path.suffix.lower() in suffixes and path.is_file())
+
+
+_CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawFrame:
+    """What is written of one frame.
+
+    Attributes:
+        left: left image (camera 2).
+        right: right image (camera 3).
+        rig: the cameras.
+        disparity_px: of the left image; NaN where unknown.
+        occluded: left pixels that the right view does not show.
+        is_sky: left pixels that show the sky.
+        points: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None.
+        camera_from_velodyne: from the LiDAR to the left camera.
+    """
+
+    left: Float[Tensor, "3 h w"]
+    right: Float[Tensor, "3 h w"]
+    rig: StereoRig
+    disparity_px: Float[Tensor, "h w"]
+    occluded: Bool[Tensor, "h w"]
+    is_sky: Bool[Tensor, "h w"]
+    points: Float[Tensor, "n 4"] | None
+    camera_from_velodyne: Float64[np.ndarray, "4 4"]
+
+
+def has_raw_frame(folder: Path, drive: str, number: int) -> bool:
+    """Whether a frame is there, and every file of it as it was written."""
+    last = f"{drive[:10]}/{drive}/disp_occ/{number:010d}.png"
+    return is_whole(folder, f"{drive}/{number:010d}", [last])
+
+
+def has_calibration(folder: Path, date: str) -> bool:
+    """Whether the calibration of a date is there as it was written."""
+    return is_whole(folder, date, [f"{date}/{name}" for name in _CALIBRATION_FILES])
+
+
+def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> None:
+    """Write a frame: images, LiDAR scan, disparity, and once a date the calibration.
+
+    ``image_02/data``, ``image_03/data`` and ``velodyne_points/data`` are KITTI's own folders;
+    disparity, which KITTI raw has not, goes beside them into ``disp_occ`` (all pixels) and
+    ``disp_noc`` (those that both views show), as 16-bit PNG x 256, and the sky into ``sky``.
+
+    Args:
+        folder: the dataset's root.
+        drive: ``DATE_drive_NNNN_sync``.
+        number: of the frame, in its drive.
+        frame: what to write.
+
+    Raises:
+        InputError: the date already has another calibration, or the disk refuses.
+    """
+    home = folder / drive[:10] / drive
+    _write_calibration(folder, drive[:10], frame)
+    name = f"{number:010d}"
+    written: list[Path] = []
+
+    def new(place: str, suffix: str = ".png") -> Path:
+        written.append(home / place / f"{name}{suffix}")
+        return written[-1]
+
+    write_image(new("image_02/data"), frame.left)
+    write_image(new("image_03/data"), frame.right)
+    if frame.points is not None:
+        scan = frame.points.float().contiguous().numpy().astype("<f4")
+        write_bytes(new("velodyne_points/data", ".bin"), scan.tobytes())
+    write_image(new("sky"), frame.is_sky.float().expand(3, -1, -1))
+    seen_by_both = torch.where(frame.occluded, torch.nan, frame.disparity_px)
+    write_disparity_png(new("disp_noc"), seen_by_both)
+    write_disparity_png(new("disp_occ"), frame.disparity_px)
+    note_result(folder, f"{drive}/{name}", written)
+
+
+def _write_calibration(folder: Path, date: str, frame: RawFrame) -> None:
+    """Write the calibration of a date once; one that is not as it was written, again."""
+    rig, eye = frame.rig, np.eye(3)
+    left = np.zeros((3, 4))
+    left[:, :3] = rig.K.numpy()
+    right = left.copy()
+    right[0, 2] += rig.cx_right_minus_left_px
+    right[0, 3] = -right[0, 0] * rig.baseline_m
+    size = np.array([rig.width, rig.height])
+    cameras = {"S_rect_02": size, "R_rect_00": eye, "P_rect_02": left,
+               "S_rect_03": size, "P_rect_03": right}  # fmt: skip
+    transform = frame.camera_from_velodyne
+    poses = {"R": transform[:3, :3], "T": transform[:3, 3]}
+    is_there = has_calibration(folder, date)
+    files = [folder / date / name for name in _CALIBRATION_FILES]
+    for path, matrices in zip(files, (cameras, poses), strict=True):
+        lines = [
+            f"{name}: " + " ".join(f"{value:.12e}" for value in matrix.ravel())
+            for name, matrix in matrices.items()
+        ]
+        text = "\n".join(lines) + "\n"
+        if not is_there:
+            write_bytes(path, text.encode())
+        elif read_text(path) != text:
+            raise InputError(
+                f"{path}: belongs to frames of another rig or scale; write these to another folder"
+            )
+    if not is_there:
+        note_result(folder, date, files)

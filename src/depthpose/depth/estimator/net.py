@@ -1,12 +1,15 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from depthpose.core.arrays import check_image
@@ -19,15 +22,15 @@ from depthpose.core.camera import (
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import own_arithmetic
-from depthpose.core.errors import InputError, refused_memory
+from depthpose.core.errors import InputError, Notice, refuse_unknown, refused_memory
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.disparity import focal_size, resize_image, smallest_focal_px
-from depthpose.depth.estimator.far import match_to_infinity
 from depthpose.depth.estimator.inputs import (
     Picture,
     as_input,
     as_inputs,
     as_tensor,
+    exif_focal_px,
     refuse_unrectified,
     usable_right,
 )
@@ -37,12 +40,13 @@ from depthpose.depth.estimator.rig import (
     from_pair,
     from_virtual,
     join_matches,
+    match_to_infinity,
     set_answer,
     square_camera,
 )
 from depthpose.depth.ground import scale_by_distance, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher
-from depthpose.depth.synthesis import SynthesisedViews, Synthesiser, make_synthesiser
+from depthpose.depth.synthesis import Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import read_depth_weights
 
@@ -136,22 +140,22 @@ class FakestereoNet:
         """
         if weights is None and matcher is None:
             weights = DEFAULT
-        found = None if weights is None else read_depth_weights(find_weights(weights))
+        main = None if weights is None else read_depth_weights(find_weights(weights))
         if answer is not None:
-            set_answer(found, answer)
-        own = None
+            set_answer(main, answer)
+        other = None
         # Paths first: a Path has a method 'match' too, and would pass for a matcher.
         if isinstance(matcher, str | Path) and matcher != "sgbm":
-            own = read_depth_weights(find_weights(matcher))
-        terms = join_terms(*(held.facts for held in (found, own) if held is not None))
+            other = read_depth_weights(find_weights(matcher))
+        terms = join_terms(*(read.facts for read in (main, other) if read is not None))
         warn_of_terms({"terms": terms})
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        chosen = choose_matcher(weights, found, matcher, own, config)
-        said = " + ".join(str(one) for one, held in ((weights, found), (matcher, own)) if held)
-        if found is None or found.generator is None:
-            return cls(chosen, terms=terms, weights=said)
-        synthesiser = make_synthesiser(found.generator, run.device, run.speed)
-        return cls(chosen, synthesiser, terms=terms, weights=said, allow_ood=allow_ood)
+        chosen = choose_matcher(weights, main, matcher, other, config)
+        names = " + ".join(str(name) for name, read in ((weights, main), (matcher, other)) if read)
+        if main is None or main.generator is None:
+            return cls(chosen, terms=terms, weights=names)
+        synthesiser = make_synthesiser(main.generator, run.device, run.speed)
+        return cls(chosen, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load
     """The same as :meth:`load`."""
@@ -201,8 +205,8 @@ class FakestereoNet:
             pair = replace(pair, right=as_tensor(right, "the right image"))
             if known_distance is not None:
                 raise InputError(f"{chosen}: a pair has metres of its own; omit known_distance")
-        found = self.estimate_pair(pair, with_check=with_check)
-        return found if known_distance is None else scale_by_distance(found, chosen, known_distance)
+        depth = self.estimate_pair(pair, with_check=with_check)
+        return depth if known_distance is None else scale_by_distance(depth, chosen, known_distance)
 
     @torch.no_grad()
     @own_arithmetic()
@@ -210,7 +214,7 @@ class FakestereoNet:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does."""
         if pair.right is None:
             with refused_memory(pair.name):
-                return self._estimate_alone([pair])[0]
+                return self._estimate_alone([pair], self.virtual_sizes(pair))[0]
         right = usable_right(pair)
         if self.matcher is None:
             raise InputError(
@@ -221,7 +225,7 @@ class FakestereoNet:
             )
         warning = refuse_unrectified(pair) if with_check else ""
         with refused_memory(pair.name):
-            match = match_to_infinity(self._match_one, pair.left, right, pair.camera)
+            match = match_to_infinity(self._match, pair.left, right, pair.camera)
             return replace(from_pair(pair, match), warning=warning)
 
     @torch.no_grad()
@@ -249,16 +253,20 @@ class FakestereoNet:
         Raises:
             InputError: as :meth:`estimate`; the first unusable image is named.
         """
-        found: list[DepthEstimate] = []
+        estimates: list[DepthEstimate] = []
         inputs = as_inputs(images, choose_lens(camera, focal_px, fov_deg))
-        for sizes, group in groupby(inputs, self._sizes_alone):
+
+        def sizes_alone(image: StereoInput) -> list[tuple[int, int]] | None:
+            return self.virtual_sizes(image) if image.right is None else None
+
+        for sizes, group in groupby(inputs, sizes_alone):
             alike = list(group)
             with refused_memory(alike[0].name):
                 if sizes is None:
-                    found += [self.estimate_pair(pair, with_check=with_check) for pair in alike]
+                    estimates += [self.estimate_pair(p, with_check=with_check) for p in alike]
                 else:
-                    found += self._estimate_alone(alike)
-        return found
+                    estimates += self._estimate_alone(alike, sizes)
+        return estimates
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Rows and columns at which one image is looked at.
@@ -270,69 +278,6 @@ class FakestereoNet:
             InputError: there is no generator or no camera, or the focal length would make the image
                 too large.
         """
-        synthesiser, camera = self._usable_alone(image)
-        focal_px, own_px = synthesiser.config.virtual_focal_px, smallest_focal_px(camera)
-        used = [s for s in synthesiser.scales if s == 1 or s * focal_px <= own_px]
-        return [focal_size(camera, scale * focal_px) for scale in used]
-
-    def _sizes_alone(self, image: StereoInput) -> list[tuple[int, int]] | None:
-        """Sizes at which an image is looked at; None for a pair."""
-        return self.virtual_sizes(image) if image.right is None else None
-
-    def _estimate_alone(self, images: list[StereoInput]) -> list[DepthEstimate]:
-        """Bring images to the virtual rig, draw their right views, match, and come back."""
-        synthesiser, _ = self._usable_alone(images[0])
-        rig = synthesiser.config
-        sizes = self.virtual_sizes(images[0])
-        given = [image.left.float() for image in images]
-        left, *larger = (
-            torch.stack([resize_image(image, *size) for image in given]) for size in sizes
-        )
-        drawn = synthesiser.draw(left, *larger)
-        matches = self._disparities(left, drawn, square_camera(sizes[0], rig.virtual_focal_px))
-        skies = [m.is_sky for m in matches] if drawn.is_sky is None else drawn.is_sky
-        parts = zip(images, matches, drawn.right, skies, strict=True)
-        found = [from_virtual(image, rig, match, right, sky) for image, match, right, sky in parts]
-        found = [scale_by_mount(one, image) for one, image in zip(found, images, strict=True)]
-        if drawn.confidence is None:
-            return found
-        known = drawn.confidence.mean((1, 2)) if drawn.street is None else drawn.street
-        return [
-            check_distribution(
-                image.name, replace(one, image_confidence=sure), rig, allow_ood=self.allow_ood
-            )
-            for image, one, sure in zip(images, found, known.tolist(), strict=True)
-        ]
-
-    def _disparities(
-        self, left: Float[Tensor, "b 3 h w"], drawn: SynthesisedViews, camera: Camera
-    ) -> list[Match]:
-        """Take the generator's own disparity, the matcher's, or both, as its weights say."""
-        assert self.synthesiser is not None, "checked before"
-        answer = self.synthesiser.config.answer
-        matched = [] if answer == "own" else self._match_many(left, drawn.right, camera)
-        if answer == "matched":
-            return matched
-        assert drawn.disparity_px is not None and drawn.confidence is not None  # noqa: PT018
-        parts = zip(drawn.disparity_px, drawn.confidence, strict=True)
-        own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
-        if answer == "own":
-            return own
-        return [join_matches(one, other) for one, other in zip(own, matched, strict=True)]
-
-    def _match_one(self, left: Tensor, right: Tensor, camera: Camera | None) -> Match:
-        return self._match_many(left[None], right[None], camera)[0]
-
-    def _match_many(
-        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], camera: Camera | None
-    ) -> list[Match]:
-        assert self.matcher is not None, "checked before"
-        pairs = list(zip(left, right, strict=True))
-        if isinstance(self.matcher, CameraMatcher):
-            return self.matcher.match_many(pairs, camera)
-        return [self.matcher.match(*pair) for pair in pairs]
-
-    def _usable_alone(self, image: StereoInput) -> tuple[Synthesiser, Camera]:
         if self.synthesiser is None:
             raise InputError(
                 f"{image.name}: there is no right image, and these weights match pairs only; give "
@@ -347,4 +292,133 @@ class FakestereoNet:
             )
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
-        return self.synthesiser, image.camera
+        rig_px, own_px = self.synthesiser.config.virtual_focal_px, smallest_focal_px(image.camera)
+        used = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
+        return [focal_size(image.camera, scale * rig_px) for scale in used]
+
+    def _estimate_alone(
+        self, images: list[StereoInput], sizes: list[tuple[int, int]]
+    ) -> list[DepthEstimate]:
+        """Bring images to the virtual rig, draw their right views, match, and come back."""
+        assert self.synthesiser is not None, "virtual_sizes checked it"
+        rig = self.synthesiser.config
+        left, *larger = (
+            torch.stack([resize_image(image.left.float(), *size) for image in images])
+            for size in sizes
+        )
+        views = self.synthesiser.draw(left, *larger)
+        matches: list[Match] = []
+        if rig.answer != "own":  # matched or joined
+            camera = square_camera(sizes[0], rig.virtual_focal_px)
+            matches = self._match(list(zip(left, views.right, strict=True)), camera)
+        if rig.answer != "matched":  # own or joined
+            assert views.disparity_px is not None and views.confidence is not None  # noqa: PT018
+            parts = zip(views.disparity_px, views.confidence, strict=True)
+            own = [Match(disparity_px=px, confidence=sure) for px, sure in parts]
+            matches = list(map(join_matches, own, matches)) if matches else own
+        estimates = []
+        for n, (image, match) in enumerate(zip(images, matches, strict=True)):
+            is_sky = match.is_sky if views.is_sky is None else views.is_sky[n]
+            estimate = from_virtual(image, rig, match, views.right[n], is_sky)
+            estimate = scale_by_mount(estimate, image)
+            if views.confidence is not None:
+                sure = views.confidence[n].mean() if views.street is None else views.street[n]
+                estimate = replace(estimate, image_confidence=float(sure))
+                estimate = check_distribution(image.name, estimate, rig, allow_ood=self.allow_ood)
+            estimates.append(estimate)
+        return estimates
+
+    def _match(self, pairs: list[tuple[Tensor, Tensor]], camera: Camera | None) -> list[Match]:
+        assert self.matcher is not None, "checked before"
+        if isinstance(self.matcher, CameraMatcher):
+            return self.matcher.match_many(pairs, camera)
+        return [self.matcher.match(*pair) for pair in pairs]
+
+
+_PHONE = 0.75
+"""Focal length of a phone's main camera, in widths of the picture."""
+
+
+class DepthPipeline:
+    """Pictures to ``{"predicted_depth", "depth"}``.
+
+    Args:
+        net: estimates one image.
+    """
+
+    def __init__(self, net: FakestereoNet) -> None:
+        self.net = net
+
+    def __call__(
+        self,
+        inputs: Picture | Sequence[Picture],
+        camera: AnyCamera | None = None,
+        *,
+        focal_px: float | None = None,
+        fov_deg: float | None = None,
+    ) -> dict[str, Any] | list[dict[str, Any]]:
+        """Estimate one picture, or a list of them.
+
+        Args:
+            inputs: as :meth:`FakestereoNet.estimate` takes them.
+            camera: of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's EXIF is
+                taken, or else 0.75 widths, a phone's, with a notice: the metres are as wrong as
+                that is.
+            focal_px: the focal length alone [px].
+            fov_deg: the horizontal field of view alone [degrees].
+
+        Returns:
+            For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and
+            ``depth``, an 8-bit picture of Pillow's, the farthest white, as transformers draws it.
+
+        Raises:
+            InputError: as :meth:`FakestereoNet.estimate`.
+        """
+        lens = choose_lens(camera, focal_px, fov_deg)
+        if isinstance(inputs, list | tuple):
+            return [self._one(one, lens) for one in inputs]
+        return self._one(inputs, lens)
+
+    def _one(self, picture: object, lens: AnyLens | None) -> dict[str, Any]:
+        image = as_tensor(picture)
+        if lens is None:
+            lens = exif_focal_px(picture, "the picture")
+        if lens is None:
+            lens = _PHONE * image.shape[2]
+            warnings.warn(
+                f"no camera: a focal length of {lens:g} px is taken, a phone's; the metres are as "
+                "wrong as it is. Give focal_px= or camera=",
+                Notice,
+                stacklevel=3,
+            )
+        (found,) = self.net.estimate_many([image], lens)
+        assert found.depth_m is not None
+        return {"predicted_depth": found.depth_m, "depth": _drawn(found.depth_m)}
+
+
+def pipeline(
+    task: str = "depth-estimation", model: str | Path | None = None, device: str | int = "cpu"
+) -> DepthPipeline:
+    """Build what transformers' function of this name builds, for the one task that is known.
+
+    Args:
+        task: depth-estimation.
+        model: weights with a generator, by name or file; None: ``default``.
+        device: cpu, cuda, cuda:1, ...; or the number of a GPU, -1 for the CPU.
+
+    Raises:
+        InputError: another task, or no such weights.
+    """
+    refuse_unknown("task", task, ["depth-estimation"])
+    if isinstance(device, int):
+        device = f"cuda:{device}" if device >= 0 else "cpu"
+    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=device))
+    return DepthPipeline(net)
+
+
+def _drawn(depth_m: Float[Tensor, "h w"]) -> Image.Image:
+    """Draw depth from the nearest (black) to the farthest (white); what has none is white too."""
+    known = depth_m[depth_m.isfinite()]
+    low, high = known.aminmax() if len(known) else (torch.zeros(()), torch.ones(()))
+    share = ((depth_m - low) / (high - low).clamp(min=1e-6)).nan_to_num(1.0)
+    return Image.fromarray((255 * share.clamp(0, 1)).byte().cpu().numpy())

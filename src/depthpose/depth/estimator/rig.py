@@ -1,11 +1,14 @@
 """The rig of a generator or a matcher and the way there and back; the matcher an estimator gets."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
@@ -17,6 +20,7 @@ from depthpose.depth.config import (
     SGBMConfig,
 )
 from depthpose.depth.disparity import (
+    changed_match,
     depth_from_disparity,
     disparity_from_depth,
     resize_image,
@@ -24,7 +28,7 @@ from depthpose.depth.disparity import (
     resized_match,
 )
 from depthpose.depth.stereo import Matcher, SGBMMatcher, make_matcher
-from depthpose.depth.stereo.enlargement import LEAST_PX
+from depthpose.depth.stereo.light import LEAST_PX
 from depthpose.depth.synthesis import SelectionGenerator
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
@@ -214,3 +218,51 @@ def choose_matcher(
         "matcher become one file by 'depthpose weights pack G --matcher S --trained-on DATA "
         "--licence L --out W'."
     )
+
+
+def match_to_infinity(
+    match: Callable[[list[tuple[Tensor, Tensor]], Camera | None], list[Match]],
+    left: Float[Tensor, "3 h w"],
+    right: Float[Tensor, "3 h w"],
+    camera: Camera | None,
+) -> Match:
+    """Match a pair; with principal points apart, after its views were moved by their difference.
+
+    What is farthest then has a disparity of 0 px, where matchers search, and what is nearest that
+    of a rig whose principal points agree. Disparities of the views as given are returned.
+    Where the right view shows nothing of the left one, the confidence is 0.
+
+    Args:
+        match: of pairs and their camera.
+        left: RGB in [0, 1].
+        right: of the same size, rectified.
+        camera: of the pair; None: its principal points are taken as equal.
+
+    Raises:
+        InputError: the principal points lie farther apart than the images are wide.
+    """
+    rig = camera if isinstance(camera, StereoRig) else None
+    columns = 0 if rig is None else math.ceil(rig.cx_right_minus_left_px)
+    if rig is None or columns == 0:
+        return match([(left, right)], camera)[0]
+    width, apart_px = left.shape[2], rig.cx_right_minus_left_px
+    if abs(columns) >= width:
+        raise InputError(
+            f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: the "
+            "two views share nothing that is far away. Take both principal points from one "
+            "calibration of images of this size."
+        )
+    added = max(columns, 0)
+    K = rig.K.clone()
+    K[0, 2] += added
+    moved = replace(rig, width=width + added, K=K, cx_right_minus_left_px=apart_px - columns)
+    # New columns repeat the border; those cut off the right view show nothing of the left one.
+    wide_left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
+    wide_right = F.pad(right[None], (added - columns, added, 0, 0), mode="replicate")[0]
+    (wide,) = match([(wide_left, wide_right[..., : width + added])], moved)
+    cut = changed_match(wide, lambda values: values[:, added:])
+    confidence = cut.confidence
+    if confidence is not None:  # the right view shows none of the first columns, even at infinity
+        is_outside = torch.arange(width, device=confidence.device) < -columns
+        confidence = torch.where(is_outside, 0.0, confidence)
+    return replace(cut, disparity_px=cut.disparity_px - columns, confidence=confidence)

@@ -4,8 +4,13 @@ A protocol fixes the truth, the pixels that count and how the prediction is prep
 two protocols do not compare; every row carries its protocol's name.
 """
 
+from depthpose.depth.evaluate.evaluate import DecileRow as DecileRow
 from depthpose.depth.evaluate.evaluate import Evaluation as Evaluation
+from depthpose.depth.evaluate.evaluate import FrameRow as FrameRow
+from depthpose.depth.evaluate.evaluate import MeanRow as MeanRow
 from depthpose.depth.evaluate.evaluate import Measured as Measured
+from depthpose.depth.evaluate.evaluate import Row as Row
+from depthpose.depth.evaluate.evaluate import Source as Source
 from depthpose.depth.evaluate.evaluate import evaluate as evaluate
 from depthpose.depth.evaluate.evaluate import measure_frame as measure_frame
 from depthpose.depth.evaluate.evaluate import ranking_metric as ranking_metric
@@ -17,8 +22,3 @@ from depthpose.depth.evaluate.frames import clamped_depth as clamped_depth
 from depthpose.depth.evaluate.frames import find_protocol as find_protocol
 from depthpose.depth.evaluate.frames import frame_result as frame_result
 from depthpose.depth.evaluate.frames import has_truth as has_truth
-from depthpose.depth.evaluate.rows import DecileRow as DecileRow
-from depthpose.depth.evaluate.rows import FrameRow as FrameRow
-from depthpose.depth.evaluate.rows import MeanRow as MeanRow
-from depthpose.depth.evaluate.rows import Row as Row
-from depthpose.depth.evaluate.rows import Source as Source

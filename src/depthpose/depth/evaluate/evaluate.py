@@ -1,7 +1,7 @@
-"""Each frame measured, and the means over frames."""
+"""Each frame measured, the means over frames, and the rows that hold them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from depthpose.depth.evaluate.frames import (
     find_protocol,
     prepare,
 )
-from depthpose.depth.evaluate.rows import DecileRow, FrameRow, MeanRow
 from depthpose.depth.metrics import (
     METRICS,
     RANKING,
@@ -32,6 +31,121 @@ from depthpose.depth.metrics import (
     score_confidence,
 )
 from depthpose.depth.predictions import EXPECTED
+
+Cell = str | int | float
+"""What a table holds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A row whose columns are its fields, in order.
+
+    A field that is None is no column; a mapping is a column for each of its entries.
+    """
+
+    def columns(self) -> dict[str, Cell]:
+        """Give the columns by name, as files and printed tables hold them."""
+        found: dict[str, Cell] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Mapping):
+                found |= value
+            elif value is not None:
+                found[field.name] = value
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source(Row):
+    """Whose predictions were measured.
+
+    Attributes:
+        method: its name.
+        input: which images it was given.
+        speed: at which networks ran.
+        weights: name of the file.
+        weights_sha256: the first 12 digits.
+    """
+
+    method: str
+    input: str = ""
+    speed: str = ""
+    weights: str = ""
+    weights_sha256: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanRow(Row):
+    """Means over frames, each of the same weight.
+
+    Attributes:
+        method: as in :class:`Source`, like the next four; None: not known.
+        input: which images it was given.
+        speed: at which networks ran.
+        weights: name of the file.
+        weights_sha256: the first 12 digits.
+        protocol: by which the frames were measured.
+        dataset: its name.
+        cap_m: truth beyond it does not count; None for disparity.
+        frames: how many.
+        pixels: sum of the pixels compared.
+        coverage: share of the pixels with truth that have a prediction.
+        metrics: means of what all frames with a predicted pixel have, in the order of
+            ``depth.metrics.METRICS``, then those of the drawn view and of the confidence.
+    """
+
+    method: str | None = None
+    input: str | None = None
+    speed: str | None = None
+    weights: str | None = None
+    weights_sha256: str | None = None
+    protocol: str
+    dataset: str
+    cap_m: float | None
+    frames: int
+    pixels: int
+    coverage: float
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRow(Row):
+    """Numbers of one frame; the fields are those of :class:`MeanRow`, ``frame`` is its name."""
+
+    method: str | None = None
+    input: str | None = None
+    speed: str | None = None
+    weights: str | None = None
+    protocol: str
+    dataset: str
+    frame: str
+    cap_m: float | None
+    pixels: int
+    coverage: float
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecileRow(Row):
+    """Mean error of the n-th tenth of the pixels, from the least sure (1) to the surest (10).
+
+    Attributes:
+        confidence_decile: n.
+        error: the name of the error and its mean over frames.
+
+    The other fields are those of :class:`MeanRow`.
+    """
+
+    method: str | None = None
+    input: str | None = None
+    speed: str | None = None
+    weights: str | None = None
+    protocol: str
+    dataset: str
+    cap_m: float | None
+    frames: int
+    confidence_decile: int
+    error: Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +238,12 @@ def measure_frame(
     prepared = prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
-    return _measure(prepared, rule, caps_m) or "no truth within the caps and the crop"
+    if rule.truth == "disparity":
+        by_cap = [_measure_disparity(prepared)]
+    else:
+        by_cap = [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
+    measured = [one for one in by_cap if one is not None]
+    return measured or "no truth within the caps and the crop"
 
 
 def summarise(
@@ -174,15 +293,6 @@ def summarise(
     )
 
 
-def _measure(prepared: Prepared, rule: Protocol, caps_m: Sequence[float]) -> list[Measured]:
-    """Measure by each cap within which there is truth."""
-    if rule.truth == "disparity":
-        found = [_measure_disparity(prepared)]
-    else:
-        found = [_measure_depth(prepared, rule, cap_m) for cap_m in caps_m]
-    return [one for one in found if one is not None]
-
-
 def _measure_depth(prepared: Prepared, rule: Protocol, cap_m: float) -> Measured | None:
     compared = compare_depth(prepared, rule, cap_m)
     mask, counted = _count(prepared, compared, cap_m)
@@ -220,11 +330,7 @@ def _count(
         return mask, None
     share = float(mask.sum() / counts.sum())
     counted = Measured(
-        frame=prepared.frame.name,
-        cap_m=cap_m,
-        pixels=int(mask.sum()),
-        coverage=share,
-        metrics={},
+        frame=prepared.frame.name, cap_m=cap_m, pixels=int(mask.sum()), coverage=share, metrics={}
     )
     return mask, counted
 

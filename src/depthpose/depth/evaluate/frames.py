@@ -62,14 +62,10 @@ PROTOCOLS = {
         summary="the same with depth = camera z", truth="camera_z", with_crop=True
     ),
     "eigen-improved": Protocol(
-        summary="annotated depth maps, no crop: monodepth2's",
-        truth="depth",
-        with_crop=False,
+        summary="annotated depth maps, no crop: monodepth2's", truth="depth", with_crop=False
     ),
     "eigen-improved-garg": Protocol(
-        summary="annotated depth maps, Garg crop: BTS's, AdaBins'",
-        truth="depth",
-        with_crop=True,
+        summary="annotated depth maps, Garg crop: BTS's, AdaBins'", truth="depth", with_crop=True
     ),
     "kitti-2015": Protocol(
         summary="disparity: EPE and D1 (> 3 px and > 5 %), all pixels and those both views see",

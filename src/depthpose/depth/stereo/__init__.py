@@ -1,45 +1,22 @@
 """Stereo matching: a rectified pair to disparity, by one of several matchers."""
 
-from depthpose.depth.stereo.light import LightStereo
-from depthpose.depth.stereo.light_matcher import LightMatcher
-from depthpose.depth.stereo.matcher import (
-    CallableMatcher,
-    CameraMatcher,
-    Matcher,
-    check_pair,
-)
-from depthpose.depth.stereo.network_matcher import (
-    NetworkMatcher,
-    StereoNetwork,
-    normalise,
-    tile_change_px,
-    with_usable_precision,
-)
-from depthpose.depth.stereo.psmnet import PSMNet
-from depthpose.depth.stereo.psmnet_matcher import PSMNetMatcher
-from depthpose.depth.stereo.published import import_psmnet, psmnet_from_published
-from depthpose.depth.stereo.registry import MATCHERS, MatcherKind, make_matcher
-from depthpose.depth.stereo.sgbm import SGBMMatcher, fill_holes
-
-__all__ = [
-    "MATCHERS",
-    "CallableMatcher",
-    "CameraMatcher",
-    "LightMatcher",
-    "LightStereo",
-    "Matcher",
-    "MatcherKind",
-    "NetworkMatcher",
-    "PSMNet",
-    "PSMNetMatcher",
-    "SGBMMatcher",
-    "StereoNetwork",
-    "check_pair",
-    "fill_holes",
-    "import_psmnet",
-    "make_matcher",
-    "normalise",
-    "psmnet_from_published",
-    "tile_change_px",
-    "with_usable_precision",
-]
+from depthpose.depth.stereo.kinds import MATCHERS as MATCHERS
+from depthpose.depth.stereo.kinds import LightMatcher as LightMatcher
+from depthpose.depth.stereo.kinds import MatcherKind as MatcherKind
+from depthpose.depth.stereo.kinds import PSMNetMatcher as PSMNetMatcher
+from depthpose.depth.stereo.kinds import make_matcher as make_matcher
+from depthpose.depth.stereo.light import LightStereo as LightStereo
+from depthpose.depth.stereo.matcher import CallableMatcher as CallableMatcher
+from depthpose.depth.stereo.matcher import CameraMatcher as CameraMatcher
+from depthpose.depth.stereo.matcher import Matcher as Matcher
+from depthpose.depth.stereo.matcher import SGBMMatcher as SGBMMatcher
+from depthpose.depth.stereo.matcher import check_pair as check_pair
+from depthpose.depth.stereo.matcher import fill_holes as fill_holes
+from depthpose.depth.stereo.network_matcher import NetworkMatcher as NetworkMatcher
+from depthpose.depth.stereo.network_matcher import StereoNetwork as StereoNetwork
+from depthpose.depth.stereo.network_matcher import normalise as normalise
+from depthpose.depth.stereo.network_matcher import tile_change_px as tile_change_px
+from depthpose.depth.stereo.network_matcher import with_usable_precision as with_usable_precision
+from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
+from depthpose.depth.stereo.published import import_psmnet as import_psmnet
+from depthpose.depth.stereo.published import psmnet_from_published as psmnet_from_published

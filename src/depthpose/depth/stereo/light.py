@@ -12,7 +12,8 @@
 """
 
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -22,30 +23,277 @@ from torch import Tensor, nn
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
 from depthpose.depth.encoder import LiteEncoder
-from depthpose.depth.stereo.enlargement import (
-    STEM,
-    ConvexUpsampling,
-    Features,
-    Maps,
-    Quarter,
-    Refinement,
-    Seen,
-    ViewFeatures,
-    enlarge,
-    unit_groups,
+from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, Maps, StereoNetwork
+from depthpose.depth.stereo.psmnet import (
+    Shape,
+    by_rows,
+    conv_norm_2d,
+    conv_norm_3d,
+    deconv_norm_3d,
+    interpolation_matrix,
+    linear_taps,
 )
-from depthpose.depth.stereo.network_matcher import IMAGENET_MEAN, IMAGENET_STD, StereoNetwork
-from depthpose.depth.stereo.psmnet import Shape, conv_norm_2d, conv_norm_3d, deconv_norm_3d
-from depthpose.depth.stereo.scores import (
-    STEP_PX,
-    Reading,
-    Scores,
-    SkyHead,
-    confidence_near,
-    mean_of_all,
-    mean_of_best,
-)
-from depthpose.depth.stereo.volume import by_rows
+
+Features = Float[Tensor, "b _ _ _"]
+Quarter = Float[Tensor, "b h4 w4"]
+
+STEM = 16
+"""Channels at half size."""
+_OFFSETS = (-2, -1, 0, 1, 2)
+"""Where the refinement compares the views: so many pixels at half size from the disparity."""
+LEAST_PX = 0.01
+"""Of a corrected disparity in use: depth stays finite. It is what a pair without a rig has in the
+sky."""
+_REFINED = 32
+"""Channels of the refinement at half size."""
+
+
+class ViewFeatures(NamedTuple):
+    """Features of a view.
+
+    Attributes:
+        half: at 1/2 of the image's sides.
+        levels: at 1/4, 1/8, 1/16 and 1/32.
+    """
+
+    half: Features
+    levels: tuple[Features, ...]
+
+
+class Seen(NamedTuple):
+    """Inputs of the upsampling.
+
+    Attributes:
+        left: features of the left view.
+        right_half: of the right view at 1/2 of its sides, where both are compared.
+    """
+
+    left: ViewFeatures
+    right_half: Features | None
+
+
+class ConvexUpsampling(nn.Module):
+    """Weights of the nine neighbours at 1/4 size, for each pixel of the image.
+
+    With agreement, the weights also depend on how alike both views are under the disparity of each
+    neighbour: where two surfaces meet, this says which one a pixel belongs to. That part is
+    initialised to zero.
+    """
+
+    def __init__(self, width: int, *, with_agreement: bool) -> None:
+        super().__init__()
+        self.hidden = conv_norm_2d(STEM + width, 32)
+        self.weights = nn.Conv2d(32, 4 * 9, 1)
+        self.compared = conv_norm_2d(STEM, STEM) if with_agreement else None
+        self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False) if with_agreement else None
+        if self.agreement is not None:
+            nn.init.zeros_(self.agreement.weight)
+
+    def forward(self, seen: Seen, quarter_px: Quarter) -> Float[Tensor, "b 9 4 h2 w2"]:
+        """Answer weights that sum to one, for the four pixels of each one at half size."""
+        left, right_half = seen
+        wide = F.interpolate(left.levels[0], scale_factor=2.0, mode="nearest")
+        x = self.hidden(torch.cat([left.half, wide], 1))
+        if self.compared is not None and self.agreement is not None:
+            assert right_half is not None
+            both = self.compared(left.half), self.compared(right_half)
+            alike = agreement_of_neighbours(*both, quarter_px.detach())
+            x = x + self.agreement(alike.to(x))
+        x = F.relu(x)
+        b, _, h, w = x.shape
+        return self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
+
+
+def agreement_of_neighbours(
+    left: Float[Tensor, "b c h2 w2"], right: Float[Tensor, "b c h2 w2"], quarter_px: Quarter
+) -> Float[Tensor, "b 9 h2 w2"]:
+    """Give the cosine of features at half size under the disparity of each of nine neighbours."""
+    near, far = (F.normalize(x.float(), dim=1, eps=1e-3) for x in (left, right))
+    shifts = (_neighbours(quarter_px) / 2).unbind(1)
+    return torch.stack([(near * _moved(far, shift)).sum(1) for shift in shifts], 1)
+
+
+def agreement_around(
+    left: Float[Tensor, "b c h2 w2"],
+    right: Float[Tensor, "b c h2 w2"],
+    half_px: Float[Tensor, "b h2 w2"],
+    groups: int,
+) -> Float[Tensor, "b _ h2 w2"]:
+    """Give the cosine of each group of features at half size at five disparities about one [px]."""
+    near, far = unit_groups(left, groups), unit_groups(right, groups).flatten(1, 2)
+    cosines = []
+    for offset in _OFFSETS:
+        moved = _moved(far, half_px + offset).unflatten(1, near.shape[1:3])
+        cosines.append((near * moved).sum(2))
+    return torch.cat(cosines, 1)
+
+
+def _moved(
+    right: Float[Tensor, "b c h2 w2"], shift: Float[Tensor, "b h2 w2"]
+) -> Float[Tensor, "b c h2 w2"]:
+    """Give each pixel of the left view what lies ``shift`` to the left of it in the right one."""
+    lines = torch.arange(right.shape[2], device=right.device).float()
+    columns = torch.arange(right.shape[3], device=right.device).float()
+    # The last index as a tensor: the exporter to ONNX takes no quotient of unknown sizes.
+    rows = (2 * lines / lines[-1:] - 1)[:, None]
+    x = 2 * (columns - shift) / columns[-1:] - 1
+    return F.grid_sample(right, torch.stack([x, rows.expand_as(x)], -1), align_corners=True)
+
+
+class Refinement(nn.Module):
+    """A correction of the disparity of each pixel, from both views compared around it.
+
+    Its output is initialised to zero.
+    """
+
+    def __init__(self, groups: int = 4) -> None:
+        super().__init__()
+        self.groups = groups
+        self.compared = conv_norm_2d(STEM, STEM)
+        seen = groups * len(_OFFSETS) + STEM + 4
+        self.layers = nn.ModuleList(
+            [
+                conv_norm_2d(seen, _REFINED),
+                conv_norm_2d(_REFINED, _REFINED, Shape(dilation=2)),
+                conv_norm_2d(_REFINED, _REFINED),
+            ]
+        )
+        self.correction = nn.Conv2d(_REFINED, 4, 1)
+        nn.init.zeros_(self.correction.weight)
+        assert self.correction.bias is not None
+        nn.init.zeros_(self.correction.bias)
+
+    def forward(self, enlarged_px: Maps, left_half: Features, right_half: Features) -> Maps:
+        """Correct a disparity of the left view [px] by features of both views at half size."""
+        four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
+        middle = four.mean(1)
+        left, right = self.compared(left_half), self.compared(right_half)
+        alike = agreement_around(left.float(), right.float(), middle, self.groups)
+        x = torch.cat([alike, left_half.float(), four - middle[:, None]], 1).to(left)
+        for layer in self.layers:
+            x = F.relu(layer(x))
+        correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
+        corrected = enlarged_px.detach() + correction_px
+        return corrected if self.training else corrected.clamp_min(LEAST_PX)
+
+
+def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
+    """Give the nine neighbours at 1/4 of each pixel at half size."""
+    h, w = quarter.shape[1:]
+    padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
+    near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]
+    return F.interpolate(torch.cat(near, 1), scale_factor=2.0, mode="nearest")
+
+
+def enlarge(quarter: Quarter, weights: Float[Tensor, "b 9 4 h2 w2"]) -> Float[Tensor, "b h w"]:
+    """Bring a map to full size: each pixel is a mean of nine neighbours, weighed."""
+    wide = _neighbours(quarter)
+    return F.pixel_shuffle((weights * wide[:, :, None]).sum(1), 2)[:, 0]
+
+
+def unit_groups(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor, "b g k h w"]:
+    """Bring each group of features to length 1."""
+    b, c, h, w = features.shape
+    grouped = features.contiguous().view(b, groups, c // groups, h, w)
+    return grouped * (grouped.square().sum(2, keepdim=True) + 1e-6).rsqrt()
+
+
+Scores = Float[Tensor, "b d h4 w4"]
+
+STEP_PX = 4
+"""Distance of neighbouring disparities that have a score."""
+_WINDOW = 0.15
+"""Of a disparity: what lies so near to it counts for its confidence."""
+_USUAL_PX = 64
+"""A disparity of this size is 1 to the class of the sky."""
+_SKY_WIDTH = 32
+"""Channels of the class of the sky."""
+
+
+def mean_of_best(scores: Scores, candidates: int) -> Quarter:
+    """Give the expected disparity [px] over the disparities of the highest scores."""
+    best = scores.topk(candidates, 1)
+    return STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
+
+
+def mean_of_all(scores: Scores) -> Quarter:
+    """Give the expected disparity [px] over all disparities."""
+    bins = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
+    return STEP_PX * (scores.softmax(1) * bins[:, None, None]).sum(1)
+
+
+def confidence_near(scores: Scores, disparity_px: Quarter) -> Quarter:
+    """Give the probability of what lies within 15 % of a disparity.
+
+    As the confidence of a generator that selects: depth is then off by no more than about that.
+    Between the disparities that have a score, scores are interpolated.
+    """
+    bins = scores.shape[1]
+    count = STEP_PX * (bins - 1) + 1
+    matrix = interpolation_matrix(linear_taps(bins, count, scores, align_corners=True), bins)
+    probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
+    steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
+    distance_px = (steps_px - disparity_px[:, None]).abs()
+    window_px = _WINDOW * disparity_px.clamp(min=1)[:, None]
+    # Each whole disparity stands for the half pixel on both sides of it.
+    share = (window_px + 0.5 - distance_px).clamp(0, 1)
+    return (probability * share).sum(1).clamp(0, 1)
+
+
+class SkyHead(nn.Module):
+    """Probability of the sky at 1/4 size; it begins as unlikely everywhere.
+
+    Args:
+        widths: channels of the left view's features at 1/4, 1/8, 1/16 and 1/32.
+    """
+
+    def __init__(self, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        quarter, *coarser = widths
+        deepest = len(coarser) - 1
+        self.coarse = nn.ModuleList(
+            conv_norm_2d(w if k == deepest else w + _SKY_WIDTH, _SKY_WIDTH)
+            for k, w in enumerate(coarser)
+        )
+        self.hidden = conv_norm_2d(quarter + _SKY_WIDTH + 2, _SKY_WIDTH)
+        self.logit = nn.Conv2d(_SKY_WIDTH, 1, 1)
+        nn.init.zeros_(self.logit.weight)
+        assert self.logit.bias is not None
+        nn.init.constant_(self.logit.bias, -2.0)
+
+    def forward(
+        self, levels: tuple[Features, ...], quarter_px: Quarter, confidence: Quarter
+    ) -> Quarter:
+        """Tell the sky by features of the left view, and by its match, which learns nothing.
+
+        Where the match is near and its confidence high, there is no sky.
+        """
+        quarter, *coarser = levels
+        found: list[Tensor] = []
+        for layer, level in zip(reversed(self.coarse), reversed(coarser), strict=True):
+            x = F.relu(layer(torch.cat([level, *found], 1)))
+            found = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
+        match = torch.stack([confidence, quarter_px / _USUAL_PX], 1).detach()
+        hidden = F.relu(self.hidden(torch.cat([quarter, *found, match.to(quarter)], 1)))
+        return self.logit(hidden)[:, 0].to(confidence).sigmoid()
+
+
+class Reading(NamedTuple):
+    """What the scores say about the left view.
+
+    Attributes:
+        heads: disparity [px], the last one the answer: while training that of all scores, enlarged
+            without the image, that before the refinement, and that after it; in eval mode the last
+            alone. What it says in the sky means nothing where the network has that class.
+        confidence: 0..1, in the sky its probability; None where it was not asked for.
+        sky: probability of the sky, or None where the network has no such class. In eval mode at
+            most a half where the confidence of the match is higher: white walls look like the sky.
+    """
+
+    heads: tuple[Maps, ...]
+    confidence: Maps | None
+    sky: Maps | None
+
 
 Volume = Float[Tensor, "b _ _ _ _"]
 
@@ -242,7 +490,11 @@ class LightStereo(StereoNetwork):
         coarse_px = mean_of_all(scores)[:, None] if self.training else None
         del scores
         found_px, *rest = self.enlarge(torch.stack(quarters, 1), seen).unbind(1)
-        heads = (found_px,) if self.refinement is None else (found_px, self.refine(found_px, seen))
+        heads = (found_px,)
+        if self.refinement is not None:
+            parts = (found_px, seen.left.half, seen.right_half)
+            half_rows = None if self.rows is None else 2 * self.rows
+            heads = (found_px, by_rows(self.refinement, parts, halo=5, rows=half_rows))
         if coarse_px is None:
             heads = heads[-1:]
         else:
@@ -281,30 +533,19 @@ class LightStereo(StereoNetwork):
         parts = (quarters, seen.left.half, seen.left.levels[0], seen.right_half)
         return by_rows(enlarged, parts, halo=2, rows=self.rows)
 
-    def refine(self, found_px: Maps, seen: Seen) -> Maps:
-        """Correct an enlarged disparity, where the network has that part."""
-        refinement = self.refinement
-        if refinement is None:
-            return found_px
-
-        def refined(found_px: Maps, left_half: Features, right_half: Features) -> Maps:
-            return refinement(Seen(ViewFeatures(left_half, ()), right_half), found_px)
-
-        half = None if self.rows is None else 2 * self.rows
-        parts = (found_px, seen.left.half, seen.right_half)
-        return by_rows(refined, parts, halo=5, rows=half)
-
     def scores(
-        self,
-        left: Float[Tensor, "b 3 h w"],
-        right: Float[Tensor, "b 3 h w"],
-        max_disparity_px: int,
+        self, left: Float[Tensor, "b 3 h w"], right: Float[Tensor, "b 3 h w"], max_disparity_px: int
     ) -> tuple[Scores, Seen]:
         """Answer a score for each disparity at 1/4 size, and what the enlargement sees.
 
         Scores are float32 at least: 8 bits would round the expectation to whole pixels.
         """
-        self._check_size(left)
+        h, w = left.shape[-2:]
+        if h % 32 or w % 32:
+            raise InputError(
+                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
+                "pair, as LightMatcher does"
+            )
         near, far = self.features(left), self.features(right)
         described = self.describe(near.levels[0]), self.describe(far.levels[0])
         compares = self.config.with_agreement or self.config.with_refinement
@@ -314,11 +555,3 @@ class LightStereo(StereoNetwork):
         scores = self.aggregation(*described, bins, near.levels, self.rows)
         wide = torch.promote_types(scores.dtype, torch.float32)
         return scores.to(wide), Seen(near, right_half)
-
-    def _check_size(self, image: Float[Tensor, "b 3 h w"]) -> None:
-        h, w = image.shape[-2:]
-        if h % 32 or w % 32:
-            raise InputError(
-                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
-                "pair, as LightMatcher does"
-            )

@@ -8,10 +8,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import fields, replace
-from functools import partial
-from itertools import chain
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +21,7 @@ from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
 from depthpose.depth.disparity import (
+    changed_match,
     focal_size,
     left_right_difference_px,
     resize_image,
@@ -30,7 +29,6 @@ from depthpose.depth.disparity import (
 )
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.matcher import check_pair
-from depthpose.depth.stereo.plan import Tiling, match_tiles
 from depthpose.depth.types import Match
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -84,7 +82,7 @@ class NetworkMatcher(ABC):
     """Pixels of a fine match at most."""
     most_enlarged: ClassVar[float] = 1.0
     """Times the size of the images at which a fine match may be."""
-    most_reach: ClassVar[float] = 1.5
+    most_disparities: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
 
     def __init__(self, network: NetworkConfig, config: MatcherConfig | None = None) -> None:
@@ -134,14 +132,18 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        if camera is None or self.network_config.work_focal_px is None:
-            return self._match_alike(pairs, self.network_config)
+        trained = self.network_config
+        if camera is None or trained.work_focal_px is None:
+            return self._match_alike(pairs, trained)
         size = self.work_size(camera)
-        network = self._reaching(self.work_focal_px(camera))
-        seen = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
-        found = self._match_alike(seen, network)
+        # A larger size needs more disparities; the same filters look through them.
+        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
+        steps = math.ceil(round(trained.max_disparity_px * larger, 3) / trained.step_px)
+        network = replace(trained, max_disparity_px=steps * trained.step_px)
+        resized = [(resize_image(one, *size), resize_image(other, *size)) for one, other in pairs]
+        matches = self._match_alike(resized, network)
         sizes = [left.shape[1:] for left, _ in pairs]
-        return [resized_match(match, *own) for match, own in zip(found, sizes, strict=True)]
+        return [resized_match(match, *own) for match, own in zip(matches, sizes, strict=True)]
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
         """Rows and columns at which images of a camera are matched [px]."""
@@ -159,82 +161,46 @@ class NetworkMatcher(ABC):
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
         return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
 
-    def _reaching(self, focal_px: float) -> NetworkConfig:
-        """Give the network with the disparities that a larger size needs."""
-        trained = self.network_config
-        assert trained.work_focal_px is not None
-        larger = min(focal_px / trained.work_focal_px, self.most_reach)
-        reach_px = round(trained.max_disparity_px * larger, 3)
-        step_px = trained.step_px
-        return replace(trained, max_disparity_px=step_px * math.ceil(reach_px / step_px))
-
     def _match_alike(
         self, pairs: Sequence[tuple[Tensor, Tensor]], network: NetworkConfig
     ) -> list[Match]:
-        with_tiles = self.config.tile_px is not None
-        is_alone = with_tiles or self.config.max_memory_bytes is not None
-        if is_alone or len({left.shape for left, _ in pairs}) > 1:
-            groups = [[pair] for pair in pairs]
-        else:
-            groups = [list(pairs)]
-        found = [self._match(group, network, with_tiles=with_tiles) for group in groups]
-        return list(chain(*found))
+        """Match pairs at the size that they have: all together, or each alone."""
+        is_bounded = self.config.tile_px is not None or self.config.max_memory_bytes is not None
+        together = not is_bounded and len({left.shape for left, _ in pairs}) == 1
+        home = pairs[0][0].device
+        matches: list[Match] = []
+        for group in [pairs] if together else [[pair] for pair in pairs]:
+            left, right = (
+                normalise(torch.stack(views).to(self.device, torch.float32))
+                for views in zip(*group, strict=True)
+            )
+            seen = self._match_one_way(left, right, network)
+            if self.config.with_left_right_check:
+                mirrored = self._match_one_way(right.flip(-1), left.flip(-1), network)
+                other_px = [match.disparity_px.flip(-1) for match in mirrored]
+                seen = list(map(lower_where_disagreeing, seen, other_px))
+            matches += [changed_match(match, lambda values: values.to(home)) for match in seen]
+        return matches
 
-    def _match(
-        self, pairs: list[tuple[Tensor, Tensor]], network: NetworkConfig, *, with_tiles: bool
-    ) -> list[Match]:
-        """Match pairs of one size together."""
-        views = [self._normalised(torch.stack(list(of))) for of in zip(*pairs, strict=True)]
-        way = self._match_tiled if with_tiles else self._match_padded
-        found = self._match_both_ways(partial(way, network=network), views[0], views[1])
-        return [_moved(match, pairs[0][0].device) for match in found]
+    def _match_one_way(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
+        """Match normalised pairs of any size: in tiles, or padded and cropped back."""
+        if self.config.tile_px is not None:
+            tiling = Tiling(
+                *self.config.tile_px, self.config.tile_overlap_px, network.max_disparity_px
+            )
 
-    def _normalised(self, views: Views) -> Views:
-        return normalise(views.to(self.device, torch.float32))
+            def match_tile(one: Tensor, other: Tensor) -> Match:
+                return self._match_padded(one[None], other[None], network)[0]
 
-    def _match_both_ways(
-        self, one_way: Callable[[Views, Views], list[Match]], left: Views, right: Views
-    ) -> list[Match]:
-        found = one_way(left, right)
-        if self.config.with_left_right_check:
-            mirrored = one_way(right.flip(-1), left.flip(-1))
-            found = [
-                lower_where_disagreeing(match, other.disparity_px.flip(-1))
-                for match, other in zip(found, mirrored, strict=True)
+            return [
+                match_tiles(match_tile, *pair, tiling) for pair in zip(left, right, strict=True)
             ]
-        return found
-
-    def _match_tiled(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
-        assert self.config.tile_px is not None
-        reach = network.max_disparity_px
-        tiling = Tiling(*self.config.tile_px, self.config.tile_overlap_px, reach)
-
-        def match_tile(one: Tensor, other: Tensor) -> Match:
-            return self._match_padded(one[None], other[None], network)[0]
-
-        both = zip(left, right, strict=True)
-        return [match_tiles(match_tile, one, other, tiling) for one, other in both]
+        return self._match_padded(left, right, network)
 
     def _match_padded(self, left: Views, right: Views, network: NetworkConfig) -> list[Match]:
-        """Match normalised pairs of any size: pad, run, crop back."""
         h, w = left.shape[-2:]
-        found = self.run(pad_top_right(left, network), pad_top_right(right, network), network)
-        return [_cropped(match, h, w) for match in found]
-
-
-def _cropped(match: Match, height: int, width: int) -> Match:
-    return _changed(match, lambda values: values[-height:, :width])
-
-
-def _moved(match: Match, device: torch.device) -> Match:
-    return _changed(match, lambda values: values.to(device))
-
-
-def _changed(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
-    """Give a match with every map of it changed alike."""
-    maps = {field.name: getattr(match, field.name) for field in fields(match)}
-    known = {name: change(values) for name, values in maps.items() if values is not None}
-    return Match(**known)
+        padded = self.run(pad_top_right(left, network), pad_top_right(right, network), network)
+        return [changed_match(match, lambda values: values[-h:, :w]) for match in padded]
 
 
 def with_usable_precision(config: MatcherConfig) -> MatcherConfig:
@@ -295,3 +261,75 @@ def tile_change_px(
     whole.config = replace(matcher.config, tile_px=None)
     tiled, untiled = (one.match_many([(left, right)], camera)[0] for one in (matcher, whole))
     return float((tiled.disparity_px - untiled.disparity_px).abs().mean())
+
+
+Image = Float[Tensor, "3 h w"]
+
+
+class Tiling(NamedTuple):
+    """Size of a tile's own part, what neighbours share, and what lies to the left besides [px].
+
+    A left pixel at x matches a right one at x - disparity, so each tile sees
+    ``max_disparity_px`` more columns on its left than it answers for.
+    """
+
+    rows: int
+    columns: int
+    overlap: int
+    max_disparity_px: int
+
+
+class Span(NamedTuple):
+    """One tile along one axis: what it sees, from where it counts, and its weights there."""
+
+    seen: slice
+    counted: slice
+    weight: Float[Tensor, " n"]
+
+
+def match_tiles(
+    match: Callable[[Image, Image], Match], left: Image, right: Image, tiling: Tiling
+) -> Match:
+    """Match tile by tile and blend the answers linearly where tiles overlap."""
+    h, w = left.shape[-2:]
+    total = left.new_zeros(4, h, w)
+    with_confidence = with_sky = True
+    for y in _spans(h, tiling.rows, tiling.overlap, 0):
+        for x in _spans(w, tiling.columns, tiling.overlap, tiling.max_disparity_px):
+            tile = match(left[:, y.seen, x.seen], right[:, y.seen, x.seen])
+            inner = (_inside(y), _inside(x))
+            weight = (y.weight[:, None] * x.weight).to(left)
+            total[0, y.counted, x.counted] += weight
+            total[1, y.counted, x.counted] += weight * tile.disparity_px[inner]
+            with_confidence, with_sky = tile.confidence is not None, tile.is_sky is not None
+            if tile.confidence is not None:
+                total[2, y.counted, x.counted] += weight * tile.confidence[inner]
+            if tile.is_sky is not None:
+                total[3, y.counted, x.counted] += weight * tile.is_sky[inner]
+    disparity_px, confidence, sky = total[1:] / total[0]
+    return Match(
+        disparity_px=disparity_px,
+        confidence=confidence if with_confidence else None,
+        is_sky=sky > 0.5 if with_sky else None,
+    )
+
+
+def _inside(span: Span) -> slice:
+    first = span.counted.start - span.seen.start
+    return slice(first, first + span.counted.stop - span.counted.start)
+
+
+def _spans(length: int, step: int, overlap: int, max_disparity_px: int) -> list[Span]:
+    spans = []
+    for own_first in range(0, length, step):
+        own_stop = min(own_first + step, length)
+        first, stop = max(own_first - overlap, 0), min(own_stop + overlap, length)
+        at = torch.arange(first, stop) + 0.5
+        ramp = max(2 * overlap, 1)
+        rising = (at - own_first + overlap) / ramp if own_first else torch.ones_like(at)
+        falling = (own_stop + overlap - at) / ramp if own_stop < length else torch.ones_like(at)
+        weight = rising.clamp(0, 1) * falling.clamp(0, 1)
+        spans.append(
+            Span(slice(max(first - max_disparity_px, 0), stop), slice(first, stop), weight)
+        )
+    return spans

@@ -6,12 +6,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from depthpose.core.checkpoint import (
-    Checkpoint,
-    file_sha256,
-    read_published,
-    save_checkpoint,
-)
+from depthpose.core.checkpoint import Checkpoint, file_sha256, read_published, save_checkpoint
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from depthpose.core.arrays import check_image
 from depthpose.core.devices import usable_device
 from depthpose.depth.config import GeneratorConfig, SelectionConfig, Speed
-from depthpose.depth.synthesis.generator import UNetGenerator
-from depthpose.depth.synthesis.selection import (
+from depthpose.depth.synthesis.networks import (
     Selected,
     SelectionGenerator,
+    UNetGenerator,
     average,
     select,
     shift_left,
@@ -110,20 +110,25 @@ class SelectionSynthesiser:
         Raises:
             InputError: an image is no such.
         """
-        given = [_checked(images, self.device) for images in (left, *larger)]
+        sizes = [_checked(images, self.device) for images in (left, *larger)]
         size = (left.shape[-2], left.shape[-1])
-        views = [select_views(self.generator, images, size) for images in given]
         most_px = float(self.generator.planes[-1])
-        limits_px = [most_px * size[1] / images.shape[-1] for images in given]
-        seen, other = (average(list(each), limits_px) for each in zip(*views, strict=True))
-        parts = {
-            "right": shift_left(given[0], other.shift_px),
-            "disparity_px": seen.disparity_px,
-            "confidence": seen.confidence,
-            "is_sky": seen.is_sky,
-        }
-        parts |= {} if seen.street is None else {"street": seen.street}
-        return SynthesisedViews(**{name: part.to(left.device) for name, part in parts.items()})
+        limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
+        lefts: list[Selected] = []
+        rights: list[Selected] = []
+        for images in sizes:
+            of_left, of_right = select_views(self.generator, images, size)
+            lefts.append(of_left)
+            rights.append(of_right)
+        seen = average(lefts, limits_px)
+        home = left.device
+        return SynthesisedViews(
+            right=shift_left(sizes[0], average(rights, limits_px).shift_px).to(home),
+            disparity_px=seen.disparity_px.to(home),
+            confidence=seen.confidence.to(home),
+            is_sky=seen.is_sky.to(home),
+            street=None if seen.street is None else seen.street.to(home),
+        )
 
 
 class UNetSynthesiser:
@@ -182,8 +187,8 @@ def select_views(
     size = (height, width) if size is None else size
     multiple = generator.config.side_multiple_px
     # Even, since logits stand for two rows and two columns.
-    rows = _even(_near_multiple(height, multiple, ROWS_SHARE))
-    columns = _even(_near_multiple(width, multiple, COLUMNS_SHARE))
+    rows = max(_near_multiple(height, multiple, ROWS_SHARE) // 2 * 2, 2)
+    columns = max(_near_multiple(width, multiple, COLUMNS_SHARE) // 2 * 2, 2)
     padded = pad_to_multiple(_resized(left, rows, columns), multiple)
     features = generator.encoder(padded)
     kept = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
@@ -213,10 +218,6 @@ def draw_right(generator: Generator, left: Float[Tensor, "b 3 h w"]) -> Float[Te
 def _near_multiple(side_px: int, multiple: int, share: float) -> int:
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
-
-
-def _even(side_px: int) -> int:
-    return max(side_px // 2 * 2, 2)
 
 
 def _resized(

@@ -1,13 +1,13 @@
 """Synthetic street scenes with exact disparity: training data that costs nothing."""
 
-from depthpose.depth.synthetic.clutter import make_clutter as make_clutter
 from depthpose.depth.synthetic.dataset import StreetFrame as StreetFrame
 from depthpose.depth.synthetic.dataset import Streets as Streets
+from depthpose.depth.synthetic.dataset import camera_from_velodyne as camera_from_velodyne
 from depthpose.depth.synthetic.dataset import draw_scene as draw_scene
 from depthpose.depth.synthetic.dataset import draw_street as draw_street
 from depthpose.depth.synthetic.scene import StreetScene as StreetScene
 from depthpose.depth.synthetic.scene import kitti_rig as kitti_rig
+from depthpose.depth.synthetic.scene import make_clutter as make_clutter
 from depthpose.depth.synthetic.scene import make_scene as make_scene
 from depthpose.depth.synthetic.scene import rig_number as rig_number
 from depthpose.depth.synthetic.scene import street_rig as street_rig
-from depthpose.depth.synthetic.sensor import camera_from_velodyne as camera_from_velodyne

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from depthpose.depth.synthetic.materials import Color, Number, Surface
 from depthpose.depth.synthetic.mesh import MeshBuilder
+from depthpose.depth.synthetic.textures import Color, Number, Surface
 
 _PLASTERS: list[Color] = [
     (0.62, 0.57, 0.46), (0.58, 0.47, 0.26), (0.5, 0.5, 0.5), (0.55, 0.36, 0.28), (0.36, 0.4, 0.35),
@@ -198,13 +198,7 @@ def _add_frames(
     low, high = windows[:, 0, 1], windows[:, 2, 1]
     middle, bar = (left + right) / 2, 0.07
     cells = lambda x0, x1, y0, y1: np.stack(  # noqa: E731
-        [
-            np.stack([x0, y0], 1),
-            np.stack([x1, y0], 1),
-            np.stack([x1, y1], 1),
-            np.stack([x0, y1], 1),
-        ],
-        1,
+        [np.stack(corner, 1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1
     )
     frames = np.concatenate(
         [

@@ -1,23 +1,391 @@
-"""Synthetic street scenes as a dataset: both views, disparity, occlusion and a LiDAR scan."""
+"""Synthetic street scenes as a dataset: both views, disparity, occlusion and a LiDAR scan.
 
-from dataclasses import dataclass
+First what a camera sees at its pixels and the light of it; then the sensors, from light to a
+picture, and a LiDAR of 64 beams as KITTI's; then frames and the dataset of them.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
+from depthpose.core.render import Raster, barycentric_shares, edge_functions, rasterize
+from depthpose.depth.augment import through_jpeg
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.synthetic.clutter import make_clutter
-from depthpose.depth.synthetic.materials import NUMBER
-from depthpose.depth.synthetic.scene import StreetScene, make_scene, street_rig
-from depthpose.depth.synthetic.sensor import draw_sensors, expose, scan
-from depthpose.depth.synthetic.stage import Stage, prepare
-from depthpose.depth.synthetic.view import Sight, draw_light, look, nearest_at, neighbours
+from depthpose.depth.synthetic.scene import StreetScene, make_clutter, make_scene, street_rig
+from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_light
+from depthpose.depth.synthetic.textures import NUMBER
 from depthpose.depth.types import StereoInput, StereoSample, StereoTruth
+
+NEAR_M = 0.3
+
+Seen = tuple[Int[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, " n"]]
+"""Triangles (-1 where none is met), barycentric shares and depths [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sight:
+    """Visibility from one camera.
+
+    Attributes:
+        raster: visibility at the pixel centres.
+        K: intrinsic matrix.
+        eye: position of the camera in the left camera's frame [m]; it looks along z.
+        edges: edge functions of all triangles; see ``core.render``.
+        volume: what they are divided by.
+    """
+
+    raster: Raster
+    K: Float64[Tensor, "3 3"]
+    eye: Float[Tensor, "3"]
+    edges: Float64[Tensor, "n 3 3"]
+    volume: Float64[Tensor, " n"]
+
+    def rays(self, pixels: Float64[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+        """Directions of pixels, with z = 1."""
+        (a, b, c), (_, d, e), _ = self.K.inverse().tolist()
+        u, v = pixels.unbind(1)
+        return torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
+
+
+def look(
+    stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
+) -> Sight:
+    """Find what each pixel sees.
+
+    Args:
+        stage: the scene.
+        K: intrinsic matrix.
+        size: height and width of the picture [px].
+        eye: position of the camera in the left camera's frame [m].
+    """
+    corners = stage.corners - eye
+    raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)
+    edges, volume = edge_functions(corners, K)
+    shares = barycentric_shares(edges, volume, raster.primitive)
+    raster = replace(raster, barycentric=shares)
+    return Sight(raster=raster, K=K, eye=eye, edges=edges, volume=volume)
+
+
+def nearest_at(
+    sight: Sight, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
+) -> list[Seen]:
+    """Look between the pixel centres, at triangles that were seen near by.
+
+    Args:
+        sight: from where.
+        candidates: triangles that may be met; -1 none.
+        places: one or more lists of pixels (u, v) [px], which share their candidates.
+
+    Returns:
+        For each list, the nearest of the candidates on each pixel's ray.
+    """
+    which = candidates.clamp(min=0).flatten()
+    volume = sight.volume.index_select(0, which)[:, None]
+    lines = (sight.edges.flatten(1).index_select(0, which) / volume).unflatten(0, candidates.shape)
+    missing, row = candidates < 0, torch.arange(len(candidates))
+    found = []
+    for pixels in places:
+        u, v = pixels[:, :1], pixels[:, 1:]
+        # Corner by corner: a sum over so short an axis would take ten times as long.
+        weights = [
+            torch.addcmul(lines[..., i + 2], lines[..., i], u).addcmul_(lines[..., i + 1], v)
+            for i in (0, 3, 6)
+        ]
+        inverse = weights[0] + weights[1] + weights[2]
+        least = torch.minimum(torch.minimum(weights[0], weights[1]), weights[2])
+        is_missed = (least < -1e-9) | missing | ~(inverse < 1 / NEAR_M)
+        inverse, first = inverse.masked_fill_(is_missed, 0).clamp_(min=0).max(1)
+        primitive = torch.where(inverse > 0, candidates[row, first], -1)
+        chosen = torch.stack([weight[row, first] for weight in weights], 1)
+        shares = (chosen / inverse[:, None]).float()
+        found.append((primitive, shares, (1 / inverse).float()))
+    return found
+
+
+def neighbours(primitive: Int[Tensor, "h w"], index: Int[Tensor, " n"]) -> Int[Tensor, "n 5"]:
+    """Triangles seen at some pixels and at the four beside each."""
+    height, width = primitive.shape
+    column, row = index % width, index // width
+    places = [
+        (row + y).clamp(0, height - 1) * width + (column + x).clamp(0, width - 1)
+        for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    flat = primitive.flatten()
+    return torch.stack([flat.index_select(0, place) for place in places], 1)
+
+
+_OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
+"""Where in an edge pixel light is sampled: a turned square, which treats no direction badly."""
+
+
+def draw_light(stage: Stage, sight: Sight, *, with_antialiasing: bool) -> Float[Tensor, "h w 3"]:
+    """Give linear RGB, before any sensor.
+
+    Args:
+        stage: what is drawn.
+        sight: from where it is seen.
+        with_antialiasing: take four samples in pixels where an edge shows.
+    """
+    height, width = sight.raster.primitive.shape
+    is_edge = torch.zeros(height * width, dtype=torch.bool)
+    if with_antialiasing:
+        is_edge = _edge_pixels(stage, sight.raster).flatten()
+    light = torch.zeros(height * width, 3)
+    whole, mixed = (~is_edge).nonzero()[:, 0], is_edge.nonzero()[:, 0]
+    light[whole] = _light(stage, sight, _centres(whole, width), _seen_at(sight, whole))
+    if len(mixed):
+        light[mixed] = _light_of_edges(stage, sight, mixed)
+    return light.reshape(height, width, 3)
+
+
+def _centres(index: Int[Tensor, " n"], width: int) -> Float64[Tensor, "n 2"]:
+    return torch.stack([index % width, index // width], 1).double()
+
+
+def _seen_at(sight: Sight, index: Int[Tensor, " n"]) -> Seen:
+    raster = sight.raster
+    assert raster.barycentric is not None
+    shares, primitive, depth_m = (
+        values.flatten(0, 1).index_select(0, index)
+        for values in (raster.barycentric, raster.primitive, raster.depth_m)
+    )
+    return primitive, shares, depth_m
+
+
+def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
+    """Pixels beside which something else is seen, or the same thing bent sharply."""
+    seen = raster.primitive.clamp(min=0)
+    kind = torch.where(raster.primitive >= 0, stage.kind[seen], -1)
+    normal = stage.attributes[:, 18:21].index_select(0, seen.flatten()).unflatten(0, seen.shape)
+    edge = torch.zeros_like(kind, dtype=torch.bool)
+    for one, other in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+    ):
+        is_other = raster.primitive[one] != raster.primitive[other]
+        is_bent = _aligned(normal[one], normal[other]) < 0.9
+        differs = is_other & ((kind[one] != kind[other]) | is_bent)
+        edge[one] |= differs
+        edge[other] |= differs
+    return edge
+
+
+def _aligned(one: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    both = one * other
+    return (both[..., 0] + both[..., 1] + both[..., 2]).abs()
+
+
+def _light_of_edges(stage: Stage, sight: Sight, mixed: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+    """Mean light of four places in each edge pixel."""
+    candidates = neighbours(sight.raster.primitive, mixed)
+    centre = _centres(mixed, sight.raster.primitive.shape[1])
+    own = _seen_at(sight, mixed)
+    places = [centre + torch.tensor(offset, dtype=torch.float64) for offset in _OFFSETS]
+    found = []
+    for seen in nearest_at(sight, candidates, places):
+        # A gap between all that was seen near by: take what the pixel's centre sees.
+        is_lost = (seen[0] < 0) & (candidates >= 0).all(1)
+        found.append([
+            torch.where(is_lost if one.ndim == 1 else is_lost[:, None], instead, one)
+            for one, instead in zip(seen, own, strict=True)
+        ])  # fmt: skip
+    primitive, shares, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
+    light = _light(stage, sight, torch.cat(places), (primitive, shares, depth))
+    # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
+    return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
+
+
+def _light(
+    stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], seen: Seen
+) -> Float[Tensor, "n 3"]:
+    primitive, shares, depth = seen
+    rays = sight.rays(pixels)
+    length = rays.norm(dim=1)
+    towards = rays / length[:, None]
+    light = torch.empty_like(rays)
+    sky = (primitive < 0).nonzero()[:, 0]
+    light[sky] = sky_light(stage, towards[sky])
+    hit = (primitive >= 0).nonzero()[:, 0]
+    hits = Hits(
+        primitive=primitive.index_select(0, hit),
+        barycentric=shares.index_select(0, hit),
+        points=(rays * depth[:, None] + sight.eye).index_select(0, hit),
+        towards=towards.index_select(0, hit),
+        distance_m=(length * depth).index_select(0, hit),
+    )
+    light[hit] = shade(stage, hits, float(sight.K[0, 0]))
+    return light
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """How one camera of a pair turns light into numbers.
+
+    Attributes:
+        exposure: factor of the light, by channel.
+        blur: share of a pixel's light that falls on its neighbours, in each direction.
+        glare: share of the light that the lens scatters widely.
+        black: light below which there is only black.
+        vignette: loss in the corners.
+        noise: deviation of full light's noise, and of darkness'.
+        gamma: exponent of the tone curve.
+        jpeg_quality: None: not compressed.
+        noise_seed: of this picture.
+    """
+
+    exposure: tuple[float, float, float]
+    blur: float
+    glare: float
+    black: float
+    vignette: float
+    noise: tuple[float, float]
+    gamma: float
+    jpeg_quality: int | None
+    noise_seed: int
+
+
+def draw_sensors(
+    rng: np.random.Generator, light: Float[Tensor, "h w 3"], jpeg_share: float
+) -> tuple[Sensor, Sensor]:
+    """Draw the cameras of a pair: alike, but for a little gain and colour.
+
+    Args:
+        rng: random numbers.
+        light: what the left one receives; the exposure is set by it, sky aside.
+        jpeg_share: how many pictures are compressed.
+    """
+    luminance = light.mean(-1)
+    metered = luminance[len(luminance) // 3 :].clamp(max=1.2).mean() + 1e-3
+    # Rounded, for the last bits of a long mean depend on how many threads took part.
+    exposure = float(f"{float(0.27 / metered):.4g}") * float(np.exp(rng.normal(0, 0.28)))
+    white = np.exp(rng.normal(0, 0.035, 3))
+    is_jpeg = bool(rng.random() < jpeg_share)
+    common = {
+        "blur": rng.uniform(0.0, 0.22),
+        "glare": rng.uniform(0, 0.02),
+        "black": rng.uniform(0, 0.025),
+        "vignette": rng.uniform(0, 0.2),
+        "noise": (rng.uniform(0.004, 0.025), rng.uniform(0.0005, 0.004)),
+        "gamma": rng.uniform(1.6, 2.1),
+        "jpeg_quality": int(rng.integers(75, 98)) if is_jpeg else None,
+    }
+    gain = np.exp(rng.normal(0, 0.02) + rng.normal(0, 0.006, 3))
+    seeds = rng.integers(1 << 31, size=2)
+    left, right = (
+        Sensor(exposure=tuple((exposure * white * factor).tolist()), noise_seed=int(seed), **common)
+        for factor, seed in ((1.0, seeds[0]), (gain, seeds[1]))
+    )
+    return left, right
+
+
+def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
+    """Take a picture: RGB in [0, 1], in steps of 1/255."""
+    signal = light.permute(2, 0, 1) * torch.tensor(sensor.exposure)[:, None, None]
+    height, width = signal.shape[1:]
+    y = torch.linspace(-1, 1, height)[:, None] * height / width
+    x = torch.linspace(-1, 1, width)[None]
+    signal = signal * (1 - sensor.vignette * (x**2 + y**2) / 1.1)
+    signal = _blurred(_with_glare(signal, sensor.glare), sensor.blur)
+    generator = torch.Generator().manual_seed(sensor.noise_seed)
+    shot, dark = sensor.noise
+    deviation = (signal * shot**2 + dark**2).sqrt()
+    signal = signal + torch.randn(signal.shape, generator=generator) * deviation
+    # A shoulder before white, as cameras have; the brightest is lost all the same.
+    signal = (signal - sensor.black) / (1 - sensor.black)
+    signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
+    picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
+    return picture if sensor.jpeg_quality is None else through_jpeg(picture, sensor.jpeg_quality)
+
+
+def _with_glare(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h w"]:
+    height, width = signal.shape[1:]
+    small = F.adaptive_avg_pool2d(
+        signal.clamp(max=6)[None], (max(height // 32, 1), max(width // 32, 1))
+    )
+    wide = F.interpolate(F.avg_pool2d(small, 3, 1, 1), (height, width), mode="bilinear")[0]
+    return torch.lerp(signal.clamp(max=8), wide, share)
+
+
+def _blurred(signal: Float[Tensor, "3 h w"], share: float) -> Float[Tensor, "3 h w"]:
+    for axis in (1, 2):
+        size = signal.shape[axis]
+        before = signal.narrow(axis, 0, 1), signal.narrow(axis, 0, size - 1)
+        after = signal.narrow(axis, 1, size - 1), signal.narrow(axis, size - 1, 1)
+        beside = torch.cat(before, axis) + torch.cat(after, axis)
+        signal = signal * (1 - share) + beside * (share / 2)
+    return signal
+
+
+_BEAMS_RAD = np.deg2rad(np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.87, -24.33, 32)]))
+_TURN_RAD = np.deg2rad(np.arange(-44.5, 44.5, 0.1728))
+"""Elevations of the beams, and the turns that lie in the cameras' sight."""
+
+_ORIGIN_M = (0.056, -0.076, -0.272)
+"""Its place in the left camera's frame: a little above and behind."""
+
+_SIZE_PX = (440, 1200)
+_FOCAL_PX = 600.0
+_MAX_RANGE_M = 115.0
+_NOISE_M = 0.015
+
+
+def camera_from_velodyne() -> Float64[np.ndarray, "4 4"]:
+    """Give the transform from the LiDAR (x forward, y left, z up) to the left camera."""
+    transform = np.eye(4)
+    transform[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    transform[:3, 3] = _ORIGIN_M
+    return transform
+
+
+def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
+    """Scan a stage: x forward, y left, z up [m] and reflectance, a row a return.
+
+    Hits of the beams are exact: a wide picture from the LiDAR's place shows which triangles are
+    near each beam, and these are intersected.
+    """
+    tilt, turn = (
+        torch.from_numpy(a.ravel()) for a in np.meshgrid(_BEAMS_RAD, _TURN_RAD, indexing="ij")
+    )
+    towards = torch.stack([tilt.cos() * turn.sin(), -tilt.sin(), tilt.cos() * turn.cos()], 1)
+    height, width = _SIZE_PX
+    K = torch.tensor(
+        [[_FOCAL_PX, 0, width / 2], [0, _FOCAL_PX, 40], [0, 0, 1]], dtype=torch.float64
+    )
+    sight = look(stage, K, _SIZE_PX, torch.tensor(_ORIGIN_M))
+    pixels = (towards @ K.T)[:, :2] / towards[:, 2:]
+    column = pixels[:, 0].round().long().clamp(0, width - 1)
+    row = pixels[:, 1].round().long().clamp(0, height - 1)
+    candidates = neighbours(sight.raster.primitive, row * width + column)
+    primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
+    range_m = depth_m / towards[:, 2]
+    returned = _returned(stage, rng, primitive, range_m)
+    noise = torch.from_numpy(rng.normal(0, _NOISE_M, len(returned)))
+    far = range_m[returned].double() + noise
+    x, y, z = (towards[returned] * far[:, None]).unbind(1)
+    light = stage.attributes[primitive[returned], 15:18].mean(1).clamp(0.02, 0.99)
+    return torch.stack([z, -x, -y, light.double()], 1).float()
+
+
+def _returned(
+    stage: Stage, rng: np.random.Generator, primitive: Tensor, range_m: Tensor
+) -> Int[Tensor, " m"]:
+    """Which beams come back: few from glass, fewer from afar and from what is dark."""
+    chance = torch.from_numpy(rng.random(len(primitive)))
+    seen = primitive.clamp(min=0)
+    material = stage.material[seen]
+    is_glass = (material == NUMBER["glass"]) | (material == NUMBER["pane"])
+    dark = (0.12 - stage.attributes[seen, 15:18].mean(1)).clamp(min=0) * 2.5
+    lost = 0.03 + 0.0025 * range_m + 0.65 * is_glass + dark * (range_m / 40).clamp(max=1)
+    kept = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost)
+    return kept.nonzero()[:, 0]
+
 
 _OCCLUSION_SHARE = 1e-4
 """What is nearer by this share of the depth hides a point; less is the point itself, rounded."""
@@ -65,15 +433,10 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
     if index < 0:
         raise InputError(f"index is {index}, but frames are counted from 0; take another")
     rig, mount_height_m = street_rig(config, index)
-    scene = _make_scene(config, index, mount_height_m)
-    return draw_scene(scene, rig, config, (config.seed, index))
-
-
-def _make_scene(config: StreetsConfig, index: int, mount_height_m: float) -> StreetScene:
     seed = (config.seed, index)
-    if np.random.default_rng([75, *seed]).random() < config.clutter_share:
-        return make_clutter(seed)
-    return make_scene(seed, mount_height_m)
+    is_clutter = np.random.default_rng([75, *seed]).random() < config.clutter_share
+    scene = make_clutter(seed) if is_clutter else make_scene(seed, mount_height_m)
+    return draw_scene(scene, rig, config, seed)
 
 
 def draw_scene(
@@ -91,7 +454,11 @@ def draw_scene(
     rng = np.random.default_rng([73, *seed])
     stage = prepare(scene, rig.width * rig.height)
     left = look(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
-    right = _look_right(stage, rig, rng.normal(0, 1) * config.rectification_error_px)
+    # The right camera, whose rows are off by a fraction of a pixel as real ones are.
+    K = rig.K.clone()
+    K[0, 2] += rig.cx_right_minus_left_px
+    K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
+    right = look(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
     light, other_light = (
         draw_light(stage, sight, with_antialiasing=config.with_antialiasing)
         for sight in (left, right)
@@ -112,15 +479,6 @@ def draw_scene(
         lidar_points=points,
         rig=rig,
     )
-
-
-def _look_right(stage: Stage, rig: StereoRig, rows_px: float) -> Sight:
-    """See with the right camera, whose rows are off by a fraction of a pixel as real ones are."""
-    K = rig.K.clone()
-    K[0, 2] += rig.cx_right_minus_left_px
-    K[1, 2] += rows_px
-    eye = torch.tensor([rig.baseline_m, 0.0, 0.0])
-    return look(stage, K, (rig.height, rig.width), eye)
 
 
 def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Bool[Tensor, "h w"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from depthpose.depth.synthetic.materials import NUMBER, Color, Number, Surface, Values
+from depthpose.depth.synthetic.textures import NUMBER, Color, Number, Surface, Values
 
 Rotation = Float[np.ndarray, "3 3"]
 
@@ -199,7 +199,7 @@ class MeshBuilder:
         low, high = p + ring * radii_m[0], q + ring * radii_m[1]
         around = angle * max(radii_m)
         below, above = (np.stack([around, 0 * around + d], -1) for d in (0.0, length))
-        self.quads(_between(low, high), _between(below, above), surface, _between(ring, ring))
+        self.quads(between(low, high), between(below, above), surface, between(ring, ring))
 
     def disc(
         self, centre: Values, axis: Values, radius_m: Number, surface: Surface, sides: int = 12
@@ -238,8 +238,8 @@ def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(values, np.float32), shape))
 
 
-def _between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Faces between two rows of points."""
+def between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Give the four-cornered faces (n - 1, 4, ...) between two rows of n points."""
     return np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
 
 

@@ -1,11 +1,306 @@
-"""Vehicles and people: parked, driving, standing, walking, riding."""
+"""Traffic: vehicles and people as models, and their places on the road.
+
+Models are made once and placed often. Vehicles are lofted from cross-sections.
+"""
+
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from depthpose.depth.synthetic import people, vehicles
-from depthpose.depth.synthetic.materials import Number
-from depthpose.depth.synthetic.mesh import MeshBuilder, place
+from depthpose.depth.synthetic.mesh import Mesh, MeshBuilder, place
+from depthpose.depth.synthetic.models import add_ball
 from depthpose.depth.synthetic.road import Road
+from depthpose.depth.synthetic.textures import Color, Number, Surface
+
+Ring = Float[np.ndarray, "10 3"]
+
+
+class Body(NamedTuple):
+    """The shape of a kind of vehicle.
+
+    Attributes:
+        size_m: length, width and height.
+        stations: share of the length (-0.5 rear, 0.5 front), and heights of belt and roof as
+            shares of the height.
+        glazed: stations between this pair have windows.
+        wheels: shares of the length where the axles are.
+        share: how often it is met.
+    """
+
+    size_m: tuple[Number, Number, Number]
+    stations: tuple[tuple[Number, Number, Number], ...]
+    glazed: tuple[int, int]
+    wheels: tuple[float, ...]
+    share: Number
+
+
+_HATCH = ((-0.5, 0.4, 0.45), (-0.49, 0.6, 0.62), (-0.45, 0.62, 0.66), (-0.35, 0.62, 0.96),
+          (-0.05, 0.62, 1.0), (0.07, 0.62, 0.98), (0.25, 0.61, 0.63), (0.45, 0.52, 0.54),
+          (0.49, 0.42, 0.44), (0.5, 0.3, 0.34))  # fmt: skip
+_SEDAN = ((-0.5, 0.4, 0.48), (-0.49, 0.62, 0.66), (-0.33, 0.64, 0.68), (-0.19, 0.64, 0.97),
+          (-0.04, 0.64, 1.0), (0.07, 0.63, 0.98), (0.24, 0.62, 0.64), (0.45, 0.52, 0.55),
+          (0.49, 0.42, 0.45), (0.5, 0.3, 0.34))  # fmt: skip
+_WAGON = ((-0.5, 0.4, 0.45), (-0.495, 0.6, 0.63), (-0.47, 0.62, 0.66), (-0.42, 0.62, 0.93),
+          (-0.05, 0.62, 1.0), (0.08, 0.62, 0.98), (0.25, 0.61, 0.63), (0.46, 0.52, 0.54),
+          (0.49, 0.42, 0.44), (0.5, 0.3, 0.34))  # fmt: skip
+_VAN = ((-0.5, 0.5, 0.9), (-0.48, 0.55, 1.0), (-0.46, 0.55, 1.0), (0.12, 0.55, 1.0),
+        (0.2, 0.55, 0.98), (0.36, 0.52, 0.56), (0.48, 0.42, 0.46), (0.5, 0.3, 0.34))  # fmt: skip
+_BOXY = ((-0.5, 0.5, 0.96), (-0.49, 0.5, 1.0), (0.2, 0.5, 1.0), (0.44, 0.5, 0.97),
+         (0.49, 0.46, 0.84), (0.5, 0.3, 0.4))  # fmt: skip
+
+BODIES: dict[str, Body] = {
+    "hatch": Body((4.0, 1.72, 1.48), _HATCH, (2, 6), (-0.31, 0.31), 0.32),
+    "sedan": Body((4.6, 1.8, 1.44), _SEDAN, (2, 6), (-0.3, 0.31), 0.22),
+    "wagon": Body((4.6, 1.8, 1.5), _WAGON, (2, 6), (-0.3, 0.31), 0.2),
+    "suv": Body((4.6, 1.9, 1.75), _WAGON, (2, 6), (-0.3, 0.31), 0.1),
+    "van": Body((5.1, 1.95, 2.05), _VAN, (2, 5), (-0.31, 0.32), 0.1),
+    "lorry": Body((7.4, 2.4, 3.1), _BOXY, (3, 4), (-0.36, 0.36), 0.04),
+    "bus": Body((11.0, 2.5, 3.0), _BOXY, (1, 4), (-0.28, 0.3), 0.02),
+}
+MODELS = 4
+"""Different models of each kind."""
+
+_PAINTS: list[tuple[Color, float]] = [
+    ((0.52, 0.53, 0.55), 0.24), ((0.02, 0.02, 0.023), 0.2), ((0.16, 0.17, 0.19), 0.16),
+    ((0.8, 0.8, 0.78), 0.15), ((0.35, 0.025, 0.025), 0.08), ((0.03, 0.07, 0.25), 0.08),
+    ((0.05, 0.12, 0.07), 0.03), ((0.33, 0.28, 0.2), 0.04), ((0.55, 0.35, 0.03), 0.02),
+]  # fmt: skip
+_BLACK = Surface("tyre", (0.02, 0.02, 0.022))
+
+
+def paint_color(rng: np.random.Generator) -> Color:
+    """Draw a colour of cars: silver, black, grey and white before all others."""
+    shares = np.array([share for _, share in _PAINTS])
+    color, _ = _PAINTS[rng.choice(len(_PAINTS), p=shares / shares.sum())]
+    light = rng.uniform(0.8, 1.15)
+    return color[0] * light, color[1] * light, color[2] * light
+
+
+def draw_kind(rng: np.random.Generator) -> str:
+    """Draw a kind of vehicle."""
+    shares = np.array([body.share for body in BODIES.values()])
+    return list(BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
+
+
+@cache
+def vehicle(kind: str, number: int) -> Mesh:
+    """Give model ``number`` of a kind, white, looking along z."""
+    rng = np.random.default_rng([21, list(BODIES).index(kind), number])
+    body = BODIES[kind]
+    size = np.array(body.size_m) * rng.uniform(0.95, 1.05, 3)
+    builder = MeshBuilder()
+    _shell(builder, rng, body, size)
+    _wheels(builder, body, size, number)
+    _trim(builder, size)
+    return builder.finish()
+
+
+def _shell(
+    builder: MeshBuilder, rng: np.random.Generator, body: Body, size: Float[np.ndarray, "3"]
+) -> None:
+    shift = np.zeros((len(body.stations), 3))
+    shift[2:-2, 0] = rng.normal(0, 0.008, len(shift) - 4)
+    stations = np.array(body.stations) + shift
+    rings = [_ring(station, size) for station in stations]
+    for i, (rear, front) in enumerate(pairwise(rings)):
+        is_glazed = body.glazed[0] <= i < body.glazed[1]
+        is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
+        for j in range(9):
+            is_window = is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5)))
+            _panel(builder, (rear, front), j, size, is_window=bool(is_window))
+    for ring in (rings[0], rings[-1]):
+        hub = np.broadcast_to(ring.mean(0), ring.shape)
+        faces = np.stack([hub, ring, np.roll(ring, -1, 0)], 1)
+        builder.triangles(faces, faces[..., :2], Surface("paint"))
+
+
+def _ring(station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]) -> Ring:
+    """One cross-section: sill, flank, belt, roof edge and roof of one side, then the other's."""
+    length, width, height = size
+    place, belt, roof = station[0], station[1] * height, station[2] * height
+    sill = 0.16 * min(height, 1.8) + 0.03
+    half = width / 2 * (1 - 0.1 * abs(2 * place) ** 6)
+    lean = 0.8 if height < 1.9 else 0.93
+    high = half * lean if roof > belt + 0.1 else half * 0.95
+    x = [half * 0.96, half, half * 0.985, high, high * 0.6]
+    y = [sill, sill + 0.4 * (belt - sill), belt, roof, roof + 0.012 * height]
+    one = [(a, -b, place * length) for a, b in zip(x, y, strict=True)]
+    return np.array(one + [(-a, b, c) for a, b, c in reversed(one)])
+
+
+def _panel(
+    builder: MeshBuilder,
+    rings: tuple[Ring, Ring],
+    j: int,
+    size: Float[np.ndarray, "3"],
+    *,
+    is_window: bool,
+) -> None:
+    face = np.stack([rings[0][j], rings[0][j + 1], rings[1][j + 1], rings[1][j]])
+    if is_window:
+        _window(builder, face)
+        return
+    is_flank = j in (0, 1, 2, 6, 7, 8)
+    uv = np.stack([face[:, 2] / size[0] + 0.5, -face[:, 1] / size[2]], -1)
+    # The roof's picture starts at the top of the side's, where there is plain paint.
+    uv = uv if is_flank else np.stack([face[:, 0], face[:, 2]], -1)
+    surface = Surface("side", variant=int(size[0] * 100)) if is_flank else Surface("paint")
+    builder.quads([face], [uv], surface)
+
+
+def _window(builder: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
+    """A pane in a painted frame, so that pillars part the windows."""
+    uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    builder.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
+    middle = face.mean(0)
+    outward = np.cross(face[1] - face[0], face[3] - face[0])
+    outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
+    outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
+    # Towards the outside: a body's panes look away from its middle.
+    if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
+        outward = -outward
+    builder.quads(
+        [middle + (face - middle) * 0.93 + outward], [uv], Surface("glass", (0.03, 0.035, 0.04))
+    )
+
+
+def _wheels(builder: MeshBuilder, body: Body, size: Float[np.ndarray, "3"], number: int) -> None:
+    radius = 0.31 if size[2] < 2.5 else 0.47
+    rim = Surface("wheel", (0.4, 0.41, 0.43), 1.0, number)
+    for side in (-1, 1):
+        outside = side * (size[1] / 2 + 0.01)
+        for share in body.wheels:
+            hub = np.array([outside, -radius, share * size[0]])
+            inside = hub - [side * 0.22, 0, 0]
+            arch = hub - [side * 0.004, 0.02, 0]
+            builder.disc(arch, (side, 0, 0), radius * 1.18, _BLACK, 16)
+            builder.tube(inside, hub, (radius, radius), _BLACK, 16)
+            builder.disc(hub + np.array([side * 0.003, 0, 0]), (side, 0, 0), radius, _BLACK, 16)
+            builder.disc(hub + np.array([side * 0.012, 0, 0]), (side, 0, 0), radius * 0.66, rim, 12)
+
+
+def _trim(builder: MeshBuilder, size: Float[np.ndarray, "3"]) -> None:
+    length, width, height = size
+    low = min(height, 1.6)
+    white, red = Surface("lamp", (0.8, 0.81, 0.83)), Surface("lamp", (0.4, 0.02, 0.02))
+    sill = 0.16 * min(height, 1.8) + 0.03
+    builder.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)
+    for side in (-1, 1):
+        front, rear = side * width * 0.36, side * width * 0.4
+        builder.box((front, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
+        builder.box((rear, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
+        mirror = (side * (width / 2 + 0.08), -0.66 * min(height, 2), 0.2 * length)
+        builder.box(mirror, (0.18, 0.13, 0.1), Surface("paint"))
+    plate = Surface("plate", (0.8, 0.8, 0.76), 0.52)
+    builder.box((0, -0.42 * low, -0.502 * length), (0.52, 0.12, 0.03), plate)
+    builder.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
+    builder.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
+    builder.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
+    if height > 1.9:  # what is loft from glass elsewhere stands upright here
+        pane = Surface("glass", (0.03, 0.03, 0.035))
+        where = (0, -0.74 * height, -0.499 * length)
+        builder.box(where, (width * 0.72, height * 0.28, 0.02), pane)
+
+
+WALKERS = 10
+RIDERS = 5
+"""How many different models there are of each."""
+
+_SKINS: list[Color] = [(0.5, 0.31, 0.22), (0.42, 0.25, 0.17), (0.2, 0.11, 0.07)]
+_RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
+
+
+@cache
+def walker(number: int) -> Mesh:
+    """Give a person on foot, looking along z, caught at some moment of a step."""
+    rng = np.random.default_rng([31, number])
+    builder = MeshBuilder()
+    height, step = rng.uniform(1.55, 1.9), rng.uniform(-0.28, 0.28)
+    coat, trousers = _cloth(rng, 0.45), _cloth(rng, 0.22)
+    for side in (-1, 1):
+        foot, hip = (side * 0.1, -0.04, side * step), np.array([side * 0.09, -0.48 * height, 0])
+        builder.tube(foot, hip, (0.06, 0.09), trousers)
+        builder.box((foot[0], -0.04, foot[2] + 0.05), (0.09, 0.08, 0.26), _RUBBER)
+        hand = (side * 0.27, -0.47 * height, -side * step * 0.8)
+        builder.tube(hand, (side * 0.2, -0.81 * height, 0), (0.045, 0.06), coat)
+    _trunk(builder, rng, (0, -0.48 * height, 0), (0, -0.82 * height, 0.02), coat)
+    _head(builder, rng, (0, -0.93 * height, 0.03))
+    if rng.random() < 0.4:
+        builder.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(rng, 0.4))
+    return builder.finish()
+
+
+@cache
+def rider(number: int) -> Mesh:
+    """Give a person on a bicycle, riding along z."""
+    rng = np.random.default_rng([32, number])
+    builder = MeshBuilder()
+    frame = Surface("metal", tuple(rng.uniform(0.03, 0.4, 3)))
+    _bicycle(builder, frame)
+    coat, trousers = _cloth(rng, 0.45), _cloth(rng, 0.22)
+    hip, neck = np.array([0, -0.98, -0.22]), np.array([0, -1.5, 0.02])
+    for side in (-1, 1):
+        knee, pedal = (side * 0.1, -0.68, 0.15), (side * 0.1, -0.28 - 0.13 * side, 0.0)
+        builder.tube(pedal, knee, (0.05, 0.065), trousers)
+        builder.tube(knee, hip + np.array([side * 0.08, 0, 0]), (0.065, 0.09), trousers)
+        builder.tube(
+            (side * 0.25, -1.08, 0.42), neck + np.array([side * 0.18, 0, 0]), (0.04, 0.055), coat
+        )
+    _trunk(builder, rng, tuple(hip), tuple(neck), coat)
+    _head(builder, rng, (0, -1.7, 0.08))
+    return builder.finish()
+
+
+def _bicycle(builder: MeshBuilder, frame: Surface) -> None:
+    for z in (-0.52, 0.52):
+        angle = np.linspace(0, 2 * np.pi, 19)
+        rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
+        for start, stop in pairwise(rim):
+            builder.tube(start, stop, (0.02, 0.02), _RUBBER, 4)
+        builder.tube((-0.05, -0.34, z), (0.05, -0.34, z), (0.03, 0.03), frame, 5)
+        for spoke in rim[:-1:3]:
+            builder.tube((0, -0.34, z), spoke, (0.005, 0.005), frame, 3)
+    joints = {"rear": (-0.34, -0.52), "front": (-0.34, 0.52), "saddle": (-0.9, -0.2),
+              "pedals": (-0.3, -0.02), "head": (-0.86, 0.36), "bar": (-1.05, 0.36)}  # fmt: skip
+    links = ("rear saddle", "rear pedals", "pedals saddle", "pedals head", "saddle head",
+             "head front", "head bar")  # fmt: skip
+    for link in links:
+        start, stop = ((0.0, *joints[name]) for name in link.split())
+        builder.tube(start, stop, (0.022, 0.022), frame, 5)
+    builder.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), (0.016, 0.016), _RUBBER, 4)
+    builder.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
+
+
+def _trunk(
+    builder: MeshBuilder, rng: np.random.Generator, hip: tuple, neck: tuple, coat: Surface
+) -> None:
+    low, high = np.array(hip), np.array(neck)
+    builder.tube(low, (low + high) / 2, (0.17, 0.2), coat, 10)
+    builder.tube((low + high) / 2, high, (0.2, 0.16), coat, 10)
+    add_ball(builder, high, (0.2, 0.09, 0.13), coat, 1)
+    if rng.random() < 0.3:
+        middle = low * 0.35 + high * 0.65 - [0, 0, 0.2]
+        builder.box(middle, (0.3, 0.42, 0.18), _cloth(rng, 0.4))
+
+
+def _head(builder: MeshBuilder, rng: np.random.Generator, centre: tuple) -> None:
+    middle = np.array(centre)
+    skin = Surface("skin", _SKINS[rng.integers(len(_SKINS))])
+    r, g, b = rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])
+    builder.tube(middle + np.array([0, 0.2, 0]), middle, (0.06, 0.06), skin, 6)
+    add_ball(builder, middle, (0.085, 0.125, 0.1), skin, 2)
+    add_ball(
+        builder, middle - [0, 0.03, 0.02], (0.098, 0.11, 0.105), Surface("cloth", (r, g, b)), 2
+    )
+
+
+def _cloth(rng: np.random.Generator, light: Number) -> Surface:
+    r, g, b = rng.uniform(0.1, 1, 3) * rng.uniform(0.15, 1) * light
+    return Surface("cloth", (r, g, b), 0.6, int(rng.integers(4)))
+
 
 _FAR_M = 110.0
 
@@ -82,14 +377,14 @@ def _vehicle(
     where: tuple[Number, Number, Number],
 ) -> None:
     x, s, yaw = where
-    kind = vehicles.draw_kind(rng)
-    length, width, _ = vehicles.BODIES[kind].size_m
+    kind = draw_kind(rng)
+    length, width, _ = BODIES[kind].size_m
     c, t = abs(np.cos(yaw)), abs(np.sin(yaw))
     half_x, half_s = (width * c + length * t) / 2 + 0.1, (length * c + width * t) / 2 + 0.3
     if not places.claim(x, s, half_x, half_s):
         return
-    color = vehicles.paint_color(rng)
-    model = vehicles.vehicle(kind, int(rng.integers(vehicles.MODELS)))
+    color = paint_color(rng)
+    model = vehicle(kind, int(rng.integers(MODELS)))
     tints = {"paint": color, "side": color}
     builder.add(place(model, (x, 0, s), yaw, rng.uniform(0.96, 1.04, 3), tints))
 
@@ -111,7 +406,7 @@ def _people(builder: MeshBuilder, rng: np.random.Generator, road: Road, places: 
         s = rng.uniform(6, 45)
         if places.claim(x, s, 0.4, 1.0):
             yaw = rng.normal(0, 0.08) + (0 if side > 0 else np.pi)
-            builder.add(place(people.rider(int(rng.integers(people.RIDERS))), (x, 0, s), yaw))
+            builder.add(place(rider(int(rng.integers(RIDERS))), (x, 0, s), yaw))
 
 
 def _person(
@@ -128,5 +423,5 @@ def _person(
     turns = rng.choice([0, np.pi, np.pi / 2, -np.pi / 2], p=[0.35, 0.35, 0.15, 0.15])
     yaw = float(turns) + rng.normal(0, 0.2) + (np.pi / 2 if on_road else 0)
     y = 0.0 if on_road else -road.curb_m
-    model = people.walker(int(rng.integers(people.WALKERS)))
+    model = walker(int(rng.integers(WALKERS)))
     builder.add(place(model, (where[0], y, where[1]), yaw))

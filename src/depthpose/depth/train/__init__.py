@@ -1,28 +1,14 @@
 """Stages of a training, one loop: a generator, the matcher, the generator through the matcher."""
 
-from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.runs import (
-    STAGES,
-    train_adapt,
-    train_finetune,
-    train_select,
-    train_stereo,
-    train_view,
-)
-from depthpose.depth.train.select import SelectionSamples, SelectTask
-from depthpose.depth.train.stages import FinetuneTask, StereoTask, ViewTask
-
-__all__ = [
-    "STAGES",
-    "FinetuneTask",
-    "SelectTask",
-    "SelectionSamples",
-    "StereoTask",
-    "TrainingPairs",
-    "ViewTask",
-    "train_adapt",
-    "train_finetune",
-    "train_select",
-    "train_stereo",
-    "train_view",
-]
+from depthpose.depth.train.pairs import TrainingPairs as TrainingPairs
+from depthpose.depth.train.runs import STAGES as STAGES
+from depthpose.depth.train.runs import train_adapt as train_adapt
+from depthpose.depth.train.runs import train_finetune as train_finetune
+from depthpose.depth.train.runs import train_select as train_select
+from depthpose.depth.train.runs import train_stereo as train_stereo
+from depthpose.depth.train.runs import train_view as train_view
+from depthpose.depth.train.stages import FinetuneTask as FinetuneTask
+from depthpose.depth.train.stages import SelectionSamples as SelectionSamples
+from depthpose.depth.train.stages import SelectTask as SelectTask
+from depthpose.depth.train.stages import StereoTask as StereoTask
+from depthpose.depth.train.stages import ViewTask as ViewTask

@@ -63,8 +63,8 @@ class AdaptTask:
         error = _photometric_loss(views, others, found_px, count)
         smooth = smoothness_loss(found_px, views)
         network: Any = self.matcher.config
-        reach = network.max_disparity_px
-        label = heads_loss([head[:count] for head in heads], batch.left_px, reach)
+        max_disparity_px = network.max_disparity_px
+        label = heads_loss([head[:count] for head in heads], batch.left_px, max_disparity_px)
         config = self.config
         loss = config.photometric_weight * error + config.smooth_weight * smooth
         loss = loss + config.label_weight * label

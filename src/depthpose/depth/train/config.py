@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from depthpose.core.config import check_settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.depth.config import (
@@ -61,11 +62,7 @@ class ViewTraining:
     def __post_init__(self) -> None:
         """Refuse an unknown loss, and a network and a weight that are none."""
         refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
-        if self.discriminator_width < 1:
-            raise InputError(
-                f"discriminator_width must be 1 or more, got {self.discriminator_width}; take 64"
-            )
-        _refuse_negative("l1_weight", self.l1_weight)
+        check_settings(self, discriminator_width="[1, inf)", l1_weight="[0, inf)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,17 +128,14 @@ class SelectTraining:
     def __post_init__(self) -> None:
         """Refuse weights and shares that are none, and an unknown loss."""
         refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
-        shares = {"more_share": self.more_share, "encoder_rate": self.encoder_rate}
-        for name, value in shares.items():
-            if not 0 <= value <= 1:
-                raise InputError(f"{name} must be from 0 to 1, got {value}")
-        weights = {
-            "plane_weight": self.plane_weight,
-            "right_share": self.right_share,
-            "view_weight": self.view_weight,
-        }
-        for name, value in weights.items():
-            _refuse_negative(name, value)
+        check_settings(
+            self,
+            more_share="[0, 1]",
+            encoder_rate="[0, 1]",
+            plane_weight="[0, inf)",
+            right_share="[0, inf)",
+            view_weight="[0, inf)",
+        )
         _refuse_views_changed_apart(self.pairs)
         if self.more is not None:
             _refuse_views_changed_apart(self.more)
@@ -199,9 +193,7 @@ class StereoTraining:
                 "matcher and light are both given, and one network is trained; leave matcher out "
                 "for the light network, or light for PSMNet"
             )
-        for name in ("encoder_rate", "sky_weight"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        check_settings(self, encoder_rate="[0, 1]", sky_weight="[0, 1]")
         if self.light is None and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
                 "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
@@ -268,16 +260,18 @@ class AdaptTraining:
 
     def __post_init__(self) -> None:
         """Refuse weights and counts that are none, and views changed each on its own."""
-        weights = (self.photometric_weight, self.smooth_weight, self.label_weight)
-        if min(weights) < 0 or max(weights) == 0:
+        check_settings(
+            self,
+            photometric_weight="[0, inf)",
+            smooth_weight="[0, inf)",
+            label_weight="[0, inf)",
+            validation_share="(0, 1)",
+            streets="[0, inf)",
+        )
+        if not (self.photometric_weight or self.smooth_weight or self.label_weight):
             raise InputError(
-                "photometric_weight, smooth_weight and label_weight must be 0 or more, and one "
-                f"above 0; got {weights}"
-            )
-        if not 0 < self.validation_share < 1 or self.streets < 0:
-            raise InputError(
-                "validation_share must be above 0 and below 1 and streets 0 or more, got "
-                f"{self.validation_share:g} and {self.streets}"
+                "photometric_weight, smooth_weight and label_weight are all 0, so nothing would be "
+                "learnt; give one above 0"
             )
         _refuse_views_changed_apart(self.pairs)
 
@@ -309,12 +303,7 @@ class FinetuneTraining:
 
     def __post_init__(self) -> None:
         """Refuse a weight that is none."""
-        _refuse_negative("l1_weight", self.l1_weight)
-
-
-def _refuse_negative(name: str, value: float) -> None:
-    if value < 0:
-        raise InputError(f"{name} must be 0 or more, got {value}")
+        check_settings(self, l1_weight="[0, inf)")
 
 
 def _refuse_views_changed_apart(pairs: PairsConfig) -> None:

@@ -1,0 +1,549 @@
+"""Settings of depth: frozen dataclasses that refuse unusable values."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from depthpose.core.config import check_settings
+from depthpose.core.errors import InputError
+
+TruthKind = Literal["scan", "annotated", "disparity"]
+"""scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
+(KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
+
+_MOST_FOCAL_PX = 20_000
+"""Of pairs: several times that of the largest images; beyond it they would fill the memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradeConfig:
+    """Augmentation of the input image alone, for transfer from synthetic to real images."""
+
+    colour: float = 0.35
+    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+
+    hue_share: float = 0.1
+    """Share of images whose channels are exchanged."""
+
+    haze_share: float = 0.2
+    """Share of images with haze."""
+
+    glare_share: float = 0.2
+    """Share of images with a light in them."""
+
+    blur_share: float = 0.4
+    """Share of images that are blurred."""
+
+    blur_px: float = 1.2
+    """Largest standard deviation of the blur [px]."""
+
+    noise_share: float = 0.6
+    """Share of images with noise."""
+
+    noise: float = 0.04
+    """Largest standard deviation of the noise; white is 1."""
+
+    jpeg_share: float = 0.3
+    """Share of images that go through JPEG."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        shares = [f"{name}_share" for name in ("hue", "haze", "glare", "blur", "noise", "jpeg")]
+        check_settings(
+            self,
+            **dict.fromkeys(shares, "[0, 1]"),
+            colour="[0, 1)",
+            blur_px="[0.3, inf)",
+            noise="[0, inf)",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentConfig:
+    """Random changes of a training pair (thesis, 2.4.2)."""
+
+    crop_px: tuple[int, int] = (256, 512)
+    """Rows and columns of the crop."""
+
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
+    on the right and below, never enlarged: another size would be another focal length."""
+
+    jitter: float = 0.2
+    """Brightness, contrast and saturation are each scaled by 1 +- this."""
+
+    flip_share: float = 0.5
+    """Share of pairs that are mirrored and swapped."""
+
+    per_view: DegradeConfig | None = None
+    """Changes of each view on its own, as two cameras differ; None: none."""
+
+    erased_share: float = 0.0
+    """Share of pairs with a patch of the right view in one colour: what only one camera sees."""
+
+    misaligned_px: float = 0.0
+    """Rows of the right view are off by up to this at either border, as after a worn calibration
+    [px]."""
+
+    def __post_init__(self) -> None:
+        """Refuse changes that would break a pair."""
+        check_settings(
+            self,
+            crop_px="[1, inf)",
+            scale="(0, 10]",
+            jitter="[0, 1)",
+            flip_share="[0, 1]",
+            erased_share="[0, 1]",
+            misaligned_px="[0, 10)",
+        )
+        if self.scale[0] > self.scale[1]:
+            raise InputError(f"scale must be a range, the lower end first, got {self.scale}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetsConfig:
+    """What synthetic street scenes are like."""
+
+    seed: int = 0
+    """Another seed, other streets."""
+
+    frames: int = 100_000
+    """How many there are; each is rendered on demand."""
+
+    rigs: Literal["kitti", "varied"] = "kitti"
+    """kitti: the five rigs of KITTI's recording days; varied: half of the frames with others."""
+
+    scale: float = 1.0
+    """Size of the pictures as a share of the rig's: 0.5 draws half as many rows and columns."""
+
+    crop: tuple[int, int] | None = None
+    """Rows and columns of a window that alone is drawn, somewhere in each frame; None: all."""
+
+    clutter_share: float = 0.0
+    """Share of the scenes that are clutter in place of a street: shapes of all kinds and surfaces,
+    floating before a ground, a wall or in a box."""
+
+    with_antialiasing: bool = True
+    """Four samples in pixels where edges show."""
+
+    with_lidar: bool = False
+    """Scan each scene with a LiDAR too."""
+
+    jpeg_share: float = 0.5
+    """Share of the pairs that went through JPEG."""
+
+    rectification_error_px: float = 0.1
+    """Deviation of the rows by which the right view is off, as after a real calibration."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        check_settings(
+            self,
+            seed="[0, inf)",
+            frames="[0, inf)",
+            scale="[0.02, 4]",
+            crop="[1, inf)",
+            jpeg_share="[0, 1]",
+            clutter_share="[0, 1]",
+            rectification_error_px="[0, 10)",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Which pairs a training sees, and how."""
+
+    folders: tuple[str, ...] = ()
+    """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
+
+    streets: StreetsConfig | None = None
+    """Streets that are rendered while training, each on demand; beside the folders' pairs."""
+
+    split: str | None = None
+    """Name or file of a split, for the first folder."""
+
+    exclude: tuple[str, ...] = ()
+    """Names of frames to leave out."""
+
+    truth: TruthKind | None = None
+    """Which truth of the folders is learnt from, one kind alone; frames without it are left out.
+    None: the one kind that a folder has; a folder with several is refused. Streets that are
+    rendered while training have exact disparity, whatever this says."""
+
+    limit: int | None = None
+    """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
+
+    focal_px: float | None = None
+    """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
+    are. Before ``augment.scale``: give the largest focal length that it is to make, and scales up
+    to 1, and no image is enlarged."""
+
+    with_cache: bool = False
+    """Keep decoded pairs in memory (8 bit): for sets that fit."""
+
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    """Random changes."""
+
+    def __post_init__(self) -> None:
+        """Refuse what selects nothing."""
+        check_settings(self, limit="[1, inf)", focal_px=f"(0, {_MOST_FOCAL_PX}]")
+
+
+BaselineName = Literal["rows", "nearest"]
+"""The best constant depth of each image row; the depth of the training image most alike."""
+
+
+Speed = Literal["quick", "fine"]
+"""How much time a match may take: see :class:`MatcherConfig`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PSMNetConfig:
+    """Size and conventions of the stereo network (Chang and Chen 2018, stacked hourglass)."""
+
+    max_disparity_px: int = 192
+    """Disparities 0 .. max_disparity_px - 1 are considered; a multiple of 16."""
+
+    width: int = 32
+    """Channels of the first layers; all others are 1, 2 or 4 times it."""
+
+    blocks: tuple[int, int, int, int] = (3, 16, 3, 3)
+    """Residual blocks of the four stages of the feature extractor."""
+
+    pools: tuple[int, ...] = (64, 32, 16, 8)
+    """Windows of the spatial pyramid, in quarter-size pixels, largest first."""
+
+    align_corners: bool = True
+    """How the weights expect maps to be enlarged: True for the published KITTI 2015 weights."""
+
+    work_focal_px: float | None = None
+    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        check_settings(
+            self,
+            max_disparity_px="[16, 16384]",
+            width="[1, inf)",
+            blocks="[1, 1000]",
+            pools="[1, 1024]",
+            work_focal_px="(0, inf)",
+        )
+        if self.max_disparity_px % 16:
+            raise InputError(
+                "max_disparity_px must be a multiple of 16 (the volume is a quarter of it and is "
+                f"halved twice), got {self.max_disparity_px}; take 192"
+            )
+        if not 1 <= len(self.pools) <= 16:
+            raise InputError(f"pools must hold 1 to 16 windows, got {self.pools}")
+
+    @property
+    def step_px(self) -> int:
+        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
+        return 16
+
+    @property
+    def min_side_px(self) -> int:
+        """Smallest image side that the network takes [px]: its largest pool sees one window."""
+        return max(16, -(-4 * max(self.pools) // 16) * 16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightConfig:
+    """Size and conventions of the light stereo network."""
+
+    max_disparity_px: int = 192
+    """Disparities below this are considered; a multiple of 32."""
+
+    groups: int = 8
+    """Channels of the correlation volume: features are correlated in so many groups."""
+
+    width: int = 48
+    """Features of each pixel that is matched; a multiple of ``groups``."""
+
+    volume_widths: tuple[int, int, int, int] = (8, 16, 32, 48)
+    """Channels of the volume at 1/4, 1/8, 1/16 and 1/32 of the image's sides."""
+
+    candidates: int = 2
+    """Disparities of the highest scores whose mean is the answer."""
+
+    encoder_width: float = 1.0
+    """Channels of the encoder as a share of EfficientNet-Lite0's; ImageNet's weights need 1."""
+
+    with_agreement: bool = False
+    """Whether the upsampling compares both views, at half size, under the disparities it chooses
+    from; weights without it can be trained on with it."""
+
+    with_refinement: bool = False
+    """Whether both views are compared once more, at half size, around the disparity found, which
+    is corrected; weights without it can be trained on with it."""
+
+    with_sky: bool = False
+    """Whether the sky is a class of its own, beside the disparities; weights without it can be
+    trained on with it."""
+
+    work_focal_px: float | None = None
+    """Pairs are brought to this focal length before matching [px]; None: matched as they are."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        check_settings(
+            self,
+            max_disparity_px="[32, 16384]",
+            groups="[1, inf)",
+            width="[1, inf)",
+            volume_widths="[1, inf)",
+            candidates=f"[1, {self.max_disparity_px // 4}]",
+            encoder_width="(0, 4]",
+            work_focal_px="(0, inf)",
+        )
+        if self.max_disparity_px % 32:
+            raise InputError(
+                "max_disparity_px must be a multiple of 32 (the volume is a quarter of it and is "
+                f"halved three times), got {self.max_disparity_px}; take 192"
+            )
+        if self.width % self.groups:
+            raise InputError(
+                f"width must be a multiple of groups, got width={self.width} and "
+                f"groups={self.groups}; take 48 and 8"
+            )
+
+    @property
+    def step_px(self) -> int:
+        """Sides of images and ``max_disparity_px`` are multiples of this [px]."""
+        return 32
+
+    @property
+    def min_side_px(self) -> int:
+        """Smallest image side that the network takes [px]."""
+        return 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherConfig:
+    """How a stereo network is run on a pair of images."""
+
+    device: str = "cpu"
+    """Where to compute: cpu, cuda, cuda:1, ..."""
+
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """fp32 is exact; bf16 is faster and halves the memory, at some hundredths of a pixel. A
+    processor without bf16 (AVX-512, AMX) takes fp32."""
+
+    speed: Speed = "fine"
+    """Of one image: quick looks at it once, fine at all ``scales`` of a generator that selects.
+    Of pairs of a known camera: quick matches at the focal length that the weights were trained at;
+    fine, where that is more, at up to 280,000 pixels and never enlarged (PSMNet), or at up to
+    650,000 and 1.5 times the images' sides (light), and through up to 1.5 (PSMNet) or 1.75 times
+    the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one
+    speed."""
+
+    max_memory_bytes: int | None = None
+    """Bound on the memory of activations, exact (no tiles); None: no bound."""
+
+    tile_px: tuple[int, int] | None = None
+    """Rows and columns of tiles that are matched one by one and blended: approximate."""
+
+    tile_overlap_px: int = 64
+    """Overlap of neighbouring tiles, beyond the disparity range to the left of each."""
+
+    with_confidence: bool = True
+    """Say for each pixel how sure the match is."""
+
+    with_left_right_check: bool = False
+    """Match the mirrored pair too and lower the confidence where both disagree: twice the time."""
+
+    with_compile: bool = False
+    """Compile the feature extractor: pays after many images of one size."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no run can have."""
+        check_settings(
+            self, max_memory_bytes="[1, inf)", tile_px="[1, inf)", tile_overlap_px="[0, inf)"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SGBMConfig:
+    """Semi-global block matching of OpenCV (Hirschmueller 2008), with the settings of our tables.
+
+    The names follow OpenCV's documentation of ``StereoSGBM``.
+    """
+
+    num_disparities: int = 192
+    """Disparities 0 .. num_disparities - 1 are considered; a multiple of 16.
+
+    Where the principal points of a rig differ by ``d = cx_right - cx_left``, its views are first
+    moved by this difference, so disparities grow by d: for a range given of the images as they are
+    (Middlebury's ``ndisp``), take d more."""
+
+    block_size: int = 3
+    """Side of the matched window [px], odd."""
+
+    p1: int = 8 * 3 * 9
+    """Penalty of a disparity step of 1 between neighbours."""
+
+    p2: int = 32 * 3 * 9
+    """Penalty of a larger step; more than p1."""
+
+    disp12_max_diff: int = 1
+    """Largest difference allowed in the left-right check [px]."""
+
+    pre_filter_cap: int = 63
+    """Bound of the horizontal gradient that is matched."""
+
+    uniqueness_ratio: int = 10
+    """Percent by which the best cost must beat the second."""
+
+    speckle_window_size: int = 100
+    """Islands of at most so many pixels are dropped."""
+
+    speckle_range: int = 2
+    """Disparity step inside an island [px]."""
+
+    mode: Literal["sgbm", "hh", "sgbm_3way", "hh4"] = "sgbm_3way"
+    """Directions of aggregation: 5, 8, 3 or 4."""
+
+    with_filled_holes: bool = False
+    """Fill pixels without an answer as the KITTI devkit does: the smaller neighbour of the row."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that OpenCV would misread."""
+        check_settings(self, num_disparities="[16, inf)", block_size="[1, inf)")
+        if self.num_disparities % 16:
+            raise InputError(
+                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
+            )
+        if self.block_size % 2 == 0:
+            raise InputError(f"block_size must be odd, got {self.block_size}")
+        if not 0 < self.p1 < self.p2:
+            raise InputError(f"p1 and p2 must be 0 < p1 < p2, got p1={self.p1}, p2={self.p2}")
+
+
+Answer = Literal["own", "matched", "joined"]
+"""Where the disparity of one image comes from. own: the generator, which estimates disparity beside
+the right view (no matcher runs). matched: the matcher, on the image and the right view that the
+generator drew. joined: the mean of both, weighed by their confidence."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratorConfig:
+    """Size and conventions of the view synthesis network (pix2pix's U-Net), and its rig.
+
+    The generator draws what one rig would have seen, so its weights carry that rig: an image is
+    brought to ``virtual_focal_px`` before, and depth is virtual focal x baseline / disparity.
+    """
+
+    width: int = 64
+    """Channels of the first level; they double up to eight times it."""
+
+    levels: int = 8
+    """Halvings down to the bottleneck; image sides are padded to multiples of 2 ** levels."""
+
+    with_dropout: bool = True
+    """Dropout of 0.5 in the inner decoder blocks while training."""
+
+    test_mode: Literal["running", "batch"] = "running"
+    """Norm at test: the statistics of training without dropout, or the image's own with it."""
+
+    virtual_focal_px: float = 493.0
+    """Focal length of the imitated rig [px]; by default that at which KITTI's images have the 256
+    rows of the thesis's crops: with fewer of the rows a network must guess the horizon."""
+
+    virtual_baseline_m: float = 0.5327
+    """Baseline of the imitated rig [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        check_settings(
+            self,
+            width="[1, inf)",
+            levels="[2, 10]",
+            virtual_focal_px="(0, inf)",
+            virtual_baseline_m="(0, inf)",
+        )
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels after each level of the encoder."""
+        return tuple(self.width * min(2**level, 8) for level in range(self.levels))
+
+    @property
+    def answer(self) -> Answer:
+        """Where depth comes from: this network has no disparity of its own."""
+        return "matched"
+
+    @property
+    def side_multiple_px(self) -> int:
+        """Both sides of an image are multiples of this [px]."""
+        return 2**self.levels
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionConfig:
+    """Size and conventions of the network that selects the right view, and its rig.
+
+    It answers, for each pixel of either view, a distribution over disparities and the sky. As with
+    :class:`GeneratorConfig`, an image is brought to ``virtual_focal_px`` before.
+    """
+
+    encoder_kind: Literal["efficientnet-lite0"] = "efficientnet-lite0"
+    """The encoder."""
+
+    encoder_width: float = 1.0
+    """Channels of the encoder as a share of Lite0's; ImageNet's weights are of 1."""
+
+    widths: tuple[int, int, int, int] = (96, 64, 48, 32)
+    """Channels of the decoder at strides 16, 8, 4 and 2."""
+
+    planes: int = 32
+    """Disparities that are distinguished, evenly spaced in their logarithm."""
+
+    disparity_px: tuple[float, float] = (1.2, 88.0)
+    """Least and largest disparity at the virtual rig [px]: 165 to 2.25 m at the default rig."""
+
+    answer: Answer = "own"
+    """Where depth of one image comes from. own: the generator's disparity of the left view;
+    matched: the matcher, on the image and the right view that the generator drew; joined: the mean
+    of both, weighed by their confidence."""
+
+    with_street: bool = False
+    """Has a layer that reads off the encoder's features how surely the image shows a street."""
+
+    least_confidence: float = 0.0
+    """Probability of a street below which an image is out of distribution, or mean confidence where
+    ``with_street`` is false; 0: not checked. 'depthpose depth calibrate' finds it."""
+
+    virtual_focal_px: float = 372.0
+    """Focal length of the imitated rig [px]: half of KITTI's, as wide as 640 columns."""
+
+    virtual_baseline_m: float = 0.5327
+    """Baseline of the imitated rig [m]."""
+
+    scales: tuple[float, ...] = (1.0, 1.4)
+    """Sizes at which the fine speed looks at an image, as shares of that at the virtual focal
+    length, 1 the first; it averages. The quick speed looks once."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that the network cannot have."""
+        check_settings(
+            self,
+            encoder_width="(0, 4]",
+            widths="[1, inf)",
+            planes="[2, inf)",
+            disparity_px="(0, inf)",
+            least_confidence="[0, 1)",
+            virtual_focal_px="(0, inf)",
+            virtual_baseline_m="(0, inf)",
+            scales="[1, 4]",
+        )
+        if self.disparity_px[0] >= self.disparity_px[1]:
+            raise InputError(
+                f"disparity_px must be a range, the smaller end first, got {self.disparity_px}"
+            )
+        if self.scales[:1] != (1.0,):
+            raise InputError(f"scales must begin with 1; take (1.0, 1.4), got {self.scales}")
+
+    @property
+    def side_multiple_px(self) -> int:
+        """Both sides of an image are multiples of this [px]."""
+        return 32

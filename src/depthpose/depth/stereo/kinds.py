@@ -1,0 +1,398 @@
+"""The networks as matchers: folded weights, memory, and the kinds that weights files name.
+
+Batch norm is folded into the convolution before it: the same function, one pass less.
+"""
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeVar, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from depthpose.core.errors import InputError
+from depthpose.depth.config import LightConfig, MatcherConfig, PSMNetConfig
+from depthpose.depth.stereo.light import LightStereo
+from depthpose.depth.stereo.matcher import Matcher
+from depthpose.depth.stereo.network_matcher import NetworkMatcher, StereoNetwork, Views
+from depthpose.depth.stereo.psmnet import CHUNK_BYTES, ConvNorm, PSMNet, Size, expected_disparity
+from depthpose.depth.types import Match
+
+MARGIN = 1.1
+"""Allocators keep gaps: measured peaks stay below the sum of the tensors times this ..."""
+
+OVERHEAD_BYTES = 128 << 20
+"""... plus this, which the first convolutions take for themselves whatever the size."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footprint(ABC):
+    """A network at a size of images, as far as memory is concerned.
+
+    Volumes are held whole: a bound can be met or refused, not traded for time.
+
+    Attributes:
+        config: the network.
+        height: rows of the padded image [px].
+        width: columns of the padded image [px].
+        dtype: what the network computes in.
+        rows: at quarter size, computed at a time.
+    """
+
+    config: PSMNetConfig | LightConfig
+    height: int
+    width: int
+    dtype: torch.dtype
+    rows: int
+
+    @abstractmethod
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+
+    def refuse_more_than(self, max_memory_bytes: int | None) -> None:
+        """Refuse a bound that a match would exceed.
+
+        Raises:
+            InputError: it does; the message says how much it takes.
+        """
+        least = self.estimate_bytes()
+        if max_memory_bytes is not None and least > max_memory_bytes:
+            quick = "" if self.config.work_focal_px is None else " or speed='quick'"
+            raise InputError(
+                f"max_memory_bytes={max_memory_bytes} is too small for images of "
+                f"{self.height}x{self.width} (padded): this matcher takes {least}; allow "
+                f"that, take precision='bf16'{quick}, or match tiles (tile_px)"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PSMNetFootprint(Footprint):
+    """PSMNet at a size of images: two volumes of the largest size are held whole."""
+
+    config: PSMNetConfig
+    rows: int = 32
+
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+        height, width = self.height // 4, self.width // 4
+        row_bytes = self.config.width * width * self.dtype.itemsize
+        map_bytes = row_bytes * height
+        bins = self.config.max_disparity_px // 4
+        volume_bytes = map_bytes * bins
+
+        def slab_bytes(halo: int) -> int:
+            return min(self.rows + 2 * halo, height) * row_bytes * bins
+
+        levels = 6 + len(self.config.pools)
+        cost_bytes = 4 * bins * height * width
+        # Costs are computed in float32.
+        head_slabs = 2 if self.dtype.itemsize >= 4 else 4
+        stages = (
+            # Five half-size maps in the first stage; joined levels, twice, in the last.
+            2 * map_bytes * max(5 * 4, 2 * levels + 12),
+            # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
+            volume_bytes + 2 * map_bytes + 3 * slab_bytes(4),
+            # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
+            2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab_bytes(2) + 3 * cost_bytes,
+            4 * cost_bytes + 16 * self.height * self.width + 5 * CHUNK_BYTES,
+        )
+        return int(MARGIN * max(stages)) + OVERHEAD_BYTES
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightFootprint(Footprint):
+    """The light network at a size of images: one volume of the largest size is held whole."""
+
+    config: LightConfig
+    rows: int = 16
+
+    def estimate_bytes(self) -> int:
+        """Peak memory of activations of one pair [bytes], with margin for the allocator."""
+        pixels = self.height * self.width // 16
+        slab_pixels = min((self.rows + 4) * self.width // 4, pixels)
+        halves = 2 if self.config.with_agreement or self.config.with_refinement else 1
+        kept = pixels * (halves * 4 * 16 + 3 * self.config.width) * self.dtype.itemsize
+        # Both views in float32: at this size, normalised, padded.
+        images = 6 * 3 * 4 * self.height * self.width
+        # A volume at quarter size, the smaller ones, and three of the rows at a time.
+        widest = max(self.config.groups, self.config.volume_widths[0])
+        voxel_bytes = widest * (self.config.max_disparity_px // 4) * self.dtype.itemsize
+        volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
+        # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
+        # takes less.
+        joined = 4 * (16 + self.config.width + 32) * self.dtype.itemsize
+        compared = 4 * (4 * 16 + 9 + 3 * 9) * 4 if self.config.with_agreement else 0
+        weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
+        return int(MARGIN * (images + kept + max(volumes, weights))) + OVERHEAD_BYTES // 2
+
+
+Conv = nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d
+Norm = nn.BatchNorm2d | nn.BatchNorm3d
+Volume = Float[Tensor, "b _ _ _ _"]
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+def folded_weight(layer: nn.Module) -> tuple[Tensor, Tensor]:
+    """Weight and bias of the one convolution that equals ``layer`` in eval mode, in float64.
+
+    ``norm(conv(x)) = gain * (conv(x) - mean) + bias`` with ``gain = weight / sqrt(var + eps)``.
+    """
+    conv, norm = cast("Conv", layer.conv), cast("Norm", layer.norm)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
+    bias = norm.bias.double() - gain * norm.running_mean.double()
+    output_axis = 1 if isinstance(conv, nn.ConvTranspose3d) else 0
+    shape = [1] * conv.weight.ndim
+    shape[output_axis] = -1
+    return (conv.weight.double() * gain.view(shape)).detach(), bias.detach()
+
+
+def fold_features(features: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 2D convolution, in place, and bring all to ``like``'s type."""
+    for layer in list(features.modules()):
+        if not isinstance(getattr(layer, "norm", None), nn.BatchNorm2d):
+            continue
+        weight, bias = folded_weight(layer)
+        conv = cast("nn.Conv2d", layer.conv)
+        conv.weight.data = weight
+        conv.bias = nn.Parameter(bias)
+        layer.norm = nn.Identity()
+    for parameter in features.parameters():
+        values = parameter.data.to(like)
+        order = torch.channels_last if values.ndim == 4 else torch.contiguous_format
+        parameter.data = values.contiguous(memory_format=order)
+        parameter.requires_grad_(False)
+    return features
+
+
+def fold_volumes(module: ModuleT, like: Tensor) -> ModuleT:
+    """Fold every batch norm after a 3D convolution, in place; oneDNN is called by name after it.
+
+    So it is in 3D convolutions without a norm.
+    """
+    for layer in list(module.modules()):
+        if isinstance(layer, ConvNorm) and isinstance(layer.norm, nn.BatchNorm3d):
+            layer.conv = VolumeConv(layer.conv, *folded_weight(layer), like)
+            layer.norm = nn.Identity()
+        for name, conv in list(layer.named_children()):
+            if isinstance(conv, nn.Conv3d):
+                bias = torch.zeros(conv.out_channels) if conv.bias is None else conv.bias
+                setattr(layer, name, VolumeConv(conv, conv.weight, bias, like))
+    return module
+
+
+class VolumeConv(nn.Module):
+    """A folded 3x3x3 convolution of whole volumes."""
+
+    def __init__(self, conv: nn.Module, weight: Tensor, bias: Tensor, like: Tensor) -> None:
+        super().__init__()
+        self.is_transposed = isinstance(conv, nn.ConvTranspose3d)
+        self.stride = cast("Conv", conv).stride[0]
+        weight = weight.detach().to(like).contiguous(memory_format=torch.channels_last_3d)
+        self.weight = nn.Parameter(weight, requires_grad=False)
+        self.bias = nn.Parameter(bias.detach().to(like), requires_grad=False)
+
+    def forward(self, volume: Volume) -> Volume:
+        """Convolve a volume, in the type of the weights."""
+        volume = volume.to(self.weight.dtype)
+        if self.is_transposed:
+            transposed = _onednn_transposed if _has_onednn(volume) else _transposed
+            return transposed(volume, self.weight, self.bias)
+        convolved = _onednn_convolved if _has_onednn(volume) else _convolved
+        return convolved(volume, self.weight, self.bias, self.stride)
+
+
+def _convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    return nn.functional.conv3d(volume, weight, bias, stride, 1)
+
+
+def _onednn_convolved(volume: Tensor, weight: Tensor, bias: Tensor, stride: int) -> Tensor:
+    strides = (stride,) * 3
+    return torch.mkldnn_convolution(volume, weight, bias, (1, 1, 1), strides, (1, 1, 1), 1)
+
+
+def _transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return nn.functional.conv_transpose3d(volume, weight, bias, 2, 1, 1)
+
+
+def _onednn_transposed(volume: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    sizes = ((1, 1, 1), (1, 1, 1), (2, 2, 2), (1, 1, 1), 1)
+    args = (volume, weight, bias, *sizes, "none", [], "")
+    return torch.ops.mkldnn._convolution_transpose_pointwise(*args)
+
+
+def _has_onednn(x: Tensor) -> bool:
+    """Whether to call oneDNN by name: PyTorch's own choice takes a slow path for few rows."""
+    is_usable = x.device.type == "cpu" and x.dtype in (torch.float32, torch.bfloat16)
+    return is_usable and has_onednn_operators()
+
+
+@cache
+def has_onednn_operators() -> bool:
+    """Whether this PyTorch has both oneDNN operators, which it does not document, as used here.
+
+    Without them, or where they answer otherwise than the documented ones, these are called.
+    """
+    if not torch.backends.mkldnn.is_available():
+        return False
+    volume, weight, bias = torch.ones(1, 2, 4, 4, 4), torch.ones(2, 2, 3, 3, 3), torch.ones(2)
+    try:
+        with torch.no_grad():
+            found = (
+                _onednn_convolved(volume, weight, bias, 1),
+                _onednn_transposed(volume, weight, bias),
+            )
+    except (AttributeError, RuntimeError, TypeError):
+        return False
+    wanted = (_convolved(volume, weight, bias, 1), _transposed(volume, weight, bias))
+    both = zip(found, wanted, strict=True)
+    return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)
+
+
+class PSMNetMatcher(NetworkMatcher):
+    """PSMNet with pre- and post-processing: normalisation, padding, device, memory.
+
+    The weights are copied: training ``network`` further does not change this matcher. Where the
+    processor has no bf16, ``config`` says fp32 in its place.
+
+    Raises:
+        InputError: the device does not exist on this machine.
+    """
+
+    fine_pixels = 280_000
+    """Pixels of a fine match at most: an image of KITTI at three quarters of its resolution."""
+
+    def __init__(self, network: PSMNet, config: MatcherConfig | None = None) -> None:
+        super().__init__(network.config, config)
+        like = torch.empty(0, dtype=self.dtype, device=self.device)
+        self._network = copy.deepcopy(network).eval().to(self.device)
+        for head in self._network.heads:
+            # In float32 at least: 8 bits would round the expectation to whole pixels.
+            cost, wide = cast("nn.Conv3d", head.cost), torch.empty(0, device=self.device)
+            head.cost = VolumeConv(cost, cost.weight, torch.zeros(1), wide)
+        fold_volumes(self._network, like)
+        fold_features(self._network.features, like)
+        self._network.rows = PSMNetFootprint.rows
+        if self.config.with_compile:
+            self._network.features.compile()
+
+    def run(self, left: Views, right: Views, network: PSMNetConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network.
+
+        Raises:
+            InputError: a memory bound that is too small for them.
+        """
+        height, width = left.shape[-2:]
+        footprint = PSMNetFootprint(config=network, height=height, width=width, dtype=self.dtype)
+        footprint.refuse_more_than(self.config.max_memory_bytes)
+        near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
+        costs = self._network.costs(near, far, network.max_disparity_px)[-1][:, 0]
+        found = [
+            expected_disparity(
+                cost.permute(1, 2, 0).contiguous(),
+                Size(network.max_disparity_px, height, width),
+                align_corners=network.align_corners,
+                with_confidence=self.config.with_confidence,
+            )
+            for cost in costs
+        ]
+        return [Match(disparity_px=d, confidence=c) for d, c in found]
+
+
+class LightMatcher(NetworkMatcher):
+    """The light network with pre- and post-processing: normalisation, padding, device.
+
+    The weights are copied: training ``network`` further does not change this matcher. Where the
+    processor has no bf16, ``config`` says fp32 in its place.
+
+    Raises:
+        InputError: the device does not exist on this machine.
+    """
+
+    fine_pixels = 650_000
+    """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
+    most_enlarged = 1.5
+    most_disparities = 1.75
+
+    def __init__(self, network: LightStereo, config: MatcherConfig | None = None) -> None:
+        super().__init__(network.config, config)
+        like = torch.empty(0, dtype=self.dtype, device=self.device)
+        folded = fold_volumes(copy.deepcopy(network).eval().to(self.device), like)
+        self._network = fold_features(folded, like)
+        # A GPU has the memory, and is busy with whole volumes alone.
+        self._network.rows = LightFootprint.rows if self.device.type == "cpu" else None
+        if self.config.with_compile:
+            self._network.features.compile()
+
+    def run(self, left: Views, right: Views, network: LightConfig) -> list[Match]:
+        """Match normalised pairs whose sides suit the network.
+
+        Raises:
+            InputError: a memory bound that is too small for them.
+        """
+        height, width = left.shape[-2:]
+        footprint = LightFootprint(
+            config=network,
+            height=height,
+            width=width,
+            dtype=self.dtype,
+            rows=self._network.rows or height // 4,
+        )
+        footprint.refuse_more_than(self.config.max_memory_bytes)
+        read = self._network.read(
+            left.to(self.dtype),
+            right.to(self.dtype),
+            network.max_disparity_px,
+            with_confidence=self.config.with_confidence,
+        )
+        nothing = [None] * len(left)
+        sure = nothing if read.confidence is None else read.confidence
+        sky = nothing if read.sky is None else read.sky > 0.5
+        parts = zip(read.heads[-1], sure, sky, strict=True)
+        return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherKind:
+    """What it takes to read, write and run one kind of matcher.
+
+    Attributes:
+        config: dataclass of the network's sizes and conventions, which its weights file holds.
+        network: makes the module of a config, and keeps it as the attribute ``config``.
+        matcher: makes a matcher of a module in eval mode.
+    """
+
+    config: type
+    network: type[StereoNetwork]
+    matcher: Callable[[Any, MatcherConfig], Matcher]
+
+
+MATCHERS = {
+    "psmnet": MatcherKind(config=PSMNetConfig, network=PSMNet, matcher=PSMNetMatcher),
+    "light": MatcherKind(config=LightConfig, network=LightStereo, matcher=LightMatcher),
+}
+"""Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
+
+
+def make_network(config: Any) -> StereoNetwork:  # noqa: ANN401
+    """Make the network of a config of any kind, with random weights."""
+    return next(k.network(config) for k in MATCHERS.values() if isinstance(config, k.config))
+
+
+def make_matcher(network: StereoNetwork, config: MatcherConfig) -> Matcher:
+    """Make the matcher of a network of any kind.
+
+    Raises:
+        InputError: no kind has such a network.
+    """
+    for kind in MATCHERS.values():
+        if isinstance(network, kind.network):
+            return kind.matcher(network, config)
+    raise InputError(
+        f"{type(network).__name__} is no network of a matcher; known are {', '.join(MATCHERS)}"
+    )
