@@ -11,8 +11,6 @@ import dacite
 import yaml
 
 from depthpose.core.errors import InputError, nearest_name, refuse_unknown
-from depthpose.core.files import atomic_write, read_text
-from depthpose.core.files.text import parse_yaml
 
 LONGEST = 500
 """Letters of a value that an error shows."""
@@ -178,6 +176,9 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     Raises:
         InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
     """
+    from depthpose.core.files import read_text  # here: options load without torch
+    from depthpose.core.files.text import parse_yaml
+
     content = parse_yaml(path, read_text(path, _MAX_BYTES))
     if content is None:
         content = {}
@@ -219,6 +220,8 @@ def config_to_dict(config: object) -> dict[str, Any]:
 
 def write_config(path: Path, config: object) -> None:
     """Write every setting of ``config``, defaults too, so that the file is a full record."""
+    from depthpose.core.files import atomic_write  # here: options load without torch
+
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
 
