@@ -32,7 +32,7 @@ from depthpose.pose.estimator.base import PoseEstimator
 from depthpose.pose.mesh import is_mirror_alike
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.synthetic.negatives import SCALES, NegativeKind, negative_of
-from depthpose.pose.train.held_out import pose_error
+from depthpose.pose.train.clouds import pose_error
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 

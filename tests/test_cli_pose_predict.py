@@ -39,7 +39,7 @@ from depthpose.core.files import (
 )
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.datasets import BopDataset
-from depthpose.pose.datasets.results import read_results
+from depthpose.pose.datasets.write import read_results
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.types import ObjectModel

@@ -42,9 +42,9 @@ from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
 from depthpose.pose.datasets import read_mask
-from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.layouts import read_yaml
 from depthpose.pose.datasets.masks import read_detections
-from depthpose.pose.datasets.results import read_results
+from depthpose.pose.datasets.write import read_results
 from depthpose.pose.mesh import read_model
 
 Bomb = tuple[str, Callable[[], bytes | int], Callable[[Path], object]]

@@ -46,9 +46,9 @@ from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_mask
-from depthpose.pose.datasets.linemod import read_yaml
+from depthpose.pose.datasets.layouts import read_yaml
 from depthpose.pose.datasets.masks import read_detections
-from depthpose.pose.datasets.results import BopResult, read_results, write_results
+from depthpose.pose.datasets.write import BopResult, read_results, write_results
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES

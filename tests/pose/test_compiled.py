@@ -88,7 +88,7 @@ def test_nearest_surface_points(surface: Surface, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
 def test_trees_of_few_points(count: int) -> None:
-    from depthpose.pose.compiled.nearest import nearest_of, tree_of
+    from depthpose.pose.compiled.points import nearest_of, tree_of
 
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)

@@ -19,7 +19,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Target
-from depthpose.pose.datasets.linemod import linemod_symmetries
+from depthpose.pose.datasets.layouts import linemod_symmetries
 from depthpose.pose.evaluate import (
     InstanceRow,
     ObjectRow,

@@ -12,8 +12,7 @@ from torch import Tensor
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import PointNet, PointNetConfig
-from depthpose.pose.export import pose_export
-from depthpose.pose.export.graph import direction_graph
+from depthpose.pose.export import direction_graph, pose_export
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.sparse import Voxels, batch_coordinates
 from depthpose.pose.weights import write_pose_weights

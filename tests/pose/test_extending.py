@@ -21,7 +21,7 @@ from depthpose.core.files.cloud import CLOUD_READERS
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, is_bop, open_bop
-from depthpose.pose.datasets.frames import bop_instances
+from depthpose.pose.datasets.layouts import bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss

@@ -124,7 +124,7 @@ def test_views_drawn_by_other_processes_are_the_same(monkeypatch: pytest.MonkeyP
     def draw(*_: object) -> None:
         raise AssertionError("every stored view is drawn already")
 
-    monkeypatch.setattr("depthpose.pose.synthetic.dataset.draw_view", draw)
+    monkeypatch.setattr("depthpose.pose.synthetic.views.draw_view", draw)
     found = [ahead.view(index).input.depth_m for index in range(12)]
     for mine, theirs in zip(found, expected, strict=True):
         assert torch.equal(mine.nan_to_num(), theirs)

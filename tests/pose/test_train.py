@@ -39,14 +39,14 @@ from depthpose.pose.train import (
     read_models,
     train_pose,
 )
-from depthpose.pose.train.held_out import (
+from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
     HeldOut,
     held_out_objects,
     score_held_out,
     table_text,
 )
-from depthpose.pose.train.task import keypoint_copies, packed
+from depthpose.pose.train.directions import keypoint_copies, packed
 from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
 from depthpose.pose.weights import (
     PoseWeights,
@@ -386,7 +386,7 @@ def test_weights_are_measured_as_the_file_has_them(
         seen.append(weights)
         return {}
 
-    monkeypatch.setattr("depthpose.pose.train.runs.score_held_out", counted)
+    monkeypatch.setattr("depthpose.pose.train.directions.score_held_out", counted)
     path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     (measured,) = seen
@@ -404,7 +404,7 @@ def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     none = PoseEstimate(name="", object="", status="doubtful", reason="so")
     rows = [(sure, 0.02)] * 5 + [(sure, 0.4), (unsure, 0.01), (unsure, 0.5), (none, math.inf)] * 1
     answers = ([one for one, _ in rows], [error for _, error in rows])
-    monkeypatch.setattr("depthpose.pose.train.held_out._posed", lambda *_: answers)
+    monkeypatch.setattr("depthpose.pose.train.clouds._posed", lambda *_: answers)
     held_out = HeldOutConfig(number=4, occlusions=(0.0,))
     table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
     shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}

@@ -236,7 +236,7 @@ def local_planes(
     """
     count = min(_NEIGHBOURS, len(every_m))
     if serves(every_m, some_m):
-        from depthpose.pose.compiled.planes import planes_of
+        from depthpose.pose.compiled.points import planes_of
 
         normals, bend = planes_of(every_m.numpy(), some_m.numpy(), count)
         return torch.from_numpy(normals), torch.from_numpy(bend)[:, None]

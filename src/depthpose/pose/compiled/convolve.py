@@ -3,8 +3,8 @@
 import numpy as np
 from torch import Tensor
 
-from depthpose.pose.compiled.choice import compiled
-from depthpose.pose.compiled.nearest import Array
+from depthpose.pose.compiled import compiled
+from depthpose.pose.compiled.points import Array
 
 
 def rows_of(keys: Array, standing: Array, moves: list[int]) -> Array:

@@ -14,9 +14,9 @@ from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.pose.cloud import cloud_from_depth, refusal_of
 from depthpose.pose.datasets.dataset import open_bop, read_instance_mask
-from depthpose.pose.datasets.frames import Instance
-from depthpose.pose.datasets.layouts import layout_of
-from depthpose.pose.datasets.models import (
+from depthpose.pose.datasets.layouts import (
+    Instance,
+    layout_of,
     model_path,
     models_folder,
     object_name,

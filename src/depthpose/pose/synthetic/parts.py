@@ -14,8 +14,9 @@ import torch
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.rigid import Rigid
+from depthpose.core.units import metres_of
 from depthpose.pose.augment import uniform, whole
-from depthpose.pose.config import MeshConfig, metres_of
+from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 

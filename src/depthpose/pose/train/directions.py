@@ -1,9 +1,10 @@
-"""The direction network as a task of the loop, and the folder of its training."""
+"""Training of the direction network."""
 
 import dataclasses
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -11,17 +12,47 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
-from depthpose.core.loop import Run, Update, ValidationResult, make_adam
+from depthpose.core.config import config_to_dict
+from depthpose.core.errors import InputError
+from depthpose.core.files import write_json
+from depthpose.core.loop import (
+    Run,
+    Update,
+    ValidationResult,
+    make_adam,
+    releases_folder,
+    write_card,
+)
 from depthpose.core.rigid import Rigid
+from depthpose.core.run import find_rank
+from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.config import CloudConfig, RefusalConfig
 from depthpose.pose.estimator.alternatives import near_symmetry_lines
 from depthpose.pose.losses import choose_copies, confidence_loss, direction_loss, unit_directions
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.train.clouds import CloudBatch
-from depthpose.pose.train.config import FramesConfig, PoseTraining
-from depthpose.pose.train.held_out import HeldOut
+from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms, unfold_norms
+from depthpose.pose.sparse import Voxels
+from depthpose.pose.train.clouds import (
+    CloudBatch,
+    HeldOut,
+    TrainingClouds,
+    read_models,
+    score_held_out,
+    table_text,
+)
+from depthpose.pose.train.config import (
+    FramesConfig,
+    PoseTraining,
+)
 from depthpose.pose.types import ObjectModel
-from depthpose.pose.weights import AnyNetwork, DirectionNet, PoseWeights
+from depthpose.pose.weights import (
+    AnyNetwork,
+    DirectionNet,
+    PoseWeights,
+    read_pose_network,
+    read_pose_weights,
+    write_pose_weights,
+)
 
 _SYMMETRY_STEP = 0.05
 """Turns about a continuous axis are tried every 5.7 degrees; the vote's own error is larger."""
@@ -98,7 +129,7 @@ def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
     return Rigid(R, t_m)
 
 
-_SAID = 3
+_TURNS_ON_CARD = 3
 """Turns of an object that look nearly alike, on a card."""
 
 
@@ -159,7 +190,9 @@ def card_facts(weights: PoseWeights) -> dict[str, str]:
     """Put before the facts of weights their objects, sizes, and turns that look nearly alike."""
     known = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     lines = {model.name: near_symmetry_lines(model) for model in weights.models}
-    near = "; ".join(f"{name}: {', '.join(some[:_SAID])}" for name, some in lines.items() if some)
+    near = "; ".join(
+        f"{name}: {', '.join(some[:_TURNS_ON_CARD])}" for name, some in lines.items() if some
+    )
     return {"objects": known} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
 
 
@@ -184,3 +217,116 @@ def with_classes(
     }
     known = {field.name for field in dataclasses.fields(network)}
     return dataclasses.replace(network, **{k: v for k, v in sizes.items() if k in known})
+
+
+_STATISTICS_CLOUDS = 64
+"""Clouds from which batch norm statistics, lost by folding, are computed again."""
+
+
+@releases_folder
+def train_pose(config: PoseTraining, run: Run) -> Path:
+    """Train a network of directions, ours or the PointNet; give its weights file."""
+    torch.manual_seed(config.loop.seed)
+    models = read_models(config.models, run.on_message)
+    config = dataclasses.replace(config, network=with_classes(config.network, models, config.cloud))
+    clouds = TrainingClouds(
+        models,
+        config.objects,
+        config.frames,
+        config.cloud,
+        config.loop.seed,
+        first_alone=config.first_alone,
+    )
+    if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
+        clouds.synthetic.draw_stored(config.loop.workers)
+    held_out = HeldOut(models, config.objects, config.cloud, config.held_out)
+    network = _network_of(config.network)
+    if config.start is not None:
+        _start_from(network, config.start, clouds)
+    claim_run(config, run, config.models.cad)
+    task = PoseTask(network, models, config, held_out)
+    seconds = run.train(task, clouds, config.loop)
+    if run.on_message is not None:
+        run.on_message("trained; now it is measured on synthetic views: a minute or more")
+    if isinstance(network, PointNet):
+        return _save(run.folder / "pointnet.safetensors", network, models, config, seconds)
+    return _save(run.folder / "pose.safetensors", fold_norms(network), models, config, seconds)
+
+
+def _save(
+    path: Path,
+    network: ResUNet | PointNet,
+    models: tuple[ObjectModel, ...],
+    config: PoseTraining,
+    seconds: float,
+) -> Path:
+    """Write the weights, measure the file, and write its card."""
+    if find_rank().rank:
+        return path  # statistics of batch norm are rank 0's, and so is the file
+    weights = _as_written(packed(network, models, config), with_half=config.with_half)
+    write_pose_weights(path, weights, with_half=config.with_half)
+    table = score_held_out(read_pose_weights(path), config.objects, config.held_out)
+    write_json(path.with_suffix(".json"), {"held_out": table})
+    write_card(
+        path, train_words(path.stem, config), seconds, card_facts(weights), table_text(table)
+    )
+    return path
+
+
+def _as_written(weights: PoseWeights, *, with_half: bool) -> PoseWeights:
+    """Give what a file of these weights holds: 16 bits round them."""
+    with TemporaryDirectory() as home:
+        path = Path(home) / "weights.safetensors"
+        write_pose_weights(path, weights, with_half=with_half)
+        return read_pose_weights(path)
+
+
+def _network_of(config: ResUNetConfig | PointNetConfig) -> ResUNet | PointNet:
+    return PointNet(config) if isinstance(config, PointNetConfig) else ResUNet(config)
+
+
+def _start_from(network: ResUNet | PointNet, start: str, clouds: TrainingClouds) -> None:
+    """Copy weights; of other objects, all but the last layer.
+
+    Written weights are folded: they have no norms, but biases. Batch norm takes both up. New
+    input features of a voxel get weights of zero.
+
+    Raises:
+        InputError: a network of another shape.
+    """
+    found = read_pose_network(find_weights(start))
+    if isinstance(found, ResUNet) and isinstance(network, ResUNet):
+        found = _with_inputs(found, network.config.inputs)
+    wanted, given = config_to_dict(network.config), config_to_dict(found.config)
+    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
+    free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
+    for name, value in wanted.items():
+        if name not in free and given.get(name) != value:
+            raise InputError(
+                f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
+    if (
+        isinstance(network, ResUNet)
+        and isinstance(found, ResUNet)
+        and network.config.norm != "none"
+    ):
+        batch = clouds.collate([clouds[index] for index in range(_STATISTICS_CLOUDS)])
+        unfold_norms(found, network, Voxels.from_points(batch.coordinates, batch.features))
+        return
+    state = found.state_dict()
+    if found.config.classes != network.config.classes:
+        state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
+    network.load_state_dict(state)
+
+
+def _with_inputs(network: ResUNet, inputs: int) -> ResUNet:
+    """Give a network more inputs, with weights of zero."""
+    more = inputs - network.config.inputs
+    if more <= 0:
+        return network
+    state, first = network.state_dict(), "down.0.conv.weight"
+    silent = state[first].new_zeros(len(state[first]), more, state[first].shape[2])
+    wider = ResUNet(dataclasses.replace(network.config, inputs=inputs))
+    wider.load_state_dict({**state, first: torch.cat([state[first], silent], 1)})
+    return wider.eval()

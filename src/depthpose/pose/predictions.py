@@ -1,11 +1,13 @@
-"""``poses.json``: every estimate and refusal with all that is known of it."""
+"""Predictions as files: records of what is done, and BOP results."""
 
 import math
 import warnings
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast, get_args
+from typing import Any, Generic, NamedTuple, TypeVar, cast, get_args
 
 import torch
 from torch import Tensor
@@ -14,8 +16,17 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, nearest_name
 from depthpose.core.files import write_json
 from depthpose.core.rigid import Rigid
-from depthpose.pose.datasets import Instance
-from depthpose.pose.datasets.parse import integer, number, read_rows
+from depthpose.core.run import claim_folder
+from depthpose.pose.datasets import (
+    BopDataset,
+    BopResult,
+    Detection,
+    Instance,
+    read_mask,
+    read_results,
+    write_results,
+)
+from depthpose.pose.datasets.layouts import integer, number, read_rows
 from depthpose.pose.types import (
     POSED,
     Alternative,
@@ -24,6 +35,7 @@ from depthpose.pose.types import (
     PoseEstimate,
     Status,
     Tracking,
+    ViewInput,
 )
 
 AnswerT = TypeVar("AnswerT", Fit, Identity)
@@ -284,3 +296,247 @@ def _named(row: dict[str, Any], key: str, source: str) -> dict[str, float]:
     if not isinstance(found, dict):
         raise InputError(f"{source}: {key} is {found!r}, where names to numbers belong")
     return {str(name): number(found, name, None, source) for name in found}
+
+
+_SAVE_EVERY = 200
+
+Input = TypeVar("Input")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Job(Generic[Input]):
+    """One thing to estimate: what it is called, where it belongs, and how its input is read.
+
+    Attributes:
+        name: that of the input: unique in a run.
+        read: gives the input; called only where the estimate is not there yet.
+        place: as :class:`Prediction` has it.
+        seconds: what was spent before, on its mask.
+        source: file or files that the input is read from.
+    """
+
+    name: str
+    read: Callable[[], Input]
+    place: Place | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    source: Path | tuple[Path, ...] | None = None
+
+
+def predict(
+    estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
+    jobs: Iterable[Job[Input]],
+    folder: Path,
+    settings: dict[str, Any],
+    batch: int = 1,
+) -> Generator[str, None, None]:
+    """Estimate what is not finished yet, and yield each name; ``poses.json`` grows as it goes.
+
+    What was unreadable is tried again.
+
+    What was estimated is saved every 200 jobs, and when the work ends or is interrupted.
+
+    Args:
+        estimate_many: gives an estimate for each input, of the same name.
+        jobs: all that there are to do, the finished ones too.
+        folder: where ``poses.json`` goes; refused if other settings made what it holds.
+        settings: what decides the results.
+        batch: how many inputs are handed over at once. Each then takes an equal share of the time.
+    """
+    claim_folder(folder, settings, [POSES])
+    wanted = list(jobs)
+    done = {p.estimate.name: p for p in kept_predictions(folder)}
+    finished = {name for name, prediction in done.items() if is_finished(prediction)}
+    yield from (job.name for job in wanted if job.name in finished)
+    left = [job for job in wanted if job.name not in finished]
+    unsaved = 0
+    try:
+        for start in range(0, len(left), batch):
+            some = left[start : start + batch]
+            estimates = estimate_many([job.read() for job in some])
+            for job, estimate in zip(some, estimates, strict=True):
+                assert estimate.name == job.name, f"{estimate.name!r} is not {job.name!r}"
+                spent = {**job.seconds, **estimate.seconds}
+                done[job.name] = Prediction(
+                    estimate=replace(estimate, seconds=spent), place=job.place
+                )
+                unsaved += 1
+                yield job.name
+            if unsaved >= _SAVE_EVERY:
+                write_predictions(folder, done.values())
+                unsaved = 0
+    finally:
+        if unsaved or not is_started(folder):
+            write_predictions(folder, done.values())
+
+
+def instance_jobs(
+    dataset: BopDataset,
+    names: Mapping[int, str],
+    mask_of: Callable[[Instance], Path] | None = None,
+) -> list[Job[ViewInput]]:
+    """Take every annotated instance by its mask.
+
+    Args:
+        dataset: what there is to estimate.
+        names: what the estimator calls each object, by its number.
+        mask_of: names the predicted mask of an instance, an image; None: the annotated masks.
+    """
+
+    def read(instance: Instance) -> ViewInput:
+        mask = None if mask_of is None else read_mask(mask_of(instance))
+        return replace(dataset.view(instance, mask).input, object=names[instance.object_id])
+
+    return [
+        Job(name=instance.name, read=partial(read, instance), place=place_of(instance))
+        for instance in dataset.instances
+    ]
+
+
+def detection_jobs(
+    dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
+) -> list[Job[ViewInput]]:
+    """Take the surest detections of each object, as many as an image shows of it.
+
+    What is not detected has no job, and is missing in what is measured. The time of an image's
+    detection is shared by all its jobs.
+
+    Args:
+        dataset: what there is to find.
+        names: what the estimator calls each object, by its number.
+        detections: masks of any images; those of images that ``dataset`` has not are left out.
+
+    Raises:
+        InputError: no detection is of the data set.
+    """
+    shown: dict[Place, list[Instance]] = defaultdict(list)
+    for instance in dataset.instances:
+        shown[place_of(instance)].append(instance)
+    found: dict[Place, list[Detection]] = defaultdict(list)
+    for one in sorted(detections, key=lambda d: -d.score):
+        place = Place(one.scene_id, one.image_id, one.object_id)
+        if len(found[place]) < len(shown.get(place, ())):
+            found[place].append(one)
+    kept = [(place, k, one) for place, every in found.items() for k, one in enumerate(every)]
+    if not kept:
+        raise InputError(
+            f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
+            f"of split {dataset.split!r}; give those of this very split"
+        )
+    sharing = Counter(place[:2] for place, _, _ in kept)
+
+    def read(instance: Instance, name: str, one: Detection) -> ViewInput:
+        view = dataset.view(instance, one.mask).input
+        return replace(view, name=name, object=names[instance.object_id])
+
+    jobs: list[Job[ViewInput]] = []
+    for place, k, one in sorted(kept, key=lambda item: item[:2]):
+        name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
+        seconds = {} if one.seconds is None else {"segmentation": one.seconds / sharing[place[:2]]}
+        jobs.append(
+            Job(
+                name=name,
+                read=partial(read, shown[place][0], name, one),
+                place=place,
+                seconds=seconds,
+            )
+        )
+    return jobs
+
+
+def results_name(dataset: BopDataset) -> str:
+    """Name the BOP csv of a data set: ``depthpose_DATASET-SPLIT.csv``."""
+    return f"depthpose_{dataset.folder.resolve().name}-{dataset.split}.csv"
+
+
+def read_bop_results(path: Path) -> list[Prediction]:
+    """Read anybody's BOP csv as predictions.
+
+    A row has a share of its image's time; its score is kept as the share of votes that agree.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    results = read_results(path)
+    rows_of = Counter((result.scene_id, result.image_id) for result in results)
+    found: list[Prediction] = []
+    for row, result in enumerate(results, 1):
+        place = Place(result.scene_id, result.image_id, result.object_id)
+        whole_s = result.seconds
+        estimate = PoseEstimate(
+            name=f"row {row}",
+            object=f"obj_{result.object_id:06d}",
+            status="ok",
+            camera_from_model=result.camera_from_model,
+            inlier_share=result.score,
+            seconds={} if whole_s is None else {"image": whole_s / rows_of[place[:2]]},
+        )
+        found.append(Prediction(estimate=estimate, place=place))
+    return found
+
+
+def alternatives_name(dataset: BopDataset) -> str:
+    """Name the csv that holds alternatives too: ``depthpose-alternatives_DATASET-SPLIT.csv``."""
+    return results_name(dataset).replace("depthpose_", "depthpose-alternatives_", 1)
+
+
+def write_bop_results(
+    path: Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
+) -> None:
+    """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
+
+    Args:
+        path: the csv.
+        predictions: of a data set.
+        with_alternatives: give each alternative a row too, its probability the score. BOP's
+            measures take the surest rows of an image, so they are no row of the csv that is
+            measured.
+
+    Raises:
+        InputError: a pose belongs to no scene, or the disk refuses.
+    """
+    known = list(predictions)
+    seconds: dict[tuple[int, int], float] = {}
+    for prediction in known:
+        if prediction.place is not None:
+            image = prediction.place[:2]
+            spent = sum(prediction.estimate.seconds.values())
+            seconds[image] = seconds.get(image, 0.0) + spent
+    answered = [p for p in known if p.estimate.is_posed]
+    if with_alternatives:
+        answered = [other for p in answered for other in [p, *_others(p)]]
+    write_results(path, [_result(p, seconds) for p in answered])
+
+
+def _others(prediction: Prediction) -> list[Prediction]:
+    """Give each alternative as a prediction of its own."""
+    return [
+        replace(
+            prediction,
+            estimate=replace(
+                prediction.estimate,
+                camera_from_model=other.camera_from_model,
+                certainty=other.probability,
+                alternatives=(),
+            ),
+        )
+        for other in prediction.estimate.alternatives
+    ]
+
+
+def _result(prediction: Prediction, seconds: dict[tuple[int, int], float]) -> BopResult:
+    pose, place = prediction.estimate.camera_from_model, prediction.place
+    if place is None:
+        raise InputError(
+            f"{prediction.estimate.name}: belongs to no scene of a BOP data set, and its csv is of "
+            "such; leave it out"
+        )
+    assert pose is not None
+    spent_s = seconds[place[:2]]
+    return BopResult(
+        scene_id=place.scene_id,
+        image_id=place.image_id,
+        object_id=place.object_id,
+        score=score_of(prediction.estimate),
+        camera_from_model=pose,
+        seconds=spent_s if spent_s > 0 else None,
+    )
